@@ -110,7 +110,7 @@ PYTHONS ?= $(PYTHON)
 wheel-test: wheel
 	for python in $(PYTHONS); do rm -rf $(VENV)-wheel && $$python -m venv $(VENV)-wheel && \
 		$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl && \
-		(cd wheels && ../$(VENV)-wheel/bin/ftlm doctor && ../$(VENV)-wheel/bin/ftlm demo --step 0.1 -o demo --force) || \
+		(cd wheels && ../$(VENV)-wheel/bin/ftlm doctor && ../$(VENV)-wheel/bin/ftlm demo --increment 0.1 -o demo --force) || \
 		exit 1; done
 	$(BIN)/python -m abi3audit --strict wheels/*.whl
 ifeq ($(shell uname -s),Linux)

@@ -9,7 +9,7 @@ use ftlm::fractional::kernels::{block_pulse_kernel, kernel_with_derivative};
 use ftlm::fractional::operational_matrices;
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
-use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Criterion as Criterium, Estimator, Norm, Options};
 use ftlm::regressors::Record;
 use ftlm::series::{self, Buffers, Kernel};
@@ -77,7 +77,7 @@ fn haar_transform(c: &mut Criterion) {
         let signal = noise(m, 3);
         group.throughput(Throughput::Elements(m as u64));
         group.bench_with_input(BenchmarkId::new("transform", m), &m, |b, _| {
-            b.iter_batched_ref(|| signal.clone(), |x| operational_matrices::transform(x), BatchSize::LargeInput);
+            b.iter_batched_ref(|| signal.clone(), |x| operational_matrices::haar_transform(x), BatchSize::LargeInput);
         });
     }
     group.finish();
@@ -111,7 +111,7 @@ fn operational_matrices(c: &mut Criterion) {
 
 /// P1: a deflection equation with two free orders of its own, one of the hub angle, and the current, on 2048 pulses of
 /// a synthetic stage with noise of 1e−4 rad.
-fn first_problem() -> (Record, Lattice) {
+fn first_problem() -> (Record, OrderGrid) {
     let m = 2048;
     let step = 10.0 / m as f64;
     let signals = |output: usize, terms: &[(usize, f64, f64)]| Equation {
@@ -141,7 +141,7 @@ fn first_problem() -> (Record, Lattice) {
         |signal: usize, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: signal == 1 };
     let axes = [axis(1, &all), axis(1, &all), axis(0, &all), axis(2, &[0.0])];
     let alphas: Vec<f64> = (21..=40).map(|i| 0.05 * f64::from(i)).collect();
-    let Ok(lattice) = Lattice::new(1, &alphas, &axes, |s| s == 2) else { unreachable!() };
+    let Ok(lattice) = OrderGrid::new(1, &alphas, &axes, |s| s == 2) else { unreachable!() };
     (record, lattice)
 }
 
@@ -160,9 +160,9 @@ fn order_search(c: &mut Criterion) {
             norm: Norm::L1,
             estimator: Estimator::LeastSquares,
             initial: Initial::Rest,
-            keep: 20,
+            top: 20,
             threads: 1,
-            early_stopping: true,
+            pruning: true,
             memory: 2 << 30,
         };
         group.bench_function(name, |b| {

@@ -10,20 +10,20 @@ use std::time::Instant;
 
 use ftlm::equation::{Equation, Initial, Structure, Term};
 use ftlm::estimation::joint_fit::fit;
-use ftlm::estimation::joint_fit::initial_guesses::Lattices;
-use ftlm::estimation::joint_fit::parameter_set::Free;
+use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
+use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::structure::{
     Coefficient, Equation as FreeEquation, Order, Structure as FreeStructure, Term as FreeTerm,
 };
-use ftlm::estimation::joint_fit::{Loss, Outset, Sampled, Settings, Signal, Size, Sought};
+use ftlm::estimation::joint_fit::{FitProblem, Initialization, Loss, OutputScale, SampledRuns, Settings, Signal};
 use ftlm::estimation::least_squares;
 use ftlm::fft::{self, Bin, Workspace};
 use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::fractional::operational_matrices::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
-use ftlm::order_search::batches::{search, Search};
-use ftlm::order_search::certificate::{certify, Asked, Range, Region};
+use ftlm::order_search::batches::{search, BatchEvaluator};
+use ftlm::order_search::certificate::{certify, CertificateOptions, Range, Region};
 use ftlm::order_search::control::Control;
-use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::parallel::{pool, Stop};
 use ftlm::regressors::Record;
@@ -86,10 +86,10 @@ fn transforms(n: usize) -> (f64, f64) {
     let copy = shortest(5, 0.3, || time.copy_from_slice(black_box(&signal)));
     let forward = shortest(5, 0.3, || {
         time.copy_from_slice(&signal);
-        plan.forward(&mut time, &mut spectrum, &mut workspace);
+        plan.transform(&mut time, &mut spectrum, &mut workspace);
     });
     time.copy_from_slice(&signal);
-    plan.forward(&mut time, &mut spectrum, &mut workspace);
+    plan.transform(&mut time, &mut spectrum, &mut workspace);
     let kept = spectrum.clone();
     let inverse = shortest(5, 0.3, || {
         spectrum.copy_from_slice(&kept);
@@ -138,7 +138,7 @@ fn free_run(equation: &Equation, m: usize, division: &mut Division) -> f64 {
         division.reset();
         division.add(0, 0, black_box(&numerator));
         let inverse = [1.0 / divisor[0]];
-        while division.solved() < m {
+        while division.solved_terms() < m {
             division.advance(&inverse, |_, _, len| &divisor[..len]);
         }
         black_box(division.quotient(0));
@@ -178,7 +178,7 @@ fn written(m: usize) -> Vec<f64> {
 }
 
 /// The arm's first stage over this many pulses with a little noise, and the lattice of its deflection at this step.
-fn problem(m: usize, step: f64) -> Option<(Record, Lattice)> {
+fn problem(m: usize, step: f64) -> Option<(Record, OrderGrid)> {
     let h = 10.0 / m as f64;
     let equation = |output: usize, terms: &[(usize, f64, f64)]| Equation {
         structure: Structure {
@@ -205,7 +205,7 @@ fn problem(m: usize, step: f64) -> Option<(Record, Lattice)> {
     let axis = |signal: usize, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: true };
     let axes = [axis(1, &all), axis(1, &all), axis(0, &all), axis(2, &[0.0])];
     let alphas: Vec<f64> = all.iter().copied().filter(|a| *a > 1.049).collect();
-    Some((record, Lattice::new(1, &alphas, &axes, |s| s == 2).ok()?))
+    Some((record, OrderGrid::new(1, &alphas, &axes, |s| s == 2).ok()?))
 }
 
 /// Step of the lattice that is ranked by equation errors for callgrind: five million candidates.
@@ -219,9 +219,9 @@ fn options(threads: usize) -> Options {
         norm: Norm::L1,
         estimator: Estimator::LeastSquares,
         initial: Initial::Rest,
-        keep: 20,
+        top: 20,
         threads,
-        early_stopping: true,
+        pruning: true,
         memory: 2 << 30,
     }
 }
@@ -253,7 +253,8 @@ fn setup(m: usize, step: f64, threads: usize) {
     let (records, options) = ([record], options(threads));
     let before = busy();
     let start = Instant::now();
-    let ready = Search::new(&records, Cow::Borrowed(&lattice), &[None; 4], &options, &pool, &Control::default());
+    let ready =
+        BatchEvaluator::new(&records, Cow::Borrowed(&lattice), &[None; 4], &options, &pool, &Control::default());
     let wall = start.elapsed().as_secs_f64();
     if black_box(ready).is_ok() {
         let spent: Vec<f64> =
@@ -297,10 +298,10 @@ fn joint_fit(m: usize) -> Option<f64> {
     let driven = Record::new(h, vec![vec![0.0; m], u.clone()], None).ok()?;
     let mut y = simulate::respond(&[plant], &driven, &[]).ok()?.remove(0);
     y.iter_mut().zip(noise(m, 3)).for_each(|(y, e)| *y += 1e-3 * e);
-    let sizes = [Size::of(&[y.clone()])];
-    let signal = |samples, between| Signal { samples, between };
+    let sizes = [OutputScale::from_runs(&[y.clone()])];
+    let signal = |samples, between| Signal { samples, intersample: between };
     let run = vec![signal(y, Intersample::Linear), signal(u, Intersample::Hold)];
-    let runs = Sampled::new(h, vec![0], vec![run]).ok()?;
+    let runs = SampledRuns::new(h, vec![0], vec![run]).ok()?;
     let free = |(signal, order, _): (usize, f64, f64), name: &str| FreeTerm {
         signal,
         order: Order::number(order),
@@ -309,12 +310,16 @@ fn joint_fit(m: usize) -> Option<f64> {
     };
     let terms = terms.into_iter().zip(["d", "a", "b"]).map(|(term, name)| free(term, name)).collect();
     let sought = FreeEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
-    let free = Free::of(FreeStructure::new(vec!["y".into(), "u".into()], vec![sought], Initial::Rest)).ok()?;
+    let free =
+        ParameterSet::from_structure(FreeStructure::new(vec!["y".into(), "u".into()], vec![sought], Initial::Rest))
+            .ok()?;
     let stop = Stop::default();
-    let starts = Lattices::new(&runs, 1, 1 << 28, &stop);
-    let asked = Sought { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+    let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
+    let asked = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
     let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
-    let found = fit::fit(asked, Outset::Starts { known: Vec::new(), raced: None }, settings, &|_, _| Ok(())).ok()??;
+    let found =
+        fit::fit(asked, Initialization::Multistart { known: Vec::new(), candidates: None }, settings, &|_, _| Ok(()))
+            .ok()??;
     black_box(found).finished.estimate.first().copied()
 }
 
@@ -338,7 +343,7 @@ fn kernel(name: &str) {
         "boxes" => {
             let Some((record, lattice)) = problem(m / 4, BOXED) else { return };
             let found = black_box(search(&[record], &lattice, &[None; 4], &options(1), &Control::default()));
-            if found.is_ok_and(|found| found.counts.boxed > lattice.count() / 2) {
+            if found.is_ok_and(|found| found.counts.excluded_by_box > lattice.count() / 2) {
                 println!("units {}", lattice.count());
             }
         }
@@ -349,9 +354,15 @@ fn kernel(name: &str) {
                 output: 1,
                 alpha: (1.05, 2.0),
                 terms: vec![range(1, 1.0), range(0, 1.5), range(2, 0.0)],
-                apart: 0.05,
+                min_separation: 0.05,
             };
-            let asked = Asked { within: 0.05, largest: 100.0, cells: 100_000, threads: 1, memory: 1 << 30 };
+            let asked = CertificateOptions {
+                tolerance: 0.05,
+                max_coefficient: 100.0,
+                max_cells: 100_000,
+                threads: 1,
+                memory: 1 << 30,
+            };
             let Ok(found) = black_box(certify(&[record], &region, &asked, &Control::default())) else { return };
             println!("units {}", found.cells);
         }

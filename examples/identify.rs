@@ -8,7 +8,7 @@ use ftlm::estimation::output_error::{
 };
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
-use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::regressors::Record;
 use ftlm::signal::block_pulse::point_samples;
@@ -60,15 +60,15 @@ fn main() -> Result<()> {
     let tenths = |range: std::ops::RangeInclusive<u8>| range.map(|i| 0.1 * f64::from(i)).collect::<Vec<_>>();
     let axis = |signal, values| TermAxis { signal, values, interchangeable: false };
     let axes = [axis(OUTPUT, vec![0.0]), axis(OUTPUT, tenths(1..=14)), axis(INPUT, vec![0.0])];
-    let lattice = Lattice::new(OUTPUT, &tenths(15..=20), &axes, |signal| signal == INPUT)?;
+    let lattice = OrderGrid::new(OUTPUT, &tenths(15..=20), &axes, |signal| signal == INPUT)?;
     let options = Options {
         criterion: Criterion::OutputError,
         norm: Norm::L2,
         estimator: Estimator::LeastSquares,
         initial: Initial::Rest,
-        keep: 3,
+        top: 3,
         threads: 2,
-        early_stopping: true,
+        pruning: true,
         ..Options::default()
     };
     let outcome = search(std::slice::from_ref(&record), &lattice, &[None; 3], &options, &Control::default())?;

@@ -1,18 +1,16 @@
-//! Equations of fractional order: terms, orders, order laws, initial terms, sensor filters.
+//! Equations of fractional order: terms, orders, order laws, initial terms, sensor filters, solvability.
 //!
-//! An equation is D^α y = Σ_k c_k D^{ν_k} s_k over the signals of a record. Divided by D^α it is a series equation,
-//! y = Σ_k c_k I^{α−ν_k} s_k + initial terms, which is how everything else reads it.
-//!
-//! Whether coupled equations tell their outputs apart: the leading matrix of the system.
+//! An equation is D^α y = Σ_k c_k D^{ν_k} s_k over the signals of a record. Divided by D^α it is a series equation, y =
+//! Σ_k c_k I^{α−ν_k} s_k + initial terms. All other modules use this form.
 
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
 use crate::fractional::kernels::{block_pulse_kernel, MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
 use crate::series;
 
-/// Orders closer than this are one order: lattices are written in steps, not in rounding errors.
+/// Orders closer than this are equal. Orders of a grid are multiples of its increment up to rounding.
 pub const ORDER_GRAIN: f64 = 1e-9;
 
-/// One term D^ν s; its coefficient lives beside the structure.
+/// Term D^ν s. Its coefficient is stored beside the structure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Term {
     /// Index of the signal in the record.
@@ -41,33 +39,35 @@ pub struct Equation {
     pub coefficients: Vec<f64>,
 }
 
-/// A power of t this close to that of an offset cannot be told from it.
-const STAND_IN: f64 = 0.05;
+/// Exponents of t closer than this to that of an offset are not separately identifiable.
+const OFFSET_EXPONENT_TOLERANCE: f64 = 0.05;
 
-/// How a record that does not start at rest is treated.
+/// Initial conditions of a record.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Initial {
-    /// At rest: no initial terms.
+    /// Zero initial conditions: no initial terms.
     Rest,
-    /// All powers of t that Caputo derivatives leave behind: t^i, i < ⌈α⌉, and t^{α−ν+i}, i < ⌈ν⌉.
+    /// All powers of t of Caputo derivatives: t^i, i < ⌈α⌉, and t^{α−ν+i}, i < ⌈ν⌉.
     Caputo,
-    /// These exponents.
+    /// Explicit exponents.
     Powers(Vec<f64>),
-    /// A constant on the right-hand side, unknown and one a record, beside what else the record starts with. Integrated
-    /// with the equation it is c t^α/Γ(α + 1), so it is one more power of t; a ramp r t is r t^{α+1}/Γ(α + 2).
+    /// Constant of unknown value on the right-hand side, one a record, in addition to other initial conditions.
+    ///
+    /// Integrated with the equation it is c t^α/Γ(α + 1), one more power of t. A ramp r t is r t^{α+1}/Γ(α + 2).
     Offset {
-        /// How the record starts; not again an offset.
+        /// Other initial conditions, not an offset.
         under: Box<Initial>,
-        /// Whether the constant grows in proportion to time as well.
+        /// Whether the constant includes a ramp.
         ramp: bool,
     },
-    /// A sensor filter that is not at rest when the record starts. What the filter makes of signals from then on lacks
-    /// what it still holds of the time before: free motions of the filter, which are its answers to an impulse and to
-    /// derivatives of one.
+    /// Sensor filter with nonzero initial conditions.
+    ///
+    /// Filtered signals lack the response of the filter to inputs before the record. That transient is a sum of the
+    /// filter's responses to an impulse and to derivatives of one.
     Filtered {
-        /// How the record starts otherwise, an offset included; not again filtered.
+        /// Other initial conditions, possibly with an offset, not filtered.
         under: Box<Initial>,
-        /// Number of these answers.
+        /// Number of these responses.
         states: u8,
     },
 }
@@ -90,7 +90,7 @@ impl Equation {
         Ok(equation)
     }
 
-    /// Refuses an equation that a record of so many signals cannot carry, any of them being an input.
+    /// Return an error if a record with so many signals, all of them possible inputs, cannot supply the equation.
     ///
     /// # Errors
     /// As [`Structure::check`] and [`Equation::new`].
@@ -106,7 +106,7 @@ impl Equation {
 }
 
 impl Initial {
-    /// The same with an unknown constant on the right-hand side (1), or a constant and a ramp (2); 0 for neither.
+    /// Add an unknown constant on the right-hand side (1), or a constant and a ramp (2). 0 adds nothing.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for another number.
@@ -130,7 +130,7 @@ impl Initial {
         }
     }
 
-    /// The same where signals passed a filter of this relative degree that was not at rest; 0 for one that was.
+    /// Add the initial transient of a filter of this relative degree. 0 adds nothing.
     ///
     /// ```
     /// use ftlm::equation::{Initial, Structure};
@@ -146,7 +146,7 @@ impl Initial {
         }
     }
 
-    /// How the record starts, an offset and a filter left aside.
+    /// Initial conditions without offset and filter transient.
     #[must_use]
     pub fn under(&self) -> &Self {
         match self {
@@ -155,7 +155,7 @@ impl Initial {
         }
     }
 
-    /// Another start under the same offset and filter.
+    /// Other initial conditions with the same offset and filter transient.
     ///
     /// ```
     /// use ftlm::equation::Initial;
@@ -174,7 +174,7 @@ impl Initial {
         }
     }
 
-    /// The same start without an offset.
+    /// Initial conditions without the offset.
     ///
     /// ```
     /// use ftlm::equation::Initial;
@@ -193,15 +193,15 @@ impl Initial {
         }
     }
 
-    /// Whether the record starts at rest: before it all signals were zero.
+    /// Whether initial conditions are zero apart from offset and filter: all signals were zero before the record.
     #[must_use]
-    pub fn at_rest(&self) -> bool {
+    pub fn is_at_rest(&self) -> bool {
         *self.under() == Self::Rest
     }
 
-    /// The same of an output that no filter stands behind.
+    /// Initial conditions of an output without a sensor filter.
     #[must_use]
-    pub(crate) fn unfiltered(&self) -> &Self {
+    pub(crate) fn without_filter(&self) -> &Self {
         match self {
             Self::Filtered { under, .. } => under,
             other => other,
@@ -217,7 +217,7 @@ impl Initial {
         }
     }
 
-    /// Powers of t that an offset is, integrated under this α.
+    /// Exponents of t of an offset that is integrated by α.
     pub(crate) fn offset_exponents(&self, alpha: f64) -> Vec<f64> {
         match self {
             Self::Offset { ramp: true, .. } => vec![tidy(alpha), tidy(alpha + 1.0)],
@@ -227,13 +227,13 @@ impl Initial {
         }
     }
 
-    /// Exponents that stand for an impulse, −1, and its derivatives, −2 and on.
+    /// Exponents that stand for an impulse, −1, and its derivatives, −2, −3, ….
     pub(crate) fn impulses(&self) -> impl Iterator<Item = f64> {
         let states = if let Self::Filtered { states, .. } = self { *states } else { 0 };
         (1..=states).map(|k| -f64::from(k))
     }
 
-    /// Refuses exponents whose power of t has no mean over the first pulse.
+    /// Return an error for exponents whose power of t has no mean over the first pulse.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for an exponent of −1 or less, [`Error::NotFinite`].
@@ -253,11 +253,13 @@ impl Initial {
 }
 
 impl Structure {
-    /// Refuses orders that make no equation: α outside (0, 10], an own-output order outside [0, α), another outside
-    /// [0, α + 1) (an input's may be negative down to −3).
+    /// Return an error for invalid orders.
+    ///
+    /// α must be in (0, 10], orders of the output in [0, α), others in [0, α + 1). Orders of inputs may be negative
+    /// down to −3.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] naming the term, [`Error::Structure`] for a signal that is not there.
+    /// [`Error::OutOfRange`] naming the term, [`Error::Structure`] for a signal that does not exist.
     pub fn check(&self, signals: usize, is_input: impl Fn(usize) -> bool) -> Result<()> {
         let range = |name: String, value: f64, range: String, remedy: &str| Error::OutOfRange {
             name,
@@ -269,11 +271,11 @@ impl Structure {
             return Err(range("order alpha".into(), self.order, format!("(0, {MAX_ORDER}]"), "choose another order"));
         }
         if self.output >= signals {
-            return Err(missing(self.output, signals));
+            return Err(missing_signal_error(self.output, signals));
         }
         for (k, term) in self.terms.iter().enumerate() {
             if term.signal >= signals {
-                return Err(missing(term.signal, signals));
+                return Err(missing_signal_error(term.signal, signals));
             }
             let name = format!("order of term {k}");
             if term.signal == self.output {
@@ -293,16 +295,16 @@ impl Structure {
         Ok(())
     }
 
-    /// Order α − ν by which term k is integrated; below 0 it is differentiated.
+    /// Integration order α − ν of term k. Negative values differentiate.
     #[must_use]
     pub fn integration(&self, k: usize) -> f64 {
         tidy(self.order - self.terms[k].order)
     }
 
-    /// Exponents of the initial terms, distinct and ascending.
+    /// Distinct exponents of the initial terms, ascending.
     ///
-    /// Beside an offset, which is t^α, Caputo's powers within 0.05 of it are left out: an order just above a whole one
-    /// brings a power that just below it is not there, and t beside D^1.0003 is the offset by another name.
+    /// With an offset, which is t^α, Caputo's powers within 0.05 of α are omitted: t beside D^1.0003 is nearly
+    /// collinear with the offset.
     #[must_use]
     pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
         let mut exponents = match initial.under() {
@@ -318,7 +320,7 @@ impl Structure {
         };
         let offset = initial.offset_exponents(self.order);
         if *initial.under() == Initial::Caputo {
-            exponents.retain(|e| *e == 0.0 || offset.iter().all(|o| (e - o).abs() > STAND_IN));
+            exponents.retain(|e| *e == 0.0 || offset.iter().all(|o| (e - o).abs() > OFFSET_EXPONENT_TOLERANCE));
         }
         exponents.extend(offset);
         exponents.extend(initial.impulses());
@@ -334,9 +336,11 @@ pub fn alpha_fits(alpha: f64) -> bool {
     alpha > 0.0 && alpha <= MAX_ORDER
 }
 
-/// Whether a search tries a term of this order under α: of the output itself in [0, α), of another signal in [0, α], of
-/// an input in [−3, α]. Of another signal [`Structure::check`] lets more pass: beyond α a freely chosen term is a way to
-/// say that the output nearly equals itself.
+/// Whether an order search tries a term of this order under α.
+///
+/// Orders of the output are in [0, α), of another signal in [0, α], of an input in [−3, α]. [`Structure::check`] also
+/// admits higher orders of other signals. A search must not: with an order above α a free term nearly reproduces the
+/// output itself.
 #[must_use]
 pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
     if own {
@@ -346,7 +350,7 @@ pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
     }
 }
 
-fn missing(signal: usize, signals: usize) -> Error {
+fn missing_signal_error(signal: usize, signals: usize) -> Error {
     Error::Structure {
         what: format!("the equation names signal {signal}, but the record holds {signals}"),
         remedy: "give the record all signals of the equation".into(),
@@ -358,7 +362,7 @@ fn whole_below(order: f64) -> impl Iterator<Item = f64> {
     (0_u32..).map(f64::from).take_while(move |&i| i < order.min(MAX_ORDER) - ORDER_GRAIN)
 }
 
-/// An order rounded to the grain, so that equal orders are equal bits.
+/// Order rounded to the resolution, so that equal orders have equal bits.
 #[must_use]
 pub fn tidy(order: f64) -> f64 {
     let units = grains(order);
@@ -367,7 +371,7 @@ pub fn tidy(order: f64) -> f64 {
     tidied
 }
 
-/// An order in units of the grain: the key under which its regressor is kept.
+/// Order as an integer multiple of the resolution: the key of its regressor.
 #[must_use]
 #[allow(clippy::cast_possible_truncation)]
 pub fn grains(order: f64) -> i64 {
@@ -391,7 +395,7 @@ impl AffineOrder {
     }
 }
 
-/// A rational filter Σ b D^ν / Σ a D^ν, such as the low-pass that a logged deflection went through.
+/// Rational filter Σ b D^ν / Σ a D^ν, such as the low-pass filter of a sensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Filter {
     /// (coefficient, order) of the numerator.
@@ -401,10 +405,10 @@ pub struct Filter {
 }
 
 impl Filter {
-    /// The filter as a series of m pulses of `step` s, at rest before the record. O(terms · m + m log² m).
+    /// Filter as a series of m pulses of `step` s with zero initial conditions. O(terms · m + m log² m).
     ///
     /// # Errors
-    /// An improper filter, an order outside [0, 10], a denominator that starts with zero, a number that is not finite, a
+    /// An improper filter, an order outside [0, 10], a denominator that starts with zero, a value that is not finite, a
     /// step that is not positive, more points than memory holds.
     ///
     /// ```
@@ -446,13 +450,13 @@ impl Filter {
     }
 }
 
-/// All choices of columns are looked at, 2^n of them; a larger system goes unlooked.
+/// Largest checked system. All 2^n choices of columns are examined; larger systems are not checked.
 const MOST_EQUATIONS: usize = 16;
 
-/// Highest order of an entry of the system, its coefficient, and the sum of sizes that this coefficient is made of.
+/// Highest order of an entry, its coefficient, and the sum of the absolute values that make up the coefficient.
 type Leading = Option<(f64, f64, f64)>;
 
-fn added(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
+fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
     match sum {
         Some((highest, v, s)) if (order - highest).abs() < ORDER_GRAIN => Some((highest, v + value, s + size)),
         Some((highest, ..)) if order < highest => sum,
@@ -460,15 +464,17 @@ fn added(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
     }
 }
 
-/// Refuses equations that together leave some output undetermined: as operators in s their determinant must be of the
-/// order that its largest products say. Where those cancel, the equations repeat or contradict each other.
+/// Return an error if coupled equations leave an output undetermined.
+///
+/// As a polynomial in s the determinant must have the order of its largest products. If these cancel, the equations
+/// repeat or contradict each other.
 ///
 /// # Errors
 /// [`Error::Structure`].
 ///
 /// ```
 /// use ftlm::equation::{Equation, Structure, Term};
-/// // D x = c D^1.5 y, D^1.5 y = D x + u: the same twice where c is 1.
+/// D x = c D^1.5 y, D^1.5 y = D x + u: singular for c = 1.
 /// let pair = |c: f64| {
 ///     let of = |output, order, terms, c| Equation::new(Structure { output, order, terms }, c);
 ///     let first = of(0, 1.0, vec![Term { signal: 1, order: 1.5 }], vec![c])?;
@@ -488,13 +494,13 @@ pub fn check_regular(equations: &[Equation]) -> Result<()> {
         let mut sum = (i == j).then_some((structure.order, 1.0, 1.0));
         for (term, &c) in structure.terms.iter().zip(coefficients) {
             if term.signal == output && c != 0.0 {
-                sum = added(sum, term.order, -c, c.abs());
+                sum = add_leading_term(sum, term.order, -c, c.abs());
             }
         }
         sum
     };
     let entries: Vec<Vec<Leading>> = (0..n).map(|i| (0..n).map(|j| entry(i, j)).collect()).collect();
-    // Rows are taken in order; which columns they took is all that the rest needs to know.
+    // Rows are processed in order, so the set of used columns is the only state.
     let mut taken: Vec<Leading> = vec![None; 1 << n];
     taken[0] = Some((0.0, 1.0, 1.0));
     for columns in 0..(1usize << n) {
@@ -505,7 +511,7 @@ pub fn check_regular(equations: &[Equation]) -> Result<()> {
             let later = (columns >> j).count_ones();
             let sign = if later % 2 == 0 { 1.0 } else { -1.0 };
             let next = columns | (1 << j);
-            taken[next] = added(taken[next], order + o, sign * value * v, size * s);
+            taken[next] = add_leading_term(taken[next], order + o, sign * value * v, size * s);
         }
     }
     match taken[(1 << n) - 1] {

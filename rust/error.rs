@@ -1,46 +1,46 @@
-//! Every way a computation can fail, with its numbers and the way out.
+//! Errors of all computations, with the values found and a remedy.
 
 use thiserror::Error;
 
-/// What went wrong, named so that a person can act on it.
+/// Error with the cause and a remedy.
 ///
 /// [`Error::kind`] groups the variants for bindings: data, model, convergence, interruption, internal.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A signal holds a NaN or an infinity.
+    /// A signal contains NaN or infinity.
     #[error("{name} is not finite at index {index} ({count} such values in all); remove or replace these samples")]
     NotFinite {
-        /// Which argument.
+        /// Name of the argument.
         name: String,
-        /// First bad index.
+        /// Index of the first value that is not finite.
         index: usize,
-        /// How many values are not finite.
+        /// Number of values that are not finite.
         count: usize,
     },
-    /// Two things that must have the same length do not.
+    /// Lengths that must be equal differ.
     #[error("{name} has length {found}, but {expected} is needed; give signals of equal length")]
     Length {
-        /// Which argument.
+        /// Name of the argument.
         name: String,
-        /// Length needed.
+        /// Length that is required.
         expected: usize,
-        /// Length given.
+        /// Length found.
         found: usize,
     },
-    /// A number outside the range in which it means something.
+    /// A value is out of range.
     #[error("{name} = {value} is outside {range}; {remedy}")]
     OutOfRange {
-        /// Which argument.
+        /// Name of the argument.
         name: String,
-        /// The value given.
+        /// Value found.
         value: f64,
-        /// The range in words.
+        /// Valid range as text.
         range: String,
-        /// What to do.
+        /// Remedy.
         remedy: String,
     },
-    /// Haar coordinates asked for a length that is no power of two.
+    /// Haar coordinates of a length that is not a power of two.
     #[error("Haar coordinates need m to be a power of two, not {m}; take m = {below} or {above}, or block-pulse (time) coordinates")]
     NotPowerOfTwo {
         /// The length given.
@@ -50,13 +50,13 @@ pub enum Error {
         /// Nearest power of two above.
         above: usize,
     },
-    /// A series cannot be divided by one that starts with zero (or nearly so, for a coupled system).
+    /// Division by a series that starts with (nearly) zero. For a coupled system: a singular leading matrix.
     #[error("the series to divide by starts with {leading:e} at z^0; the equation is not solvable for its output (an own-output term of the highest order with coefficient 1?)")]
     LeadingZero {
         /// The leading coefficient, or the pivot of the leading matrix.
         leading: f64,
     },
-    /// Regressors that cannot be told apart.
+    /// Linearly dependent regressors.
     #[error("regressor {index} of {count} is a combination of the others to working precision; remove a term or move its order")]
     Singular {
         /// First dependent regressor.
@@ -64,106 +64,106 @@ pub enum Error {
         /// Number of regressors.
         count: usize,
     },
-    /// A lattice with no candidate in it.
+    /// Order grid without candidates.
     #[error("the lattice holds no candidate: {why}; widen the intervals or refine the step")]
-    EmptyLattice {
-        /// Which condition no order met.
+    EmptyOrderGrid {
+        /// Condition that no order satisfies.
         why: String,
     },
-    /// A lattice too large to search.
-    #[error("the lattice holds up to {count} candidates, more than the limit of {limit}: up to {} of one core at 10 ns each, as fast as searches are at best; take a larger step, narrower intervals or fixed orders", spent(*count))]
-    LatticeTooLarge {
-        /// Number of candidates, or of the tuples of its axes where they were not gone through.
+    /// Order grid with too many candidates.
+    #[error("the lattice holds up to {count} candidates, more than the limit of {limit}: up to {} of one core at 10 ns each, as fast as searches are at best; take a larger step, narrower intervals or fixed orders", format_search_time(*count))]
+    OrderGridTooLarge {
+        /// Number of candidates, or of all tuples of the axes if they were not enumerated.
         count: u128,
-        /// Largest number searched.
+        /// Largest number of candidates.
         limit: u128,
     },
-    /// A bank of regressors that would not fit the memory set aside for it.
+    /// Bank of regressors over the memory limit.
     #[error("the bank of {columns} regressors of {m} pulses and their products needs {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step or narrower intervals")]
     BankTooLarge {
         /// Number of columns.
         columns: usize,
         /// Pulses.
         m: usize,
-        /// Memory needed.
+        /// Memory needed, in bytes.
         bytes: u128,
-        /// Memory allowed.
+        /// Memory allowed, in bytes.
         limit: u128,
     },
-    /// What a search would hold at once does not fit the memory that it may take.
+    /// Working memory of a search over its limit.
     #[error("{what} need {bytes} bytes, more than the {limit} that a search may take; take a smaller m, a larger step, narrower intervals or fewer runs at once, or allow more by FTLM_MEMORY")]
     Memory {
-        /// What is to be held.
+        /// Data that need the memory.
         what: String,
-        /// Memory needed.
+        /// Memory needed, in bytes.
         bytes: u128,
-        /// Memory allowed.
+        /// Memory allowed, in bytes.
         limit: u128,
     },
-    /// An equation names a signal that the record does not hold, or is otherwise malformed.
+    /// Equation that is malformed, or one with a signal that the record does not have.
     #[error("{what}; {remedy}")]
     Structure {
-        /// What is wrong.
+        /// Cause.
         what: String,
-        /// What to do.
+        /// Remedy.
         remedy: String,
     },
-    /// A response or an estimate left the range of floating point.
+    /// Response or estimate that overflows.
     #[error("the {what} stopped being finite at index {index}; the model is unstable over this record")]
     Diverged {
-        /// Which computation.
+        /// Name of the computation.
         what: String,
-        /// First index that is not finite.
+        /// Index of the first value that is not finite.
         index: usize,
     },
-    /// Wherever a fit starts, it ends beyond the range of floating point.
+    /// Every start of a fit leads to a simulation that overflows.
     #[error("wherever it starts, the free run of {output} ends beyond the range of numbers: it grows; leave out the term that pushes, or bound its coefficient")]
     Beyond {
-        /// Which output.
+        /// Name of the output.
         output: String,
     },
-    /// Runs that could not be sampled as a fit asked.
+    /// Runs that cannot be sampled on the requested grid.
     #[error("runs could not be sampled: {why}; give runs that can be")]
     Source {
-        /// What their source said.
+        /// Message of the data source.
         why: String,
     },
     /// The caller asked to stop.
     #[error("interrupted")]
     Interrupted,
-    /// Threads that the system would not start.
+    /// Threads that the system cannot start.
     #[error("{threads} threads could not be started: {why}; ask for fewer")]
     Threads {
-        /// Number asked for.
+        /// Number of requested threads.
         threads: usize,
-        /// What the system said.
+        /// Message of the operating system.
         why: String,
     },
-    /// A fault in ftlm itself.
+    /// Internal error of ftlm.
     #[error("internal fault: {what}; please report it")]
     Internal {
-        /// What was found.
+        /// Condition that is violated.
         what: String,
     },
 }
 
-/// The family of an [`enum@Error`]; each becomes one exception class in Python.
+/// Category of an [`enum@Error`]. Each category is one exception class in Python.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// The data given cannot be used.
+    /// Invalid data.
     Data,
-    /// The model, the equation or the lattice cannot be used.
+    /// Invalid model, equation or order grid.
     Model,
-    /// A computation ended without an answer.
+    /// No convergence.
     Convergence,
-    /// The caller asked to stop.
+    /// Interruption by the caller.
     Interrupted,
-    /// A fault in ftlm.
+    /// Internal error of ftlm.
     Internal,
 }
 
 impl Error {
-    /// The family of this error.
+    /// Category of this error.
     #[must_use]
     pub fn kind(&self) -> Kind {
         match self {
@@ -179,7 +179,7 @@ impl Error {
 /// Result of a computation of this crate.
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Refuses a slice with a value that is not finite.
+/// Return an error if a value is not finite.
 ///
 /// # Errors
 /// [`Error::NotFinite`] with the first bad index and the count.
@@ -199,7 +199,7 @@ pub fn check_finite(name: &str, values: &[f64]) -> Result<()> {
     }
 }
 
-/// Refuses a length other than the one needed.
+/// Return an error if a length differs from the expected one.
 ///
 /// # Errors
 /// [`Error::Length`] with both lengths.
@@ -211,9 +211,9 @@ pub fn check_length(name: &str, expected: usize, found: usize) -> Result<()> {
     }
 }
 
-/// What so many candidates take at 10 ns each, in words.
+/// Shortest duration of a search over so many candidates, at 10 ns each, as text.
 #[allow(clippy::cast_precision_loss)]
-fn spent(candidates: u128) -> String {
+fn format_search_time(candidates: u128) -> String {
     let seconds = candidates as f64 * 1e-8;
     let units = [("years", 31_557_600.0), ("days", 86_400.0), ("hours", 3600.0), ("minutes", 60.0)];
     let (unit, size) = units.into_iter().find(|(_, size)| seconds >= 2.0 * size).unwrap_or(("seconds", 1.0));
@@ -225,7 +225,7 @@ fn spent(candidates: u128) -> String {
     }
 }
 
-/// Refuses a step that is not a positive, finite number.
+/// Return an error for a step that is not positive and finite.
 ///
 /// # Errors
 /// [`Error::OutOfRange`].
@@ -242,11 +242,11 @@ pub fn check_step(step: f64) -> Result<()> {
     }
 }
 
-/// Most points of a series or a record: a hundred times the longest runs, a gigabyte a signal, and far below 2³¹, where
-/// the tables of prime divisors end. More is a slip of the hand that would exhaust memory.
+/// Most points of a series or a record: a gigabyte a signal, a hundred times the longest runs, and far below 2³¹, where
+/// the tables of prime divisors end. A larger number is a mistake that would exhaust memory.
 pub const MOST_POINTS: usize = 1 << 27;
 
-/// Refuses a number of points beyond [`MOST_POINTS`].
+/// Return an error for more points than [`MOST_POINTS`].
 ///
 /// # Errors
 /// [`Error::OutOfRange`].
@@ -263,10 +263,10 @@ pub fn check_points(name: &str, m: usize) -> Result<()> {
     })
 }
 
-/// Largest side of a dense matrix: two gigabytes. They are for study.
+/// Largest size of a dense matrix: two gigabytes. Dense matrices serve study only.
 pub const LARGEST_DENSE: usize = 1 << 14;
 
-/// Refuses a dense matrix without rows, or with more than [`LARGEST_DENSE`].
+/// Return an error for a dense matrix without rows or with more than [`LARGEST_DENSE`].
 ///
 /// # Errors
 /// [`Error::OutOfRange`].

@@ -1,8 +1,7 @@
-//! Plans, lengths and scratch for real Fourier transforms; the only user of `realfft`.
+//! Real fast Fourier transforms: shared plans, fast lengths and scratch memory. The only user of `realfft`.
 //!
-//! Transforms are unnormalised forward and divided by their length on the way back, so a product of
-//! spectra is a cyclic convolution. Scratch belongs to the caller ([`Workspace`]): plans are shared,
-//! workspaces are one per thread.
+//! Forward transforms are not normalized, inverse transforms are divided by the length. A product of spectra is thus a
+//! cyclic convolution. Plans are shared, scratch belongs to the caller: one [`Workspace`] a thread.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -12,12 +11,12 @@ use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
 pub use realfft::num_complex::Complex;
 
-use crate::parallel::Shared;
+use crate::parallel::ForkSafeLock;
 
-/// One complex number of a spectrum.
+/// Complex value of one frequency bin.
 pub type Bin = Complex<f64>;
 
-/// A forward and an inverse real transform of one even length.
+/// Forward and inverse real transform of one even length.
 #[derive(Clone)]
 pub struct Plan {
     len: usize,
@@ -25,13 +24,13 @@ pub struct Plan {
     inverse: Arc<dyn ComplexToReal<f64>>,
 }
 
-/// Scratch of the transforms of one thread; grows to the largest plan it has met.
+/// Scratch memory of one thread. It grows to the largest plan used.
 #[derive(Default)]
 pub struct Workspace {
     scratch: Vec<Bin>,
 }
 
-/// Smallest even 5-smooth length that is at least `n`: the lengths at which the transform is fast.
+/// Smallest even 5-smooth length of at least `n`. Transforms are fast at these lengths.
 #[must_use]
 pub fn fast_length(n: usize) -> usize {
     let mut len = n.max(2);
@@ -49,28 +48,29 @@ pub fn fast_length(n: usize) -> usize {
     }
 }
 
-/// Longest transform whose plan is kept for good; a plan holds some 20 bytes a point.
-const KEPT: usize = 1 << 14;
-/// Points of all longer ones together beyond which those asked for longest ago are forgotten: a run on ever finer grids
-/// would leave the plans of all of them behind. What is forgotten too early costs two transforms once more.
-const POINTS: usize = 1 << 20;
-/// Those among so many long ones asked for last are in use: one evaluation of a large problem may hold more points than
-/// these.
+/// Longest transform whose plan is never evicted. A plan takes about 20 bytes a point.
+const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
+/// Total points of longer plans above which the least recently used are evicted.
+///
+/// Refining a grid again and again would otherwise leave all its plans in memory. A plan evicted too early costs two
+/// transforms.
+const MAX_CACHED_PLAN_POINTS: usize = 1 << 20;
+/// Long plans among so many recent requests are in use and stay, even above the limit: one evaluation of a large
+/// problem may need more points.
 const IN_USE: u64 = 16;
 
-/// Plans by length, each with when it was last asked for.
+/// Plans by length, each with the number of its last request.
 struct Plans {
     asked: u64,
     made: BTreeMap<usize, (Plan, u64)>,
 }
 
-/// Plans that any thread may take. Short ones are taken once a thread; what many threads ask for all the time, none waits
-/// for.
-static SHARED: Shared<Plans> = Shared::new(Plans::new());
+/// Plans of all threads. Each thread copies short ones once, so that no thread waits for a lock.
+static SHARED_PLANS: ForkSafeLock<Plans> = ForkSafeLock::new(Plans::new());
 
 thread_local! {
-    /// Short plans that this thread has asked for, and those that it made while the shared ones were not to be had.
-    static OWN: RefCell<Plans> = const { RefCell::new(Plans::new()) };
+    /// Short plans that this thread requested, and plans that it computed while the lock was unavailable.
+    static THREAD_PLANS: RefCell<Plans> = const { RefCell::new(Plans::new()) };
 }
 
 impl Plans {
@@ -80,33 +80,38 @@ impl Plans {
 
     fn find(&mut self, len: usize) -> Option<Plan> {
         let (plan, last) = self.made.get_mut(&len)?;
-        if len > KEPT {
+        if len > MAX_PERMANENT_PLAN_POINTS {
             self.asked += 1;
             *last = self.asked;
         }
         Some(plan.clone())
     }
 
-    /// Keeps a plan, unless another thread's of its length is here, and gives that which is kept; beside it those that are
-    /// forgotten for it, so that a lock on these plans need not wait for their memory.
+    /// Store a plan, unless one of its length exists, and return the stored one with the evicted plans.
+    ///
+    /// The caller drops the evicted plans outside the lock.
     fn keep(&mut self, plan: Plan) -> (Plan, Vec<Plan>) {
         let len = plan.len;
         if let Some(there) = self.find(len) {
             return (there, vec![plan]);
         }
         let mut forgotten = Vec::new();
-        if len > KEPT {
+        if len > MAX_PERMANENT_PLAN_POINTS {
             self.asked += 1;
-            forgotten = self.make_room(POINTS.saturating_sub(len));
+            forgotten = self.make_room(MAX_CACHED_PLAN_POINTS.saturating_sub(len));
         }
         self.made.insert(len, (plan.clone(), self.asked));
         (plan, forgotten)
     }
 
-    /// Forgets long plans, the one asked for longest ago first, until no more points than these are left.
+    /// Evict long plans, the least recently used first, until at most this many points are left.
     fn make_room(&mut self, points: usize) -> Vec<Plan> {
-        let mut long: Vec<(u64, usize)> =
-            self.made.iter().map(|(&len, &(_, last))| (last, len)).filter(|&(_, len)| len > KEPT).collect();
+        let mut long: Vec<(u64, usize)> = self
+            .made
+            .iter()
+            .map(|(&len, &(_, last))| (last, len))
+            .filter(|&(_, len)| len > MAX_PERMANENT_PLAN_POINTS)
+            .collect();
         long.sort_unstable();
         let mut held: usize = long.iter().map(|&(_, len)| len).sum();
         let mut forgotten = Vec::new();
@@ -121,46 +126,47 @@ impl Plans {
     }
 }
 
-/// The plan of a length, shared by all that ask for it; [`fast_length`] gives good ones. Of long ones only the last are
-/// kept.
+/// Plan of a length, shared by all threads. See [`fast_length`] for fast lengths.
+///
+/// Long plans that were not used recently are evicted.
 ///
 /// ```
 /// use ftlm::fft::{plan, Complex, Workspace};
 /// let plan = plan(4);
 /// let (mut time, mut spectrum) = (vec![1.0, 2.0, 3.0, 4.0], vec![Complex::default(); plan.bins()]);
-/// plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+/// plan.transform(&mut time, &mut spectrum, &mut Workspace::new());
 /// assert_eq!(spectrum[0], Complex::new(10.0, 0.0));
 /// ```
 #[must_use]
 pub fn plan(len: usize) -> Plan {
-    if let Some(plan) = OWN.with_borrow_mut(|own| own.find(len)) {
+    if let Some(plan) = THREAD_PLANS.with_borrow_mut(|own| own.find(len)) {
         return plan;
     }
-    let (plan, shared) = match SHARED.with(|plans| plans.find(len)).flatten() {
+    let (plan, shared) = match SHARED_PLANS.with(|plans| plans.find(len)).flatten() {
         Some(plan) => (plan, true),
         None => {
-            // None is made behind a lock: where two threads make the same one at once, the later one is dropped.
+            // Plans are computed outside the lock. If two threads compute the same one, the later one is dropped.
             let made = Plan::new(len);
-            match SHARED.with(|plans| plans.keep(made.clone())) {
+            match SHARED_PLANS.with(|plans| plans.keep(made.clone())) {
                 Some((plan, _forgotten)) => (plan, true),
                 None => (made, false),
             }
         }
     };
-    if len <= KEPT || !shared {
-        OWN.with_borrow_mut(|own| own.keep(plan.clone()));
+    if len <= MAX_PERMANENT_PLAN_POINTS || !shared {
+        THREAD_PLANS.with_borrow_mut(|own| own.keep(plan.clone()));
     }
     plan
 }
 
-/// Squared magnitudes of a signal's transform, from frequency 0 to Nyquist's, zero-padded to a fast length.
+/// Power spectrum of a signal: squared magnitudes from zero to the Nyquist frequency, zero-padded to a fast length.
 #[must_use]
 pub fn power_spectrum(signal: impl ExactSizeIterator<Item = f64>) -> Vec<f64> {
     let plan = plan(fast_length(signal.len()));
     let mut time: Vec<f64> = signal.collect();
     time.resize(plan.len(), 0.0);
     let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-    plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+    plan.transform(&mut time, &mut spectrum, &mut Workspace::new());
     spectrum.iter().map(Bin::norm_sqr).collect()
 }
 
@@ -176,7 +182,7 @@ impl Plan {
         self.len
     }
 
-    /// Never true: a plan has at least two points.
+    /// Always false: a plan has at least two points.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len == 0
@@ -188,14 +194,14 @@ impl Plan {
         self.len / 2 + 1
     }
 
-    /// Spectrum of `time`, whose content is destroyed. `time` has `len`, `spectrum` has `bins` elements.
+    /// Transform `time` into `spectrum`. `time` has `len` elements and is overwritten, `spectrum` has `bins`.
     ///
     /// # Panics
-    /// For other lengths: a fault of the caller's program, whatever the data.
-    pub fn forward(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
+    /// If the lengths differ. That is an error of the caller, whatever the data.
+    pub fn transform(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
         self.check(time.len(), spectrum.len());
         let scratch = workspace.at_least(self.forward.get_scratch_len());
-        // The transform refuses nothing but lengths, which are right.
+        // The transform can only fail on lengths, which were checked.
         let done = self.forward.process_with_scratch(time, spectrum, scratch);
         assert!(done.is_ok(), "the forward transform refused its own lengths");
     }
@@ -209,13 +215,13 @@ impl Plan {
         );
     }
 
-    /// Signal of `spectrum`, divided by the length; the spectrum's content is destroyed.
+    /// Inverse transform of `spectrum`, divided by the length. `spectrum` is overwritten.
     ///
     /// # Panics
-    /// As [`Plan::forward`].
+    /// As [`Plan::transform`].
     pub fn inverse(&self, spectrum: &mut [Bin], time: &mut [f64], workspace: &mut Workspace) {
         self.check(time.len(), spectrum.len());
-        // The transform refuses an imaginary part in the two bins that a real signal keeps real.
+        // The transform rejects an imaginary part in the two bins that are real for a real signal.
         if let Some(first) = spectrum.first_mut() {
             first.im = 0.0;
         }
@@ -257,14 +263,14 @@ mod tests {
     #[allow(clippy::cast_precision_loss)]
     fn is_sound(plan: &Plan) -> bool {
         let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        plan.forward(&mut vec![1.0; plan.len()], &mut spectrum, &mut Workspace::new());
+        plan.transform(&mut vec![1.0; plan.len()], &mut spectrum, &mut Workspace::new());
         (spectrum[0].re - plan.len() as f64).abs() < 1e-6 && spectrum[1].norm() < 1e-6
     }
 
     #[test]
     fn long_plans_are_forgotten_that_nobody_asks_for() {
         let mut plans = Plans::new();
-        let (short, long, next) = (64, POINTS / 2, POINTS / 2 + 2);
+        let (short, long, next) = (64, MAX_CACHED_PLAN_POINTS / 2, MAX_CACHED_PLAN_POINTS / 2 + 2);
         let keep = |plans: &mut Plans, len| plans.keep(Plan::new(len)).1.len();
         for len in [short, long, next] {
             assert_eq!(keep(&mut plans, len), 0, "in use");
@@ -288,8 +294,8 @@ mod tests {
 
     #[test]
     fn a_lock_that_is_never_given_back_stops_no_plan() {
-        for len in [90, KEPT + 2] {
-            let (first, second) = SHARED.held(|| (plan(len), plan(len)));
+        for len in [90, MAX_PERMANENT_PLAN_POINTS + 2] {
+            let (first, second) = SHARED_PLANS.hold_during(|| (plan(len), plan(len)));
             assert!(is_sound(&first));
             assert!(Arc::ptr_eq(&first.forward, &second.forward), "made once");
         }

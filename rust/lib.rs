@@ -1,18 +1,18 @@
 //! Fractional-order models of flexible machines from measured data.
 //!
-//! The modules in the order in which a measurement passes them:
+//! Modules in the order of data flow:
 //!
-//! 1. [`signal`]: point samples become means over block pulses, and means samples at times of their own;
+//! 1. [`signal`]: point samples become means over block pulses, and pulse means become nonuniform samples;
 //! 2. [`fractional`], [`series`]: fractional integrals as truncated power series in the one-step delay, and the
-//!    operational matrices of the literature beside them ([`fft`], [`linalg`] and [`simd`] serve them);
-//! 3. [`equation`]: terms, orders, order laws, sensor filters; whether equations tell their outputs apart;
+//!    operational matrices of the literature; [`fft`], [`linalg`] and [`simd`] serve them;
+//! 3. [`equation`]: terms, orders, order laws, sensor filters; solvability of coupled equations;
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
-//! 5. [`estimation`]: coefficients at given orders by least squares, multi-innovation least squares and instrumental
-//!    variables; orders and coefficients together by joint output error; [`friction`]: free runs of a body that
-//!    may stick, and their output error;
-//! 6. [`order_search`]: the orders themselves, exhaustively over a lattice;
-//! 7. [`simulate`], [`signal::metrics`]: free runs, the two errors, and what they amount to; [`signal::statistics`]:
-//!    what the residuals say.
+//! 5. [`estimation`]: coefficients at fixed orders by least squares, multi-innovation least squares and instrumental
+//!    variables; orders and coefficients together by joint output error; [`friction`]: simulation and output error
+//!    with dry friction;
+//! 6. [`order_search`]: orders by exhaustive search over an order grid;
+//! 7. [`simulate`], [`signal::metrics`]: simulation, output and equation error, figures of merit;
+//!    [`signal::statistics`]: residual analysis.
 //!
 //! ```
 //! use ftlm::equation::{Equation, Initial, Structure, Term};
@@ -37,10 +37,11 @@
 //!
 //! # Features
 //!
-//! None is on by default. `rig`: [`rig`], the simulated arm and the guard between commands and motors. `oracles`: the slow
-//! computations by definition that tests compare the fast ones with. `python`: the bindings, with both of these.
+//! None is on by default. `rig`: [`rig`], the simulated arm and the safety guard of the rigs. `oracles`: slow
+//! computations by definition, against which tests compare the fast ones. `python`: the Python bindings, with both of
+//! these.
 //!
-//! The mathematics knows no file, no clock (but for the pace of the virtual rig) and no Python.
+//! Numerical code does not access files, clocks (except the timer of the virtual rig) or Python.
 #![forbid(unsafe_op_in_unsafe_fn)]
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
 #![cfg_attr(docsrs, feature(doc_cfg))]

@@ -1,13 +1,10 @@
-//! Work on the threads of the pool at hand; one after the other where there is none, since a global pool hangs after a fork.
+//! Parallel execution: parallel map, thread pool of one search, fork-safe locks and cancellation.
 //!
-//! The thread pool of one search, and memory that each of its threads reuses.
+//! A global thread pool hangs after a fork, so work runs on the pool of the current search, or serially if there
+//! is none.
 //!
-//! What all threads share and none waits for.
-//!
-//! After a fork the child has one thread and every lock as it was: one that another thread held stays locked for good.
-//! So a lock here is tried for some microseconds, far longer than it is ever held, and then done without.
-//!
-//! A computation that is told to stop.
+//! After a fork the child has one thread, and a lock that another thread held stays locked for good. Locks here are
+//! tried for some microseconds, far longer than any thread holds them. Then the caller continues without the value.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, TryLockError};
@@ -16,8 +13,10 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 
-/// What each item comes to, in the order of the items; each thread reuses its scratch. What an item comes to must not
-/// depend on the scratch: results are the same for any number of threads.
+/// Map `work` over the items, in parallel if a thread pool is installed.
+///
+/// Results keep the order of the items. Each thread reuses its scratch. `work` must give the same result for any
+/// scratch, so that results do not depend on the number of threads.
 pub(crate) fn map<T, S, R>(
     items: Vec<T>,
     scratch: impl Fn() -> S + Sync + Send,
@@ -35,13 +34,13 @@ where
     }
 }
 
-/// Most threads a search starts.
+/// Maximum number of threads of a search.
 pub const MAX_THREADS: usize = 1024;
 
-/// A thread pool of its own for one search: a global one hangs after a fork.
+/// Build a separate thread pool for one search. A global pool hangs after a fork.
 ///
 /// # Errors
-/// [`Error::OutOfRange`] for a number outside 1 to [`MAX_THREADS`], [`Error::Threads`] where the system starts no more.
+/// [`Error::OutOfRange`] for a number outside 1 to [`MAX_THREADS`], [`Error::Threads`] if the system cannot start them.
 ///
 /// ```
 /// # use ftlm::parallel::pool;
@@ -66,7 +65,7 @@ pub fn pool(threads: usize) -> Result<rayon::ThreadPool> {
         .map_err(|e| Error::Threads { threads, why: e.to_string() })
 }
 
-/// One memory a thread.
+/// One workspace per thread.
 pub(crate) struct PerThread<T>(Vec<Mutex<T>>);
 
 impl<T: Default> PerThread<T> {
@@ -79,7 +78,7 @@ impl<T: Default> PerThread<T> {
         self.0.len()
     }
 
-    /// Works with the memory of the thread at hand.
+    /// Call a function with the workspace of the current thread.
     pub(crate) fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> R {
         let thread = rayon::current_thread_index().unwrap_or(0) % self.0.len();
         let mut memory = self.0[thread].lock().unwrap_or_else(PoisonError::into_inner);
@@ -87,41 +86,41 @@ impl<T: Default> PerThread<T> {
     }
 }
 
-/// How often a lock is tried before it is done without, and how many of these tries keep the processor.
-const TRIES: usize = 128;
-const SPINS: usize = 64;
+/// Attempts to take a lock, and how many of them spin before the thread yields.
+const MAX_LOCK_ATTEMPTS: usize = 128;
+const SPIN_LOCK_ATTEMPTS: usize = 64;
 
-/// A value behind a lock that nobody waits for.
-pub(crate) struct Shared<T>(Mutex<T>);
+/// Value behind a lock with a bounded number of attempts.
+pub(crate) struct ForkSafeLock<T>(Mutex<T>);
 
-impl<T> Shared<T> {
+impl<T> ForkSafeLock<T> {
     pub(crate) const fn new(value: T) -> Self {
         Self(Mutex::new(value))
     }
 
-    /// What a short piece of work on the value comes to; none where its lock is not to be had.
+    /// Run short work on the value. None if the lock cannot be taken.
     pub(crate) fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> Option<R> {
-        for turn in 0..TRIES {
+        for turn in 0..MAX_LOCK_ATTEMPTS {
             match self.0.try_lock() {
                 Ok(mut value) => return Some(work(&mut value)),
-                // Only means that another thread died at its work, which leaves values whole.
+                // Poison means that another thread panicked, which leaves the values intact.
                 Err(TryLockError::Poisoned(value)) => return Some(work(&mut value.into_inner())),
-                Err(TryLockError::WouldBlock) if turn < SPINS => std::hint::spin_loop(),
+                Err(TryLockError::WouldBlock) if turn < SPIN_LOCK_ATTEMPTS => std::hint::spin_loop(),
                 Err(TryLockError::WouldBlock) => std::thread::yield_now(),
             }
         }
         None
     }
 
-    /// Holds the lock while something is done, as a thread does that a fork does not take along.
+    /// Hold the lock during `meanwhile`, like a thread that does not survive a fork.
     #[cfg(test)]
-    pub(crate) fn held<R>(&self, meanwhile: impl FnOnce() -> R) -> R {
+    pub(crate) fn hold_during<R>(&self, meanwhile: impl FnOnce() -> R) -> R {
         let _value = self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         meanwhile()
     }
 }
 
-/// Set from any thread, looked at by the one that computes; its clones are the same stop.
+/// Cancellation flag, set by any thread and polled by the computing one. Clones share the flag.
 ///
 /// ```
 /// let stop = ftlm::parallel::Stop::default();
@@ -133,18 +132,18 @@ impl<T> Shared<T> {
 pub struct Stop(Arc<AtomicBool>);
 
 impl Stop {
-    /// Tells whoever looks to stop.
+    /// Request cancellation.
     pub fn set(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// Whether it was told.
+    /// Whether cancellation was requested.
     #[must_use]
     pub fn is_set(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 
-    /// Refuses to go on once it was told.
+    /// Return an error after cancellation was requested.
     ///
     /// # Errors
     /// [`Error::Interrupted`].
@@ -159,14 +158,14 @@ impl Stop {
 
 #[cfg(test)]
 mod tests {
-    use super::Shared;
+    use super::ForkSafeLock;
 
     #[test]
     #[allow(clippy::panic)]
     fn a_lock_that_is_held_is_done_without() {
-        let shared = Shared::new(3);
+        let shared = ForkSafeLock::new(3);
         assert_eq!(shared.with(|value| *value), Some(3));
-        assert_eq!(shared.held(|| shared.with(|value| *value)), None);
+        assert_eq!(shared.hold_during(|| shared.with(|value| *value)), None);
         assert_eq!(shared.with(|value| *value), Some(3));
         let fault = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
             shared.with(|_| std::panic::panic_any("on purpose"));

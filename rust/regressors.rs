@@ -1,10 +1,9 @@
-//! Records and equations become one bank of distinct regressors I^η s, shared by all candidates of a search.
+//! Regressors of records: a bank of distinct columns I^η s, shared by all candidates, with filter transients as
+//! impulses.
 //!
-//! What the sensor filter of an output still held when a run began: its answers to an impulse and to derivatives of one.
-//!
-//! They are written as powers of t below zero, −1, −2, …, among the initial terms of an equation. They move nothing, and are
-//! added to the output that came through the sensor. Only where the whole equation is put through the filter afterwards, with
-//! an output that was not measured through it, do they drive the equation like others: what drives then held them.
+//! Filter transients are written as initial terms with the exponents −1, −2, …. They act on the sensor only, so they
+//! are added to the output of the equation. If the whole equation is filtered afterwards and its output is not measured
+//! through the filter, they enter the equation as inputs instead.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -14,28 +13,28 @@ use crate::fractional::kernels::{kernel, power_means, power_pulses};
 use crate::parallel::{self, Stop};
 use crate::series::{self, Buffers, Kernel};
 
-/// Largest bank that is made for itself, and what a search takes in all where no other limit is given, in bytes.
+/// Memory limit of a single bank, and default limit of a search, in bytes.
 pub const BANK_LIMIT: u64 = 2 << 30;
 
-/// One run as pulse means: all signals over the same m pulses of length `step`.
+/// Run as pulse means: all signals over the same m pulses of length `step`.
 #[derive(Debug, Clone)]
 pub struct Record {
     step: f64,
     signals: Vec<Vec<f64>>,
     filter: Option<Vec<f64>>,
     clean: Option<Vec<Vec<f64>>>,
-    /// Signals whose own sensor may still have held something when the run began; none where it is empty.
-    held: Vec<bool>,
-    /// Signals less the level at which they began, where there is one; of none where it is empty.
-    moving: Vec<Option<Vec<f64>>>,
-    /// Answers of the filter to an impulse and to derivatives of one, where they are known better than by pulses.
-    answers: Vec<Vec<f64>>,
+    /// Signals whose own sensor filter may have an initial transient. Empty if none has.
+    filter_transients: Vec<bool>,
+    /// Signals minus their initial level, if it is not zero. Empty if all levels are zero.
+    deviations: Vec<Option<Vec<f64>>>,
+    /// Filter responses to an impulse and to its derivatives, if known more accurately than by pulses.
+    impulse_responses: Vec<Vec<f64>>,
 }
 
 impl Record {
-    /// Checks and takes over pulse means; all signals of equal, non-zero length and finite.
+    /// Record of finite pulse means. All signals have the same nonzero length.
     ///
-    /// `filter` is the series that the signals went through (a known sensor filter), to be applied to initial terms.
+    /// `filter` is the series of a known sensor filter that the signals passed. It is applied to initial terms.
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::NotFinite`] naming the signal by number, [`Error::OutOfRange`] for the step.
@@ -54,13 +53,21 @@ impl Record {
             check_length("filter", m, series.len())?;
             check_finite("filter", series)?;
         }
-        Ok(Self { step, signals, filter, clean: None, held: Vec::new(), moving: Vec::new(), answers: Vec::new() })
+        Ok(Self {
+            step,
+            signals,
+            filter,
+            clean: None,
+            filter_transients: Vec::new(),
+            deviations: Vec::new(),
+            impulse_responses: Vec::new(),
+        })
     }
 
-    /// Gives every signal a substitute without most of its noise, for instrumental variables.
+    /// Add a low-noise substitute of every signal, for instrumental variables.
     ///
     /// # Errors
-    /// As [`Record::new`]; [`Error::Length`] where there are not as many substitutes as signals.
+    /// [`Error::Length`] for another number of substitutes than signals, and as [`Record::new`].
     pub fn with_clean(mut self, clean: Vec<Vec<f64>>) -> Result<Self> {
         check_length("clean signals", self.signals.len(), clean.len())?;
         for (i, signal) in clean.iter().enumerate() {
@@ -72,65 +79,76 @@ impl Record {
         Ok(self)
     }
 
-    /// The record of the substitutes, or this one where it has none.
+    /// Record of the substitutes, or a copy if there are none.
     #[must_use]
-    pub fn cleaned(&self) -> Self {
+    pub fn clean_record(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
-        let (held, moving, answers) = (self.held.clone(), Vec::new(), self.answers.clone());
-        Self { step: self.step, signals, filter: self.filter.clone(), clean: None, held, moving, answers }
+        let (held, moving, answers) = (self.filter_transients.clone(), Vec::new(), self.impulse_responses.clone());
+        Self {
+            step: self.step,
+            signals,
+            filter: self.filter.clone(),
+            clean: None,
+            filter_transients: held,
+            deviations: moving,
+            impulse_responses: answers,
+        }
     }
 
-    /// The record of the substitutes for all signals but one.
+    /// Record of the substitutes for all signals but one.
     ///
     /// # Panics
-    /// Where there is no such signal.
+    /// If the signal does not exist.
     #[must_use]
-    pub fn cleaned_but(&self, signal: usize) -> Self {
-        let mut cleaned = self.cleaned();
+    pub fn clean_record_except(&self, signal: usize) -> Self {
+        let mut cleaned = self.clean_record();
         cleaned.signals[signal].clone_from(&self.signals[signal]);
         cleaned
     }
 
-    /// All signals, and with them the initial terms, behind a causal filter given as a series of m terms.
+    /// Record whose signals and initial terms pass a causal filter, given as a series of m terms.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`] where the filter blows up.
+    /// [`Error::Length`], [`Error::NotFinite`] if the filter overflows.
     ///
     /// ```
     /// # use ftlm::regressors::Record;
     /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?;
-    /// assert_eq!(record.through(&[0.0, 1.0, 0.0])?.signal(0), [0.0, 1.0, 2.0]);
+    /// assert_eq!(record.with_filter(&[0.0, 1.0, 0.0])?.signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn through(&self, filter: &[f64]) -> Result<Self> {
+    pub fn with_filter(&self, filter: &[f64]) -> Result<Self> {
         let m = self.m();
         check_length("filter", m, filter.len())?;
         let filtered = |series: &Vec<f64>| series::multiply(filter, series, m);
         let known = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
         let mut through = Self::new(self.step, self.signals.iter().map(filtered).collect(), Some(known))?;
-        through.held.clone_from(&self.held);
-        through.moving = self.moving.iter().map(|moving| moving.as_ref().map(filtered)).collect();
+        through.filter_transients.clone_from(&self.filter_transients);
+        through.deviations = self.deviations.iter().map(|moving| moving.as_ref().map(filtered)).collect();
         Ok(through)
     }
 
-    /// The same of a run in motion: which signals came through a sensor that may still have held something of the time
-    /// before, the level at which each signal began, and pulse means of the filter's answers to an impulse and to
-    /// derivatives of one, as far as they are known.
+    /// Record with nonzero initial conditions.
     ///
-    /// A derivative above its equation's order drives by what a signal is above its level: from a jump that only the
-    /// record's beginning makes none is taken, and what the time before left is for the initial terms to say.
+    /// `held` marks signals whose sensor filter may have an initial transient. `levels` are the initial levels of the
+    /// signals. `answers` are pulse means of the filter's responses to an impulse and to its derivatives, as far as
+    /// they are known.
+    ///
+    /// An improper term differentiates the deviation of a signal from its level, so that the start of the record is not
+    /// seen as a jump. Initial terms describe the effect of earlier inputs.
     ///
     /// # Errors
-    /// [`Error::Length`] where there are not as many of both as signals, or answers of other lengths;
-    /// [`Error::NotFinite`] for a level or an answer that is none.
+    /// [`Error::Length`] for other numbers of flags or levels than signals, or responses of other lengths;
+    /// [`Error::NotFinite`] for a level or a response.
     ///
     /// ```
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?.begun(vec![false], &[1.0], Vec::new())?;
-    /// assert_eq!(record.moving(0), [0.0, 1.0, 2.0]);
+    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?;
+    /// let record = record.with_initial_state(vec![false], &[1.0], Vec::new())?;
+    /// assert_eq!(record.deviation_signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn begun(mut self, held: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
+    pub fn with_initial_state(mut self, held: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
         check_length("signals whose sensor held something", self.len(), held.len())?;
         check_length("levels of signals", self.len(), levels.len())?;
         check_finite("level of a signal", levels)?;
@@ -142,42 +160,42 @@ impl Record {
         let above = |(signal, &level): (&Vec<f64>, &f64)| {
             (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
         };
-        self.moving = self.signals.iter().zip(levels).map(above).collect();
-        (self.held, self.answers) = (held, answers);
+        self.deviations = self.signals.iter().zip(levels).map(above).collect();
+        (self.filter_transients, self.impulse_responses) = (held, answers);
         Ok(self)
     }
 
-    /// Pulse means of a signal above the level at which it began, see [`Record::begun`].
+    /// Pulse means of a signal minus its initial level, see [`Record::with_initial_state`].
     ///
     /// # Panics
-    /// Where there is no such signal.
+    /// If the signal does not exist.
     #[must_use]
-    pub fn moving(&self, index: usize) -> &[f64] {
-        self.moving.get(index).and_then(Option::as_ref).unwrap_or(&self.signals[index])
+    pub fn deviation_signal(&self, index: usize) -> &[f64] {
+        self.deviations.get(index).and_then(Option::as_ref).unwrap_or(&self.signals[index])
     }
 
-    /// What a term drives by that is integrated by `eta`: below 0 by what moves.
-    pub(crate) fn driver(&self, index: usize, eta: f64) -> &[f64] {
+    /// Signal of a term that is integrated by `eta`: its deviation from the initial level for `eta` below 0.
+    pub(crate) fn term_signal(&self, index: usize, eta: f64) -> &[f64] {
         if eta < 0.0 {
-            self.moving(index)
+            self.deviation_signal(index)
         } else {
             self.signal(index)
         }
     }
 
-    /// Whether a signal came through a sensor that may still have held something when the run began.
+    /// Whether a signal passed a sensor filter that may have an initial transient.
     #[must_use]
-    pub fn is_held(&self, index: usize) -> bool {
-        self.held.get(index).copied().unwrap_or(false)
+    pub fn has_filter_transient(&self, index: usize) -> bool {
+        self.filter_transients.get(index).copied().unwrap_or(false)
     }
 
-    /// Whether signals and initial terms went through a sensor filter.
+    /// Whether signals and initial terms passed a sensor filter.
     #[must_use]
     pub fn is_filtered(&self) -> bool {
         self.filter.is_some()
     }
 
-    /// The series of that filter.
+    /// Series of the sensor filter.
     pub(crate) fn filter(&self) -> Option<&[f64]> {
         self.filter.as_deref()
     }
@@ -200,7 +218,7 @@ impl Record {
         self.signals.len()
     }
 
-    /// Never true: a record holds at least one signal.
+    /// Always false: a record has at least one signal.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.signals.is_empty()
@@ -209,7 +227,7 @@ impl Record {
     /// Pulse means of a signal, [`Record::m`] of them.
     ///
     /// # Panics
-    /// Where there is no such signal.
+    /// If the signal does not exist.
     #[must_use]
     pub fn signal(&self, index: usize) -> &[f64] {
         &self.signals[index]
@@ -218,7 +236,7 @@ impl Record {
     /// I^η of a signal, as [`Record::m`] pulse means; η in (−1, 10], below 0 its derivative. O(m log m).
     ///
     /// # Panics
-    /// Where there is no such signal.
+    /// If the signal does not exist.
     ///
     /// ```
     /// # use ftlm::regressors::Record;
@@ -235,8 +253,9 @@ impl Record {
         series::multiply(&kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
     }
 
-    /// Pulse means of the initial term t^exponent, t in seconds, through the sensor filter where there is one; of an
-    /// impulse and its derivatives for −1, −2, ….
+    /// Pulse means of the initial term t^exponent, t in seconds, after the sensor filter if there is one.
+    ///
+    /// Exponents −1, −2, … are an impulse and its derivatives.
     ///
     /// ```
     /// # use ftlm::regressors::Record;
@@ -246,38 +265,37 @@ impl Record {
     /// ```
     #[must_use]
     pub fn initial_term(&self, exponent: f64) -> Vec<f64> {
-        self.answer(exponent).unwrap_or_else(|| self.behind_filter(power_means(exponent, self.m(), self.step)))
+        self.impulse_response(exponent).unwrap_or_else(|| self.apply_filter(power_means(exponent, self.m(), self.step)))
     }
 
-    /// What is known of the filter's answer to an impulse or to a derivative of one.
+    /// Response of the filter to an impulse or to a derivative of one, if known.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn answer(&self, exponent: f64) -> Option<Vec<f64>> {
+    fn impulse_response(&self, exponent: f64) -> Option<Vec<f64>> {
         if !is_impulse(exponent) {
             return None;
         }
-        self.answers.get((-1.0 - exponent) as usize).cloned()
+        self.impulse_responses.get((-1.0 - exponent) as usize).cloned()
     }
 
-    /// The same to drive a free run ([`power_pulses`]): where a filter makes something smooth of it.
-    pub(crate) fn driving_term(&self, exponent: f64) -> Vec<f64> {
+    /// Initial term as an input of a simulation ([`power_pulses`] if a filter smooths it).
+    pub(crate) fn forcing_term(&self, exponent: f64) -> Vec<f64> {
         match &self.filter {
             None => self.initial_term(exponent),
             Some(_) => {
-                let pulses = || self.behind_filter(power_pulses(exponent, self.m(), self.step));
-                self.answer(exponent).unwrap_or_else(pulses)
+                let pulses = || self.apply_filter(power_pulses(exponent, self.m(), self.step));
+                self.impulse_response(exponent).unwrap_or_else(pulses)
             }
         }
     }
 
-    /// What drives a free run as t^e does before the filter that makes something smooth of it; none where the record's
-    /// signals passed none, and of what is an answer of the filter.
+    /// Initial term t^e as an input before the filter. None for an unfiltered record and for a known filter response.
     pub(crate) fn unfiltered_term(&self, exponent: f64) -> Option<Vec<f64>> {
-        let passes = self.filter.is_some() && self.answer(exponent).is_none();
+        let passes = self.filter.is_some() && self.impulse_response(exponent).is_none();
         passes.then(|| power_pulses(exponent, self.m(), self.step))
     }
 
-    /// What the filter that the record's signals passed makes of a series.
-    pub(crate) fn behind_filter(&self, powers: Vec<f64>) -> Vec<f64> {
+    /// Output of the record's sensor filter for a series.
+    pub(crate) fn apply_filter(&self, powers: Vec<f64>) -> Vec<f64> {
         match &self.filter {
             None => powers,
             Some(filter) => series::multiply(filter, &powers, self.m()),
@@ -285,17 +303,17 @@ impl Record {
     }
 }
 
-/// What a column of a bank is.
+/// Key of a column of a bank.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Key {
-    /// I^η of a signal; η in grains.
+    /// I^η of a signal, η as an integer multiple of the order resolution.
     Integral {
         /// Signal of the record.
         signal: usize,
         /// Integration order, see [`grains`].
         order: i64,
     },
-    /// t^e; e in grains.
+    /// Initial term t^e, e as an integer multiple of the order resolution.
     Initial {
         /// Exponent, see [`grains`].
         exponent: i64,
@@ -303,20 +321,20 @@ pub enum Key {
 }
 
 impl Key {
-    /// The key of I^eta of a signal.
+    /// Key of I^eta of a signal.
     #[must_use]
     pub fn integral(signal: usize, eta: f64) -> Self {
         Self::Integral { signal, order: grains(eta) }
     }
 
-    /// The key of an initial term.
+    /// Key of an initial term.
     #[must_use]
     pub fn initial(exponent: f64) -> Self {
         Self::Initial { exponent: grains(exponent) }
     }
 }
 
-/// Distinct regressors in order of first mention, the same order for every record of a search.
+/// Distinct regressors in order of first use, identical for all records of a search.
 #[derive(Debug, Default, Clone)]
 pub struct Index {
     keys: Vec<Key>,
@@ -324,7 +342,7 @@ pub struct Index {
 }
 
 impl Index {
-    /// Position of a key, added at the end if new.
+    /// Position of a key. A new key is appended.
     pub fn insert(&mut self, key: Key) -> usize {
         let keys = &mut self.keys;
         *self.positions.entry(key).or_insert_with(|| {
@@ -339,7 +357,7 @@ impl Index {
         self.positions.get(&key).copied()
     }
 
-    /// Puts the keys in order of signal and order, so that neighbours on a lattice are neighbours here.
+    /// Sort the keys by signal and order, so that neighbors on an order grid are adjacent.
     pub fn sort(&mut self) {
         self.keys.sort_unstable();
         self.positions = self.keys.iter().enumerate().map(|(i, &key)| (key, i)).collect();
@@ -352,25 +370,25 @@ impl Index {
     }
 }
 
-/// The columns of an [`Index`] on one record.
+/// Columns of an [`Index`] on one record.
 pub struct Bank {
     m: usize,
-    /// All of them, one behind another.
+    /// All columns, contiguous.
     columns: Vec<f64>,
-    /// Kernels of the output's own regressors, one behind another, and by position which of them it is.
+    /// Kernels of the output's own regressors, contiguous, and their index by column.
     kernels: Vec<f64>,
     own: Vec<Option<usize>>,
 }
 
-/// What one order makes: the columns of all signals, and the kernel where the output is among them.
-struct Made<'a> {
+/// Columns of all signals at one order, and the kernel if the output is among them.
+struct OrderColumns<'a> {
     order: i64,
     columns: Vec<(usize, &'a mut [f64])>,
     kernel: Option<&'a mut [f64]>,
 }
 
-impl Made<'_> {
-    /// One kernel and its spectrum for all signals.
+impl OrderColumns<'_> {
+    /// Compute one kernel and its spectrum for all signals.
     #[allow(clippy::cast_precision_loss)]
     fn write(self, record: &Record, spectra: &BTreeMap<usize, Kernel>, buffers: &mut Buffers) {
         let kernel = kernel(tidy(self.order as f64 / 1e9), record.m(), record.step());
@@ -391,13 +409,13 @@ impl Made<'_> {
 }
 
 impl Bank {
-    /// Computes every column; `output` is the signal whose kernels simulation needs.
+    /// Compute every column. `output` is the signal whose kernels a simulation needs.
     ///
-    /// One transform a column, one more for each order and signal. O(columns · m log m), memory 8·m bytes a column (twice
-    /// for the output's own); on the threads of the pool at hand.
+    /// One transform a column, one more for each order and signal. O(columns · m log m) on the threads of the current
+    /// pool. Memory is 8·m bytes a column, twice that for the output's own.
     ///
     /// # Errors
-    /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record does not hold.
+    /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record does not have.
     ///
     /// ```
     /// # use ftlm::regressors::{Bank, Index, Key, Record};
@@ -416,20 +434,20 @@ impl Bank {
         if bytes > limit {
             return Err(Error::BankTooLarge { columns: index.keys.len(), m, bytes, limit });
         }
-        Self::counted(index, record, output, &Stop::default())
+        Self::new_interruptible(index, record, output, &Stop::default())
     }
 
-    /// How many regressors are integrals of this signal.
+    /// Number of regressors that are integrals of this signal.
     pub(crate) fn own(index: &Index, output: usize) -> usize {
         index.keys.iter().filter(|k| matches!(k, Key::Integral { signal, .. } if *signal == output)).count()
     }
 
-    /// As [`Bank::new`], for who has counted its memory.
+    /// As [`Bank::new`], interruptible and without the memory limit, which the caller checks.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a signal that the record does not hold, [`Error::Interrupted`].
+    /// [`Error::Structure`] for a signal that the record does not have, [`Error::Interrupted`].
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn counted(index: &Index, record: &Record, output: usize, stop: &Stop) -> Result<Self> {
+    pub(crate) fn new_interruptible(index: &Index, record: &Record, output: usize, stop: &Stop) -> Result<Self> {
         let m = record.m();
         let strange = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
         if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(strange) {
@@ -441,14 +459,15 @@ impl Bank {
         let mut columns = vec![0.0; m * index.keys.len()];
         let mut kernels = vec![0.0; m * Self::own(index, output)];
         let mut own = Vec::with_capacity(index.keys.len());
-        let mut orders: BTreeMap<i64, Made<'_>> = BTreeMap::new();
+        let mut orders: BTreeMap<i64, OrderColumns<'_>> = BTreeMap::new();
         let mut initial = Vec::new();
         let mut rest = kernels.chunks_exact_mut(m).enumerate();
         for (key, column) in index.keys.iter().zip(columns.chunks_exact_mut(m)) {
             let mut kernel = None;
             match *key {
                 Key::Integral { signal, order } => {
-                    let made = orders.entry(order).or_insert_with(|| Made { order, columns: vec![], kernel: None });
+                    let made =
+                        orders.entry(order).or_insert_with(|| OrderColumns { order, columns: vec![], kernel: None });
                     made.columns.push((signal, column));
                     if signal == output {
                         (kernel, made.kernel) = rest.next().unzip();
@@ -479,24 +498,24 @@ impl Bank {
         Ok(Self { m, columns, kernels, own })
     }
 
-    /// All columns, one behind another.
+    /// All columns, contiguous.
     pub(crate) fn columns(&self) -> &[f64] {
         &self.columns
     }
 
-    /// Column at a position: one value a pulse.
+    /// Column at a position, one value a pulse.
     ///
     /// # Panics
-    /// Where there is no such column.
+    /// If the column does not exist.
     #[must_use]
     pub fn column(&self, position: usize) -> &[f64] {
         &self.columns[position * self.m..(position + 1) * self.m]
     }
 
-    /// Kernel of an own-output column, one value a pulse; empty for any other column.
+    /// Kernel of an own-output column, one value a pulse. Empty for any other column.
     ///
     /// # Panics
-    /// Where there is no such column.
+    /// If the column does not exist.
     #[must_use]
     pub fn kernel(&self, position: usize) -> &[f64] {
         self.own[position].map_or(&[], |place| &self.kernels[place * self.m..(place + 1) * self.m])
@@ -508,7 +527,7 @@ impl Bank {
         self.own.len()
     }
 
-    /// Whether there is no column.
+    /// Whether there are no columns.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.own.is_empty()
@@ -520,13 +539,13 @@ pub(crate) fn is_impulse(exponent: f64) -> bool {
     exponent <= -1.0 && exponent.fract() == 0.0
 }
 
-/// Initial terms that move something, and impulses, by equation.
+/// Initial terms of the equations and impulses of the sensors, by equation.
 #[allow(clippy::type_complexity)]
-pub(crate) fn parted(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
+pub(crate) fn split_impulses(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
     powers.iter().map(|own| own.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
 }
 
-/// Adds impulses and their derivatives to pulse means of outputs.
+/// Add impulses and their derivatives to the pulse means of outputs.
 pub(crate) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
     for (output, own) in outputs.iter_mut().zip(impulses) {
         for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {

@@ -1,4 +1,4 @@
-//! Equations on a record as a series system A y = b: their free runs, damped where they grow, and the inverse of A.
+//! Equations on a record as a series system A y = b: forced response, inverse and stabilized copies.
 
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
@@ -6,22 +6,22 @@ use crate::fractional::kernels::kernel;
 use crate::regressors::{is_impulse, Record};
 use crate::series::{self, Buffers, Kernel, SumOfProducts};
 
-/// The series system A y = b of some equations: their outputs are unknown, every other signal is read from the record.
+/// Series system A y = b of equations. Their outputs are unknown, all other signals come from the record.
 ///
-/// Coefficients may be of any size here, as the steps of an estimator make them; what people give is checked before.
+/// Coefficients are not checked here, because an estimator's iterates may have any size. User input is checked before.
 pub(crate) struct System<'a> {
     record: &'a Record,
-    /// Whether the sensor of each output may still have held something.
-    held: Vec<bool>,
+    /// Whether the sensor filter of each output may have an initial transient.
+    filter_transients: Vec<bool>,
     pub(crate) matrix: Vec<Vec<Vec<f64>>>,
     pub(crate) rhs: Vec<Vec<f64>>,
 }
 
 impl<'a> System<'a> {
-    /// The system of equations with distinct outputs.
+    /// System of equations with distinct outputs.
     ///
     /// # Errors
-    /// Orders or signals that make no equation, as many coefficients as terms missing, two equations of one output.
+    /// Invalid orders or signals, a wrong number of coefficients, two equations with one output.
     pub(crate) fn new(equations: &[Equation], record: &'a Record) -> Result<Self> {
         let m = record.m();
         let n = equations.len();
@@ -36,7 +36,7 @@ impl<'a> System<'a> {
         }
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
-        // Terms often share an order: each kernel is made once.
+        // Terms often share an order, so each kernel is computed once.
         let mut kernels: Vec<(f64, Vec<f64>)> = Vec::new();
         let step = record.step();
         for (i, equation) in equations.iter().enumerate() {
@@ -48,8 +48,8 @@ impl<'a> System<'a> {
                 let eta = structure.integration(k);
                 let unknown = outputs.iter().position(|&o| o == term.signal);
                 if unknown.is_none() {
-                    let signal = record.driver(term.signal, eta);
-                    // What stands still drives nothing.
+                    let signal = record.term_signal(term.signal, eta);
+                    // A zero signal contributes nothing.
                     if signal.iter().all(|v| *v == 0.0) {
                         continue;
                     }
@@ -67,62 +67,69 @@ impl<'a> System<'a> {
                 match unknown {
                     Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
-                        // Of a single sample, only that: nothing is to be transformed then.
-                        let signal = record.driver(term.signal, eta);
+                        // Of a single nonzero sample only that one is used, which needs no transform.
+                        let signal = record.term_signal(term.signal, eta);
                         let last = signal.iter().rposition(|v| *v != 0.0).map_or(0, |k| k + 1);
-                        let integral = series::multiply(kernel, if last <= FEW { &signal[..last] } else { signal }, m);
+                        let integral = series::multiply(
+                            kernel,
+                            if last <= MAX_DIRECT_PULSES { &signal[..last] } else { signal },
+                            m,
+                        );
                         rhs[i].iter_mut().zip(integral).for_each(|(b, v)| *b += c * v);
                     }
                 }
             }
         }
-        let held = outputs.iter().map(|&o| record.is_held(o)).collect();
-        Ok(Self { record, held, matrix, rhs })
+        let held = outputs.iter().map(|&o| record.has_filter_transient(o)).collect();
+        Ok(Self { record, filter_transients: held, matrix, rhs })
     }
 
-    /// The matrix read at ρz, ρ = e^{−decay}, which makes every model stable for a large enough decay [1/pulse].
-    pub(crate) fn damped(mut self, decay: f64) -> Self {
+    /// Matrix at ρz with ρ = e^{−decay}. A large enough decay [1/pulse] makes every model stable.
+    pub(crate) fn with_damping(mut self, decay: f64) -> Self {
         if decay > 0.0 {
-            self.matrix.iter_mut().flatten().for_each(|series| *series = read_at(decay, series));
+            self.matrix.iter_mut().flatten().for_each(|series| *series = damp_series(decay, series));
         }
         self
     }
 
-    /// Free run with given initial terms: (exponent, coefficient) pairs per equation, empty at rest.
+    /// Response to inputs and initial terms: (exponent, coefficient) pairs per equation, empty for zero initial
+    /// conditions.
     pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-        let (rhs, beside) = self.driven(initial);
+        let (rhs, beside) = self.forced_right_side(initial);
         let mut outputs = self.solve(&rhs)?;
-        self.add_beside(&mut outputs, &beside);
+        self.add_output_impulses(&mut outputs, &beside);
         Ok(outputs)
     }
 
-    /// The right-hand side with these initial terms, and those that are added to the outputs instead.
+    /// Right-hand side with these initial terms, and the impulses that are added to the outputs instead.
     #[allow(clippy::type_complexity)]
-    fn driven(&self, initial: &[Vec<(f64, f64)>]) -> (Vec<Vec<f64>>, Vec<Vec<(f64, f64)>>) {
+    fn forced_right_side(&self, initial: &[Vec<(f64, f64)>]) -> (Vec<Vec<f64>>, Vec<Vec<(f64, f64)>>) {
         let (beside, driving): (Vec<_>, Vec<_>) = (initial.iter().enumerate())
-            .map(|(i, own)| own.iter().copied().partition(|&(exponent, _)| self.is_beside(i, exponent)))
+            .map(|(i, own)| own.iter().copied().partition(|&(exponent, _)| self.is_output_impulse(i, exponent)))
             .unzip();
         let mut rhs = self.rhs.clone();
         for (b, terms) in rhs.iter_mut().zip(&driving) {
             for &(exponent, coefficient) in terms {
-                b.iter_mut().zip(self.record.driving_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
+                b.iter_mut().zip(self.record.forcing_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
             }
         }
         (rhs, beside)
     }
 
-    /// Free run where `bounded` takes it, else the first of damped copies that it takes ([`respond_damped`] at 4, 8, 16, …
-    /// a record, to where nothing is left), and whether it is one. What damping leaves of the inverse of the matrix is its
-    /// series read at ρz, as long as numbers hold it: it is made once, and a copy costs products.
+    /// Outputs if `bounded` accepts them, else those of the first damped copy that it accepts.
+    ///
+    /// The flag says whether the copy is damped ([`crate::simulate::respond_damped`] with decays of 4, 8, 16, … a
+    /// record). The damped inverse is the series of the inverse at ρz while it is finite. It is computed once, so a
+    /// copy costs only products.
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn bounded(
+    pub(crate) fn respond_stabilized(
         &self,
         initial: &[Vec<(f64, f64)>],
         bounded: impl Fn(&[Vec<f64>]) -> bool,
     ) -> Result<(Vec<Vec<f64>>, bool)> {
-        let (rhs, beside) = self.driven(initial);
+        let (rhs, beside) = self.forced_right_side(initial);
         let finish = |mut outputs: Vec<Vec<f64>>| {
-            self.add_beside(&mut outputs, &beside);
+            self.add_output_impulses(&mut outputs, &beside);
             outputs
         };
         let outputs = finish(self.solve(&rhs)?);
@@ -140,7 +147,7 @@ impl<'a> System<'a> {
             let outputs = if finite {
                 let mut through = |row: &Vec<Vec<f64>>| {
                     for (series, driver) in row.iter().zip(&spectra) {
-                        sum.add(1.0, &Kernel::new(&read_at(decay, series)), driver);
+                        sum.add(1.0, &Kernel::new(&damp_series(decay, series)), driver);
                     }
                     let mut out = vec![0.0; m];
                     sum.take(&mut out, &mut buffers);
@@ -148,7 +155,8 @@ impl<'a> System<'a> {
                 };
                 finish(inverse.iter().map(&mut through).collect())
             } else {
-                let matrix = self.matrix.iter().map(|row| row.iter().map(|series| read_at(decay, series)).collect());
+                let matrix =
+                    self.matrix.iter().map(|row| row.iter().map(|series| damp_series(decay, series)).collect());
                 let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
                 finish(series::solve(&matrix.collect::<Vec<Vec<Vec<f64>>>>(), &borrowed)?)
             };
@@ -159,14 +167,15 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Whether an initial term of an equation is an impulse that only the sensor of its output gets: of an output that
-    /// passes the record's filter with all that drives it, the motion of both.
-    fn is_beside(&self, equation: usize, exponent: f64) -> bool {
-        is_impulse(exponent) && (!self.record.is_filtered() || self.held[equation])
+    /// Whether an initial term is an impulse that acts on the sensor of the output only.
+    ///
+    /// If the output and its inputs pass the record's filter together, the impulse acts on the equation instead.
+    fn is_output_impulse(&self, equation: usize, exponent: f64) -> bool {
+        is_impulse(exponent) && (!self.record.is_filtered() || self.filter_transients[equation])
     }
 
-    /// Adds impulses that only sensors get to the outputs.
-    fn add_beside(&self, outputs: &mut [Vec<f64>], beside: &[Vec<(f64, f64)>]) {
+    /// Add the impulses of the sensors to the outputs.
+    fn add_output_impulses(&self, outputs: &mut [Vec<f64>], beside: &[Vec<(f64, f64)>]) {
         for (output, own) in outputs.iter_mut().zip(beside) {
             for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
                 output.iter_mut().zip(self.record.initial_term(exponent)).for_each(|(s, v)| *s += value * v);
@@ -179,48 +188,56 @@ impl<'a> System<'a> {
         series::Solver::new(&self.matrix)?.inverse()
     }
 
-    /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
-    pub(crate) fn units(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
+    /// Response of every output to a unit of each initial term (equation, exponent), all other inputs zero.
+    pub(crate) fn unit_responses(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         let mut solver = series::Solver::new(&self.matrix)?;
-        match self.factored(&mut solver, units)? {
+        match self.invert_for_units(&mut solver, units)? {
             Some(mut by) => Ok(units.iter().map(|&unit| by.unit(unit)).collect()),
             None => self.one_by_one(&mut solver, units),
         }
     }
 
-    /// The free run at rest, and [`System::units`].
+    /// Response with zero initial conditions, and [`System::unit_responses`].
     #[allow(clippy::type_complexity)]
-    pub(crate) fn rest_and_units(&self, units: &[(usize, f64)]) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
+    pub(crate) fn rest_and_unit_responses(
+        &self,
+        units: &[(usize, f64)],
+    ) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
         let mut solver = series::Solver::new(&self.matrix)?;
-        match self.factored(&mut solver, units)? {
+        match self.invert_for_units(&mut solver, units)? {
             Some(mut by) => Ok((by.rest(), units.iter().map(|&unit| by.unit(unit)).collect())),
             None => Ok((solver.solve(&self.rhs)?, self.one_by_one(&mut solver, units)?)),
         }
     }
 
-    /// The inverse of the matrix for products with so many units; none where there are none, or where it grows by so much
-    /// that products would lose the digits of its beginning.
-    fn factored(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Option<Factored<'_, 'a>>> {
+    /// Inverse of the matrix for unit responses by products.
+    ///
+    /// None without units, or if the inverse grows so much that products would lose the digits of its first terms.
+    fn invert_for_units(
+        &self,
+        solver: &mut series::Solver<'_>,
+        units: &[(usize, f64)],
+    ) -> Result<Option<InverseKernels<'_, 'a>>> {
         if units.is_empty() {
             return Ok(None);
         }
         let inverse = solver.inverse()?;
-        if inverse.iter().flatten().any(|series| grows(series)) {
+        if inverse.iter().flatten().any(|series| exceeds_growth_limit(series)) {
             return Ok(None);
         }
         let kernels = inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
         let behind = (0..inverse.len()).map(|_| None).collect();
-        // Without a filter its spectra are all that is asked for.
+        // Without a filter only the spectra are needed.
         let inverse = if self.record.is_filtered() { inverse } else { Vec::new() };
-        Ok(Some(Factored { system: self, inverse, kernels, behind, buffers: Buffers::default() }))
+        Ok(Some(InverseKernels { system: self, inverse, kernels, behind, buffers: Buffers::default() }))
     }
 
     fn one_by_one(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         units
             .iter()
             .map(|&(i, exponent)| {
-                let term = self.alone(i, exponent);
-                if self.is_beside(i, exponent) {
+                let term = self.initial_term_right_side(i, exponent);
+                if self.is_output_impulse(i, exponent) {
                     Ok(term)
                 } else {
                     solver.solve(&term)
@@ -229,31 +246,31 @@ impl<'a> System<'a> {
             .collect()
     }
 
-    /// The right-hand side of one initial term.
-    fn alone(&self, i: usize, exponent: f64) -> Vec<Vec<f64>> {
+    /// Right-hand side of one initial term.
+    fn initial_term_right_side(&self, i: usize, exponent: f64) -> Vec<Vec<f64>> {
         let mut rows = vec![vec![0.0; self.record.m()]; self.matrix.len()];
-        rows[i] = self.record.driving_term(exponent);
+        rows[i] = self.record.forcing_term(exponent);
         rows
     }
 
-    /// What these right-hand sides make of the outputs.
+    /// Outputs for these right-hand sides.
     pub(crate) fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         series::solve(&self.matrix, &borrowed)
     }
 }
 
-/// The inverse of a system's matrix, and of one that stands behind a filter together with it: one product a right-hand side.
-struct Factored<'s, 'a> {
+/// Inverse of a system's matrix, with and without the record's filter. Each right-hand side costs one product.
+struct InverseKernels<'s, 'a> {
     system: &'s System<'a>,
     inverse: Vec<Vec<Vec<f64>>>,
     kernels: Vec<Vec<Kernel>>,
-    /// By equation, what its error does to every output behind the record's filter, once that is asked for.
+    /// By equation, response of every output to its error behind the record's filter, computed on demand.
     behind: Vec<Option<Vec<Kernel>>>,
     buffers: Buffers,
 }
 
-impl Factored<'_, '_> {
+impl InverseKernels<'_, '_> {
     fn rest(&mut self) -> Vec<Vec<f64>> {
         let (rhs, m) = (&self.system.rhs, self.system.record.m());
         let mut outputs = vec![vec![0.0; m]; self.kernels.len()];
@@ -269,8 +286,8 @@ impl Factored<'_, '_> {
 
     fn unit(&mut self, (i, exponent): (usize, f64)) -> Vec<Vec<f64>> {
         let (system, m) = (self.system, self.system.record.m());
-        if system.is_beside(i, exponent) {
-            return system.alone(i, exponent);
+        if system.is_output_impulse(i, exponent) {
+            return system.initial_term_right_side(i, exponent);
         }
         let buffers = &mut self.buffers;
         let mut through = |kernel: &Kernel, term: &[f64]| {
@@ -279,33 +296,34 @@ impl Factored<'_, '_> {
             out
         };
         let Some(term) = system.record.unfiltered_term(exponent) else {
-            let term = system.record.driving_term(exponent);
+            let term = system.record.forcing_term(exponent);
             return self.kernels.iter().map(|row| through(&row[i], &term)).collect();
         };
         let inverse = &self.inverse;
         let behind = self.behind[i].get_or_insert_with(|| {
-            inverse.iter().map(|row| Kernel::new(&system.record.behind_filter(row[i].clone()))).collect()
+            inverse.iter().map(|row| Kernel::new(&system.record.apply_filter(row[i].clone()))).collect()
         });
         behind.iter().map(|kernel| through(kernel, &term)).collect()
     }
 }
 
-/// A series read at ρz, ρ = e^{−decay}.
+/// Series at ρz, ρ = e^{−decay}.
 #[allow(clippy::cast_precision_loss)]
-fn read_at(decay: f64, series: &[f64]) -> Vec<f64> {
+fn damp_series(decay: f64, series: &[f64]) -> Vec<f64> {
     series.iter().enumerate().map(|(k, a)| a * libm::exp(-decay * k as f64)).collect()
 }
 
-/// Pulses of a signal that ends in zeros which a product takes one by one.
-const FEW: usize = 64;
+/// Most pulses of a signal that a product sums directly. Longer signals are transformed.
+const MAX_DIRECT_PULSES: usize = 64;
 
-/// Whether the second half of a series exceeds its first by so much that a transform would swamp the latter.
-fn grows(series: &[f64]) -> bool {
+/// Whether the second half of a series is so large that a transform loses the digits of the first half.
+fn exceeds_growth_limit(series: &[f64]) -> bool {
     let largest = |part: &[f64]| part.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     let (first, second) = series.split_at(series.len() / 2);
     let (first, second) = (largest(first), largest(second));
-    !(second <= GROWTH * first && first.is_finite())
+    !(second <= MAX_SERIES_GROWTH * first && first.is_finite())
 }
 
-/// By this factor: half of the digits of a transform's smallest values are lost to 1e−12 of its largest.
-const GROWTH: f64 = 1e3;
+/// Largest ratio of the second half to the first. A transform's rounding, 1e−12 of its largest value, then costs half
+/// of the digits.
+const MAX_SERIES_GROWTH: f64 = 1e3;

@@ -1,32 +1,34 @@
-//! Vector instructions chosen at run time; the only user of `pulp`.
+//! SIMD kernels with instructions chosen at run time. The only user of `pulp`.
 //!
-//! Kernels are plain loops over arrays of [`WIDTH`] values that are inlined into [`widest`], where the compiler may use
-//! the widest instructions of the machine at hand. Nothing is contracted to fused multiply-adds and no sum is
-//! reordered, so a kernel gives the same bits whether it runs inside [`widest`] or not.
+//! Kernels are plain loops over arrays of [`LANE_COUNT`] values that are inlined into [`dispatch_simd`], where
+//! the compiler may use the widest instructions of this machine. Multiply-adds are not fused and sums are not
+//! reordered, so a kernel gives the same bits inside and outside [`dispatch_simd`].
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// Values that a kernel works on side by side.
-pub const WIDTH: usize = 8;
+/// Number of values that a kernel processes side by side.
+pub const LANE_COUNT: usize = 8;
 
 /// One value of each of several computations that run side by side.
 pub type Lanes<const L: usize> = [f64; L];
 
-/// A kernel for [`widest`]. `run`, and all of its inner loops' functions, must be `#[inline(always)]`: what the compiler
-/// leaves outside is compiled for the oldest machine.
+/// Kernel for [`dispatch_simd`].
+///
+/// `run` and the functions in its inner loops must be `#[inline(always)]`: code that is not inlined is compiled for the
+/// oldest machine.
 pub trait Kernel {
-    /// What it returns.
+    /// Result type.
     type Output;
 
-    /// Does the work.
+    /// Run the kernel.
     fn run(self) -> Self::Output;
 }
 
-struct Inlined<K>(K);
+struct PulpKernel<K>(K);
 
-impl<K: Kernel> WithSimd for Inlined<K> {
+impl<K: Kernel> WithSimd for PulpKernel<K> {
     type Output = K::Output;
 
     #[inline(always)]
@@ -35,17 +37,17 @@ impl<K: Kernel> WithSimd for Inlined<K> {
     }
 }
 
-static PORTABLE: AtomicBool = AtomicBool::new(false);
+static USE_PORTABLE: AtomicBool = AtomicBool::new(false);
 
-/// Whether [`widest`] runs kernels as they are compiled for the oldest machine, so that tests can compare the two.
-pub fn portable(on: bool) {
-    PORTABLE.store(on, Ordering::Relaxed);
+/// Make [`dispatch_simd`] run kernels compiled for the oldest machine, so that tests can compare both.
+pub fn force_portable(on: bool) {
+    USE_PORTABLE.store(on, Ordering::Relaxed);
 }
 
-/// Runs a kernel with the widest vector instructions of this machine.
+/// Run a kernel with the widest vector instructions of this machine.
 ///
 /// ```
-/// use ftlm::simd::{dot, widest, Kernel};
+/// use ftlm::simd::{dispatch_simd, dot, Kernel};
 ///
 /// struct Squares<'a>(&'a [f64]);
 ///
@@ -58,29 +60,28 @@ pub fn portable(on: bool) {
 ///     }
 /// }
 ///
-/// assert_eq!(widest(Squares(&[3.0, 4.0])), 25.0);
+/// assert_eq!(dispatch_simd(Squares(&[3.0, 4.0])), 25.0);
 /// ```
-pub fn widest<K: Kernel>(kernel: K) -> K::Output {
-    if PORTABLE.load(Ordering::Relaxed) {
+pub fn dispatch_simd<K: Kernel>(kernel: K) -> K::Output {
+    if USE_PORTABLE.load(Ordering::Relaxed) {
         kernel.run()
     } else {
-        Arch::new().dispatch(Inlined(kernel))
+        Arch::new().dispatch(PulpKernel(kernel))
     }
 }
 
-/// Σ a·b, summed in [`WIDTH`] lanes that are joined at the end; slices are of one length.
-///
+/// Dot product Σ a·b of slices of equal length, accumulated in [`LANE_COUNT`] lanes.
 /// ```
 /// assert_eq!(ftlm::simd::dot(&[1.0, 2.0], &[3.0, 4.0]), 11.0);
 /// ```
 #[inline(always)]
 #[must_use]
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut sums = [0.0; WIDTH];
-    let (a, b) = (a.chunks_exact(WIDTH), b.chunks_exact(WIDTH));
+    let mut sums = [0.0; LANE_COUNT];
+    let (a, b) = (a.chunks_exact(LANE_COUNT), b.chunks_exact(LANE_COUNT));
     let rest: f64 = a.remainder().iter().zip(b.remainder()).map(|(x, y)| x * y).sum();
     for (a, b) in a.zip(b) {
-        for i in 0..WIDTH {
+        for i in 0..LANE_COUNT {
             sums[i] += a[i] * b[i];
         }
     }

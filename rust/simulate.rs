@@ -1,4 +1,4 @@
-//! Response of an equation and of a coupled model, the two errors of a model, and the explicit Euler baseline.
+//! Simulation of models: response, equation and output error, explicit Euler baseline.
 
 use crate::equation::{check_regular, Equation, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
@@ -8,37 +8,37 @@ use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::series_system::System;
 
-/// A response with the initial terms that were fitted to the measured outputs.
+/// Response with initial terms fitted to the measured outputs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Response {
     /// Pulse means of each equation's output.
     pub outputs: Vec<Vec<f64>>,
     /// Exponents of the initial terms, per equation.
     pub exponents: Vec<Vec<f64>>,
-    /// Their coefficients; 0 where dropped as combinations of others.
+    /// Coefficients of the initial terms. 0 for a linearly dependent term.
     pub initial: Vec<Vec<f64>>,
 }
 
-/// The filter that measured outputs went through, and which of the equations' outputs did.
+/// Filter of measured outputs, and the outputs that it applies to.
 #[derive(Debug, Clone, Copy)]
 pub struct OutputFilter<'a> {
     /// The filter as a series.
     pub series: &'a [f64],
-    /// One flag an equation.
+    /// Flag of each equation.
     pub applies: &'a [bool],
 }
 
-/// Free run: pulse means of the outputs of `equations`, driven by the record's other signals.
+/// Simulation (free run: only inputs and initial conditions are used): pulse means of the outputs.
 ///
-/// One equation alone is driven by the measured other outputs (measured coupling); all equations of a stage together
-/// by the currents alone. `initial` holds (exponent, coefficient) pairs per equation, empty at rest; whole exponents
-/// below 0 are impulses, which only the sensor of the output gets where the record is not behind a filter, or where the
-/// output came through it ([`Record::begun`]), so that they are added to it. An unstable model may leave the range of floating point: the values are then not finite.
-/// O(n² m log² m).
+/// A single equation takes other outputs from the record (measured coupling). All equations of a joint together take
+/// only the currents. `initial` has (exponent, coefficient) pairs per equation, empty for zero initial conditions.
+/// Integer exponents below 0 are impulses. They are added to the output if only its sensor receives them: if the record
+/// is not filtered, or if the output has a filter transient ([`Record::with_initial_state`]). An unstable model may
+/// overflow, so that values are not finite. O(n² m log² m).
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients missing or not finite, [`Error::LeadingZero`] where the outputs
-/// cannot be solved for.
+/// Invalid orders or signals, missing or nonfinite coefficients, [`Error::LeadingZero`] if the outputs cannot be solved
+/// for.
 ///
 /// ```
 /// use ftlm::equation::{Equation, Structure, Term};
@@ -54,11 +54,11 @@ pub struct OutputFilter<'a> {
 /// # }
 /// ```
 pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-    checked(equations, record, initial)?.respond(initial)
+    build_system(equations, record, initial)?.respond(initial)
 }
 
-/// The system of what people give, refused where it is no number.
-fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, f64)>]) -> Result<System<'a>> {
+/// System of user-defined equations. Return an error for invalid ones.
+fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, f64)>]) -> Result<System<'a>> {
     for equation in equations {
         equation.check(record.len())?;
     }
@@ -68,7 +68,7 @@ fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, 
     for terms in initial {
         let (exponents, coefficients): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
         check_finite("coefficients of the initial terms", &coefficients)?;
-        // Through a filter that is applied afterwards an impulse is a motion like others.
+        // Through a filter that is applied afterwards an impulse is an ordinary input.
         Initial::Powers(exponents.into_iter().filter(|&e| !is_impulse(e)).collect()).check()?;
     }
     let system = System::new(equations, record)?;
@@ -76,8 +76,9 @@ fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, 
     Ok(system)
 }
 
-/// Free run of a damped copy of the equations: the series of their outputs read at ρz, ρ = e^{−decay}, which makes every
-/// model stable for a large enough decay [1/pulse]. Instruments need be clean, not exact.
+/// Response of a damped copy of the equations: output series at ρz, ρ = e^{−decay}.
+///
+/// A large enough decay [1/pulse] makes every model stable. Instruments must be free of noise, not exact.
 ///
 /// # Errors
 /// As [`respond`].
@@ -87,31 +88,33 @@ pub fn respond_damped(
     initial: &[Vec<(f64, f64)>],
     decay: f64,
 ) -> Result<Vec<Vec<f64>>> {
-    checked(equations, record, initial)?.damped(decay).respond(initial)
+    build_system(equations, record, initial)?.with_damping(decay).respond(initial)
 }
 
-/// Columns of the inverse of the matrix of the equations: `[j][i]` is what a unit pulse in the error of equation i does
-/// to output j. O(n³ m log² m).
+/// Inverse of the matrix of the equations: `[j][i]` is the response of output j to a unit pulse in the error of
+/// equation i. O(n³ m log² m).
 ///
 /// # Errors
 /// As [`respond`].
 pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f64>>>> {
-    checked(equations, record, &[])?.inverse()
+    build_system(equations, record, &[])?.inverse()
 }
 
-/// What a unit of each initial term does to every output, nothing else driving them: `[k][j]` is the pulse means of output j for
-/// the k-th pair of an equation and the exponent of its power of t. One division for all, O(n³ m log² m), then a product
-/// each; equations whose response grows by much are divided one by one, which keeps the digits of its beginning.
+/// Response of every output to a unit of each initial term, all other inputs zero.
+///
+/// `[k][j]` are the pulse means of output j for the k-th pair of an equation and an exponent of t. One division serves
+/// all, O(n³ m log² m), then a product each. Strongly growing responses are divided one by one, which preserves the
+/// digits of their first terms.
 ///
 /// # Errors
-/// As [`respond`]; [`Error::Structure`] for an equation that is not there.
+/// [`Error::Structure`] for an equation that does not exist, and as [`respond`].
 ///
 /// ```
 /// # use ftlm::equation::{Equation, Structure, Term};
 /// # use ftlm::regressors::Record;
 /// # use ftlm::simulate;
 /// # fn main() -> ftlm::error::Result<()> {
-/// // D y = -2 y from y(0) = 1, and from a constant on its right-hand side, which is t^1.
+/// D y = -2 y from y(0) = 1, and from a constant on its right-hand side, which is t^1.
 /// let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 0, order: 0.0 }] };
 /// let record = Record::new(0.001, vec![vec![0.0; 1000]], None)?;
 /// let decay = Equation { structure, coefficients: vec![-2.0] };
@@ -122,10 +125,10 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// # }
 /// ```
 pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-    checked(equations, record, &as_terms(equations.len(), units)?)?.units(units)
+    build_system(equations, record, &as_terms(equations.len(), units)?)?.unit_responses(units)
 }
 
-/// The free run at rest ([`respond`]) and [`unit_responses`], whose divisions share their transforms.
+/// Response with zero initial conditions ([`respond`]) and [`unit_responses`], with shared transforms.
 ///
 /// # Errors
 /// As [`unit_responses`].
@@ -135,11 +138,11 @@ pub fn respond_and_units(
     record: &Record,
     units: &[(usize, f64)],
 ) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
-    let system = checked(equations, record, &as_terms(equations.len(), units)?)?;
-    system.rest_and_units(units)
+    let system = build_system(equations, record, &as_terms(equations.len(), units)?)?;
+    system.rest_and_unit_responses(units)
 }
 
-/// Units as initial terms, by equation.
+/// Unit initial terms by equation.
 fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f64)>>> {
     let mut initial = vec![Vec::new(); equations];
     for &(i, exponent) in units {
@@ -154,10 +157,10 @@ fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f6
     Ok(initial)
 }
 
-/// Free run whose initial terms are those that bring it closest to the measured outputs.
+/// Response with the initial terms that fit the measured outputs best.
 ///
-/// The response is linear in the initial terms, so they follow by least squares on the output error, each output
-/// weighted by 1/σ of its measurement. They belong to this record alone.
+/// The response is linear in the initial terms. They follow by least squares on the output error, each output weighted
+/// by 1/σ of its measurement, and apply to this record only.
 ///
 /// # Errors
 /// As [`respond`].
@@ -167,7 +170,7 @@ pub fn respond_with_initial(
     initial: &Initial,
     filter: Option<OutputFilter<'_>>,
 ) -> Result<Response> {
-    let system = checked(equations, record, &[])?;
+    let system = build_system(equations, record, &[])?;
     initial.check()?;
     if let Some(filter) = filter {
         check_length("filter", record.m(), filter.series.len())?;
@@ -175,7 +178,7 @@ pub fn respond_with_initial(
     }
     let behind = |i: usize| record.is_filtered() || filter.is_some_and(|f| f.applies[i]);
     let exponents: Vec<Vec<f64>> = (equations.iter().enumerate())
-        .map(|(i, e)| e.structure.initial_exponents(if behind(i) { initial } else { initial.unfiltered() }))
+        .map(|(i, e)| e.structure.initial_exponents(if behind(i) { initial } else { initial.without_filter() }))
         .collect();
     let through = |mut outputs: Vec<Vec<f64>>| {
         if let Some(filter) = filter {
@@ -199,7 +202,7 @@ pub fn respond_with_initial(
         .flat_map(|(i, list)| list.iter().enumerate().map(move |(e, &exponent)| (i, e, exponent)))
         .collect();
     let asked: Vec<(usize, f64)> = units.iter().map(|&(i, _, exponent)| (i, exponent)).collect();
-    let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.units(&asked)?))
+    let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.unit_responses(&asked)?))
         .map(|(&(i, e, _), outputs)| (i, e, through(outputs)))
         .filter(|(_, _, response)| finite(response))
         .collect();
@@ -230,8 +233,9 @@ fn weight(y: &[f64]) -> f64 {
     }
 }
 
-/// Equation error ε = y − Σ c_k I^{α−ν_k} s_k − initial terms, measured y on the right-hand side; the initial terms by
-/// least squares at the given coefficients.
+/// Equation error ε = y − Σ c_k I^{α−ν_k} s_k − initial terms, with measured y on the right-hand side.
+///
+/// Initial terms are fitted by least squares at the given coefficients.
 ///
 /// # Errors
 /// As [`respond`].
@@ -261,14 +265,15 @@ pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -
     Ok(residuals)
 }
 
-/// Integer-order equations stepped by explicit Euler from rest, as the paper's baseline was run.
+/// Integer-order equations by explicit Euler from zero initial conditions, the baseline of the paper.
 ///
-/// `signals` are point samples of the record's signals (those of the equations' outputs are ignored), `step` their
-/// step. Every α must be whole, every order of an output whole and below that output's α, every other order 0.
-/// Returns one sample a row for each equation. The values are not finite where Euler's step is unstable.
+/// `signals` are point samples of the record's signals at intervals of `step`. Those of the equations' outputs are
+/// ignored. Every α must be an integer, every order of an output an integer below its α, every other order 0. Returns
+/// one sample a row for each equation, not finite if the step is unstable.
 ///
 /// # Errors
-/// [`Error::Structure`] naming the equation whose orders are not whole, and as [`respond`] for equations, signals, step.
+/// [`Error::Structure`] naming the equation whose orders are not integers, and as [`respond`] for equations, signals,
+/// step.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -> Result<Vec<Vec<f64>>> {
     check_step(step)?;
@@ -287,7 +292,7 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
             Some(j) => whole(term.order) && (term.order.round() as usize) < alpha[j],
             None => term.order.abs() < ORDER_GRAIN,
         };
-        // An order within the grain of 0 is whole, but leaves no state to step.
+        // An order within the resolution of 0 is an integer, but has no state.
         if !whole(structure.order) || alpha[i] == 0 || !structure.terms.iter().all(fits) {
             return Err(Error::Structure {
                 what: format!("equation {i} has orders that explicit Euler cannot step"),
@@ -327,11 +332,12 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
     Ok(out)
 }
 
-/// Σ|y − ŷ| (45) of the free run, at rest, for each row of coefficients of one structure: the convergence of a
-/// recursion. Regressors are made once; each row costs one division.
+/// Output error Σ|y − ŷ| (45) for each row of coefficients of one structure, with zero initial conditions.
+///
+/// It shows the convergence of a recursion. Regressors are computed once; each row costs one division.
 ///
 /// # Errors
-/// Orders or signals that make no equation, a row of another length.
+/// Invalid orders or signals, a row of another length.
 pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -> Result<Vec<f64>> {
     structure.check(record.len(), |_| true)?;
     let m = record.m();
@@ -366,11 +372,11 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
         .collect()
 }
 
-/// Margin of the block-pulse scheme itself at the Nyquist frequency, for own-output terms (coefficient, η = α − ν).
+/// Stability margin of the block-pulse scheme at the Nyquist frequency, for own-output terms (coefficient, η = α − ν).
 ///
 /// The divisor 1 − Σ c F^η at z = −1 is 1 − Σ c h^η A(η)/Γ(η+2) with A(η) = 4(1 − 2^{η+2})·ζ(−η−1), the Abel sum of the
-/// alternating kernel (A(1) = 0, A(2) = −1/2). Where it is not positive the scheme has a mode that grows from pulse to
-/// pulse although the model may be stable: the step must be refined. For D²y = −c y the margin is 1 − c·h²/12.
+/// alternating kernel (A(1) = 0, A(2) = −1/2). If it is not positive, the scheme has a mode that grows from pulse to
+/// pulse even for a stable model, and the step must be refined. For D²y = −c y the margin is 1 − c·h²/12.
 ///
 /// ```
 /// let margin = ftlm::simulate::nyquist_margin(&[(-12.0, 2.0)], 0.5);
@@ -384,7 +390,7 @@ pub fn nyquist_margin(own_terms: &[(f64, f64)], step: f64) -> f64 {
         .sum::<f64>()
 }
 
-/// A(η) through the functional equation of ζ: A = 4(1 − 2^{s+1})·2^{−s}π^{−s−1}·sin(−πs/2)·Γ(1+s)·ζ(1+s), s = η + 1.
+/// A(η) by the functional equation of ζ: A = 4(1 − 2^{s+1})·2^{−s}π^{−s−1}·sin(−πs/2)·Γ(1+s)·ζ(1+s), s = η + 1.
 fn alternating_sum(eta: f64) -> f64 {
     use std::f64::consts::PI;
     let s = eta + 1.0;

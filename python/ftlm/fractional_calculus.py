@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm import _core
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import apply_along_axis, as_floats, check_pulses, real_number
 
 
@@ -167,7 +168,9 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
 def _step(m: int, duration: float) -> float:
     length = real_number("duration", duration)
     if not (math.isfinite(length) and length > 0):
-        raise ModelError(f"duration = {duration!r} s is not positive; give the length of the record in seconds")
+        raise ModelError(
+            f"{setting('duration')} {duration!r} s is not positive; give the length of the record in seconds"
+        )
     return length / m
 
 

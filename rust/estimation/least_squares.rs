@@ -1,4 +1,4 @@
-//! Least squares on the equation error at given orders, by QR of the regressors.
+//! Equation-error least squares at given orders, by QR of the regressors.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, Error, Result};
@@ -6,27 +6,27 @@ use crate::linalg::dense;
 use crate::linalg::small::back_substitute;
 use crate::regressors::Record;
 
-/// A column whose part outside the span of those before it is below this fraction of it is dependent.
-const RANK_FLOOR: f64 = 1e-12;
+/// Relative norm of a column outside the span of the previous ones below which it is linearly dependent.
+const RANK_TOLERANCE: f64 = 1e-12;
 
-/// Coefficients of an equation and what else the fit determined.
+/// Least-squares estimate of one equation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate {
-    /// One a term; fixed ones as given.
+    /// One per term; fixed coefficients as given.
     pub coefficients: Vec<f64>,
-    /// Coefficients of the initial terms, per record, in the order of the exponents; 0 where dropped.
+    /// Coefficients of the initial terms, per record, in the sequence of the exponents; 0 if excluded.
     pub initial: Vec<Vec<f64>>,
     /// Exponents of the initial terms.
     pub exponents: Vec<f64>,
-    /// (record, position) of the initial terms dropped as combinations of other regressors.
+    /// (record, position) of the initial terms excluded as linearly dependent.
     pub dropped: Vec<(usize, usize)>,
 }
 
-/// The regression of an equation on several records: stacked columns, the target last.
+/// Regression of an equation over several records: stacked columns and target.
 pub struct Regression {
     /// Free terms, then the initial terms of each record.
     pub columns: Vec<Vec<f64>>,
-    /// y less the terms with fixed coefficients.
+    /// y minus the terms with fixed coefficients.
     pub target: Vec<f64>,
     /// First row of each record, and the end of the last.
     pub starts: Vec<usize>,
@@ -35,10 +35,10 @@ pub struct Regression {
 }
 
 impl Regression {
-    /// Builds the regressors I^{α−ν} s, and t^e per record, of an equation.
+    /// Build the regressors I^{α−ν} s of an equation, and t^e per record.
     ///
     /// # Errors
-    /// [`Error::Length`] where `fixed` does not match the terms; no record; a structure that a record cannot carry.
+    /// [`Error::Length`] if `fixed` does not match the terms or there is no record; invalid structures.
     pub fn new(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Self> {
         check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
         if records.is_empty() {
@@ -81,11 +81,11 @@ impl Regression {
 
     /// Number of free coefficients of terms.
     #[must_use]
-    pub fn free(&self) -> usize {
+    pub fn free_count(&self) -> usize {
         self.fixed.iter().filter(|f| f.is_none()).count()
     }
 
-    /// Sorts a solution (free coefficients, then initial terms by record) into an [`Estimate`].
+    /// Convert a solution (free coefficients, then initial terms by record) to an [`Estimate`].
     #[must_use]
     pub fn estimate(&self, solution: &[f64], dropped: &[usize]) -> Estimate {
         let mut free = solution.iter();
@@ -95,18 +95,18 @@ impl Regression {
         let initial = (0..self.starts.len() - 1).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
         let dropped = dropped
             .iter()
-            .map(|&d| (d - self.free()) / width.max(1))
-            .zip(dropped.iter().map(|&d| (d - self.free()) % width.max(1)));
+            .map(|&d| (d - self.free_count()) / width.max(1))
+            .zip(dropped.iter().map(|&d| (d - self.free_count()) % width.max(1)));
         Estimate { coefficients, initial, exponents: self.exponents.clone(), dropped: dropped.collect() }
     }
 }
 
-/// Least-squares coefficients of an equation on one or several records, each with its own initial terms.
+/// Fit the coefficients of an equation to one or several records, each with its own initial terms.
 ///
-/// `fixed` holds a value for each coefficient that is known. O(k² Σm).
+/// `fixed` contains the values of the fixed coefficients. O(k² Σm).
 ///
 /// # Errors
-/// [`Error::Singular`] with the first free term that is a combination of others; [`Error::Length`].
+/// [`Error::Singular`] with the first linearly dependent free term; [`Error::Length`].
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -126,12 +126,13 @@ impl Regression {
 /// ```
 pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Estimate> {
     let regression = Regression::new(records, structure, fixed, initial)?;
-    let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free())?;
+    let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free_count())?;
     Ok(regression.estimate(&solution, &dropped))
 }
 
-/// argmin ‖target − Σ x_k column_k‖ by QR; the first `needed` columns must be independent, later dependent ones are
-/// dropped (x = 0) and returned.
+/// Solve argmin ‖target − Σ x_k column_k‖ by QR.
+///
+/// The first `needed` columns must be linearly independent. Later dependent columns are excluded (x = 0) and returned.
 ///
 /// # Errors
 /// [`Error::Singular`].
@@ -154,7 +155,7 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec
         scaled.push(target.iter().map(|v| v / target_scale).collect());
         let r = dense::triangular_factor(&scaled);
         let stride = scaled.len();
-        let dependent = (0..kept.len()).find(|&i| r[i * stride + i].abs() <= RANK_FLOOR);
+        let dependent = (0..kept.len()).find(|&i| r[i * stride + i].abs() <= RANK_TOLERANCE);
         if let Some(position) = dependent {
             if kept[position] < needed {
                 return Err(Error::Singular { index: kept[position], count: k });
@@ -174,7 +175,7 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec
 }
 
 fn norm(column: &[f64]) -> f64 {
-    // Scaled by the largest element, so that neither 1e200 nor 1e-200 is lost.
+    // Scaling by the largest element avoids overflow and underflow of the squares.
     let largest = column.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     if largest == 0.0 || !largest.is_finite() {
         return largest;

@@ -1,4 +1,4 @@
-//! Estimators, a module each: of the coefficients at given orders, and of orders and coefficients together.
+//! Estimators of coefficients at given orders, and of orders and coefficients together.
 
 pub mod instrumental_variables;
 pub mod joint_fit;

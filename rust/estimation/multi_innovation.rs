@@ -1,9 +1,9 @@
 //! Multi-innovation least squares (paper (42)–(44)): the recursion as published, and its exact closed form.
 //!
-//! One step of (44) with the p newest rows is a block step of recursive least squares, so after all rows the recursion
-//! has minimised Σ w_i (m_i − q_iᵀX)² + (X − X₀)ᵀK₀⁻¹(X − X₀) with w_i = min(p, M − i + 1), each row having been used
-//! by every step of which it was one of the p newest. The innovation length p is therefore a weight of the data
-//! against the prior, nothing else.
+//! One step of (44) with the p newest rows is a block step of recursive least squares. After all rows the recursion has
+//! minimized Σ w_i (m_i − q_iᵀX)² + (X − X₀)ᵀK₀⁻¹(X − X₀) with w_i = min(p, M − i + 1), because every row takes part in
+//! each step in which it is one of the p newest. The innovation length p therefore only weights the data against the
+//! prior.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{Error, Result};
@@ -12,28 +12,28 @@ use crate::fractional::operational_matrices;
 use crate::linalg::small::Recursion;
 use crate::regressors::Record;
 
-/// In which coordinates the rows come, one after the other.
+/// Row basis of the recursion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Rows {
-    /// Haar coefficients, coarse to fine, as the paper has it; m a power of two.
+pub enum RowBasis {
+    /// Haar coefficients, coarse to fine, as in the paper; m a power of two.
     Haar,
-    /// Pulse means in the order of time.
+    /// Pulse means in the sequence of time.
     Time,
 }
 
-/// The settings of (44).
+/// Settings of the recursion (44).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Innovation {
     /// Innovation length p ≥ 1.
     pub length: usize,
     /// Initial covariance K₀ (times the unit matrix) > 0.
     pub prior_covariance: f64,
-    /// Coordinates of the rows.
-    pub rows: Rows,
+    /// Basis of the rows.
+    pub row_basis: RowBasis,
 }
 
 impl Innovation {
-    /// Refuses p = 0 and a prior covariance that is not positive.
+    /// Check that p and the prior covariance are positive.
     ///
     /// # Errors
     /// [`Error::OutOfRange`].
@@ -57,29 +57,29 @@ impl Innovation {
         Ok(())
     }
 
-    /// Weight of row i of m (from 0): how many steps use it.
+    /// Weight of row i of m (from 0): the number of steps that use it.
     #[must_use]
     pub fn weight(&self, i: usize, m: usize) -> usize {
         self.length.min(m - i)
     }
 }
 
-/// Closed form of the recursion's end, by QR of the weighted rows over the prior's.
+/// Final estimate of the recursion in closed form, by QR of the weighted rows stacked on the prior.
 ///
 /// # Errors
-/// Settings out of range, m not a power of two where Haar rows are asked for, [`Error::Length`].
+/// Settings out of range, m not a power of two with the Haar basis, [`Error::Length`].
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::{Initial, Structure, Term};
-/// use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, Rows};
+/// use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, RowBasis};
 /// use ftlm::regressors::Record;
 /// let input: Vec<f64> = (0..64).map(|k| f64::from(k % 7)).collect();
 /// let driven = Record::new(0.1, vec![vec![0.0; 64], input.clone()], None)?;
 /// let output = driven.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
 /// let run = [Record::new(0.1, vec![output, input], None)?];
 /// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// let innovation = Innovation { length: 4, prior_covariance: 1e6, rows: Rows::Time };
+/// let innovation = Innovation { length: 4, prior_covariance: 1e6, row_basis: RowBasis::Time };
 /// let end = closed_form(&run, &structure, &[None], &Initial::Rest, &innovation)?;
 /// let (last, trace) = recursion(&run, &structure, &[None], &Initial::Rest, &innovation)?;
 /// assert_eq!(trace.len(), 64);
@@ -94,7 +94,7 @@ pub fn closed_form(
     initial: &Initial,
     innovation: &Innovation,
 ) -> Result<Estimate> {
-    let regression = rows(records, structure, fixed, initial, innovation)?;
+    let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let mut columns = regression.columns.clone();
     let mut target = regression.target.clone();
     for series in columns.iter_mut().chain(std::iter::once(&mut target)) {
@@ -114,20 +114,20 @@ pub fn closed_form(
         column[end + j] = prior;
     }
     target.resize(end + k, 0.0);
-    // With a prior no column is dependent in exact arithmetic, so none is needed to be.
+    // With a prior no column is linearly dependent in exact arithmetic.
     let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
-    if let Some(&index) = dropped.iter().find(|&&d| d < regression.free()) {
+    if let Some(&index) = dropped.iter().find(|&&d| d < regression.free_count()) {
         return Err(Error::Singular { index, count: k });
     }
     Ok(regression.estimate(&solution, &dropped))
 }
 
-/// The recursion (44) itself, from X₀ = 0: the estimate after every step, O(k³) a step.
+/// Run the recursion (44) from X₀ = 0; return the last estimate and the coefficients after every step.
 ///
-/// The steps run through the records one after the other; an innovation never spans two records.
+/// The steps run through the records in sequence. An innovation never spans two records. O(k³) per step.
 ///
 /// # Errors
-/// As [`closed_form`], and [`Error::Diverged`] where the covariance loses its sign to rounding.
+/// As [`closed_form`], and [`Error::Diverged`] if rounding makes the covariance indefinite.
 pub fn recursion(
     records: &[Record],
     structure: &Structure,
@@ -135,7 +135,7 @@ pub fn recursion(
     initial: &Initial,
     innovation: &Innovation,
 ) -> Result<(Estimate, Vec<Vec<f64>>)> {
-    let regression = rows(records, structure, fixed, initial, innovation)?;
+    let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let k = regression.columns.len();
     let mut state = Recursion::new(&vec![0.0; k], innovation.prior_covariance)?;
     let end = regression.target.len();
@@ -154,7 +154,7 @@ pub fn recursion(
     Ok((regression.estimate(state.coefficients(), &[]), trace))
 }
 
-fn rows(
+fn regression_in_basis(
     records: &[Record],
     structure: &Structure,
     fixed: &[Option<f64>],
@@ -163,10 +163,10 @@ fn rows(
 ) -> Result<Regression> {
     innovation.check()?;
     let mut regression = Regression::new(records, structure, fixed, initial)?;
-    if innovation.rows == Rows::Haar {
+    if innovation.row_basis == RowBasis::Haar {
         for series in regression.columns.iter_mut().chain(std::iter::once(&mut regression.target)) {
             for pair in regression.starts.windows(2) {
-                operational_matrices::transform(&mut series[pair[0]..pair[1]])?;
+                operational_matrices::haar_transform(&mut series[pair[0]..pair[1]])?;
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Output errors of an equation whose own terms are known: all else follows by linear least squares on them.
+//! Output error of an equation with fixed autoregressive terms: linear least squares in all other coefficients.
 
 use super::least_squares::{solve, Regression};
 use crate::equation::{Initial, Structure};
@@ -8,37 +8,39 @@ use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
 use crate::regressors::Record;
 use crate::series::{reciprocal, Buffers, Kernel};
 
-/// Of an initial term's answer, the share outside the span of others below which it adds nothing.
-const SPANNED: f64 = 1e-12;
-/// A column of which initial terms leave less than this share is solved for beside them.
-const LEFT: f64 = 1e-6;
+/// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
+const RANK_TOLERANCE: f64 = 1e-12;
+/// Relative norm of a column after projection below which it is solved for together with the initial terms.
+const MIN_REMAINING_NORM_RATIO: f64 = 1e-6;
 
-/// The best that an equation with given own terms comes to.
+/// Best fit of an equation with fixed autoregressive terms.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Projected {
-    /// Root mean square output error as a share of the output's size.
+pub struct FixedPoleEstimate {
+    /// Norm of the output error relative to the norm of the output.
     pub error: f64,
-    /// One a term of the structure; fixed ones as given.
+    /// One per term of the structure; fixed coefficients as given.
     pub coefficients: Vec<f64>,
 }
 
-/// The parts of the regression of one record, each with its spectrum.
-struct Part {
+/// Regression of one record: target, and spectra of the columns.
+struct RecordSpectra {
     target: Vec<f64>,
     terms: Vec<Kernel>,
     initial: Vec<Kernel>,
-    /// Kernels of the own terms.
+    /// Kernels of the autoregressive terms.
     own: Vec<Vec<f64>>,
 }
 
-/// What least squares on the output error makes of the terms of `structure`, none of which is its own output's, and of the
-/// initial terms, beside own terms that are integrated by `own` and have the coefficients of each point; none where the
-/// own terms, or the answers to them, are no numbers on this step, or where a free term is a combination of others.
+/// Fit an equation by output error for several sets of fixed autoregressive coefficients.
 ///
-/// Integrals of signals, powers of t and kernels are made once. O(points · columns · m log m).
+/// `structure` contains the terms of other signals, `own` the integration orders of the autoregressive terms, and each
+/// point their coefficients. Terms and initial terms follow by linear least squares. A result is None if the response
+/// overflows or a free term is linearly dependent.
+///
+/// Integrals of signals, powers of t and kernels are computed once. O(points · columns · m log m).
 ///
 /// # Errors
-/// As [`Regression::new`]; an order of `own` out of range; a point with another number of coefficients.
+/// As [`Regression::new`]; an order of `own` out of range; a point with a wrong number of coefficients.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -53,40 +55,42 @@ struct Part {
 /// let y = ftlm::simulate::respond(&[plant], &rest, &[])?.remove(0);
 /// let run = Record::new(0.02, vec![y, input], None)?;
 /// let driven = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// let found = resonance_scan::projected(&[run], &driven, &[None], &Initial::Rest, &[2.0], &[vec![-4.0], vec![-9.0]])?;
+/// let points = [vec![-4.0], vec![-9.0]];
+/// let found = resonances::fit_with_fixed_poles(&[run], &driven, &[None], &Initial::Rest, &[2.0], &points)?;
 /// let errors: Vec<f64> = found.iter().flatten().map(|one| one.error).collect();
 /// assert!(errors.len() == 2 && errors[0] > 0.1 && errors[1] < 1e-9);
 /// # Ok(())
 /// # }
 /// ```
-pub fn projected(
+pub fn fit_with_fixed_poles(
     records: &[Record],
     structure: &Structure,
     fixed: &[Option<f64>],
     initial: &Initial,
     own: &[f64],
     points: &[Vec<f64>],
-) -> Result<Vec<Option<Projected>>> {
+) -> Result<Vec<Option<FixedPoleEstimate>>> {
     check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
     check_finite("fixed coefficients", &fixed.iter().flatten().copied().collect::<Vec<_>>())?;
     own.iter().try_for_each(|&eta| check_order("integration of an own term", eta))?;
     points.iter().try_for_each(|point| check_length("coefficients of a point", own.len(), point.len()))?;
     let regression = Regression::new(records, structure, &vec![None; fixed.len()], initial)?;
-    // What is a combination of others drives as one, and own terms leave no more than rounding between the two.
-    if solve(&regression.columns[..regression.free()], &regression.target, regression.free()).is_err() {
+    // Linearly dependent inputs have linearly dependent responses up to rounding.
+    if solve(&regression.columns[..regression.free_count()], &regression.target, regression.free_count()).is_err() {
         return Ok(vec![None; points.len()]);
     }
-    let parts: Vec<Part> = (records.iter().enumerate()).map(|(r, record)| part(&regression, own, r, record)).collect();
+    let parts: Vec<RecordSpectra> =
+        (records.iter().enumerate()).map(|(r, record)| record_spectra(&regression, own, r, record)).collect();
     let size = norm(&regression.target).max(1e-300);
-    points.iter().map(|point| at(&parts, fixed, point, size)).collect()
+    points.iter().map(|point| fit_point(&parts, fixed, point, size)).collect()
 }
 
-fn part(regression: &Regression, own: &[f64], r: usize, record: &Record) -> Part {
+fn record_spectra(regression: &Regression, own: &[f64], r: usize, record: &Record) -> RecordSpectra {
     let rows = regression.starts[r]..regression.starts[r + 1];
     let of = |column: &Vec<f64>| Kernel::new(&column[rows.clone()]);
-    let (terms, initial) = regression.columns.split_at(regression.free());
+    let (terms, initial) = regression.columns.split_at(regression.free_count());
     let each = initial.len() / (regression.starts.len() - 1);
-    Part {
+    RecordSpectra {
         target: regression.target[rows.clone()].to_vec(),
         terms: terms.iter().map(of).collect(),
         initial: initial[r * each..(r + 1) * each].iter().map(of).collect(),
@@ -94,8 +98,13 @@ fn part(regression: &Regression, own: &[f64], r: usize, record: &Record) -> Part
     }
 }
 
-/// One point: the answers of each record, before its initial terms are projected out.
-fn at(parts: &[Part], fixed: &[Option<f64>], point: &[f64], size: f64) -> Result<Option<Projected>> {
+/// Fit at one point: responses of each record, then elimination of the initial terms.
+fn fit_point(
+    parts: &[RecordSpectra],
+    fixed: &[Option<f64>],
+    point: &[f64],
+    size: f64,
+) -> Result<Option<FixedPoleEstimate>> {
     let mut buffers = Buffers::default();
     let mut target: Vec<f64> = Vec::new();
     let mut columns: Vec<Vec<f64>> = vec![Vec::new(); fixed.iter().filter(|f| f.is_none()).count()];
@@ -133,22 +142,25 @@ fn at(parts: &[Part], fixed: &[Option<f64>], point: &[f64], size: f64) -> Result
     if !finite(&target) || !columns.iter().all(|c| finite(c)) || !starts.iter().flatten().all(|c| finite(c)) {
         return Ok(None);
     }
-    let Some((values, missed)) = solved(columns, target, starts) else { return Ok(None) };
+    let Some((values, missed)) = solve_with_initial_terms(columns, target, starts) else { return Ok(None) };
     let mut values = values.into_iter();
     let coefficients = fixed.iter().map(|f| f.or_else(|| values.next()).unwrap_or(f64::NAN)).collect();
-    Ok(Some(Projected { error: missed / size, coefficients }))
+    Ok(Some(FixedPoleEstimate { error: missed / size, coefficients }))
 }
 
-/// Coefficients of the columns beside initial terms of each record, and the norm of what is left; none where they are not
-/// determined.
-fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) -> Option<(Vec<f64>, f64)> {
+/// Coefficients of the columns with initial terms of each record, and the norm of the residuals; None if singular.
+fn solve_with_initial_terms(
+    columns: Vec<Vec<f64>>,
+    target: Vec<f64>,
+    starts: Vec<Vec<Vec<f64>>>,
+) -> Option<(Vec<f64>, f64)> {
     let lengths: Vec<usize> = starts.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
     let free = columns.len();
     let (mut less, mut left) = (columns.clone(), target.clone());
     let mut from = 0;
     for (own, &m) in starts.iter().zip(&lengths) {
         let mut basis = Vec::new();
-        own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), SPANNED));
+        own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE));
         for series in less.iter_mut().chain(std::iter::once(&mut left)) {
             let rows = &mut series[from..from + m];
             project_out(&basis, rows);
@@ -156,8 +168,9 @@ fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) 
         }
         from += m;
     }
-    let told = less.iter().zip(&columns).all(|(less, whole)| norm(less) > LEFT * norm(whole));
-    let (columns, target) = if told { (less, left) } else { (beside(columns, &starts, &lengths), target) };
+    let told = less.iter().zip(&columns).all(|(less, whole)| norm(less) > MIN_REMAINING_NORM_RATIO * norm(whole));
+    let (columns, target) =
+        if told { (less, left) } else { (append_initial_terms(columns, &starts, &lengths), target) };
     let (x, _) = solve(&columns, &target, free).ok()?;
     let mut missed = target;
     for (column, c) in columns.iter().zip(&x) {
@@ -166,8 +179,8 @@ fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) 
     Some((x, norm(&missed)))
 }
 
-/// Columns with those of initial terms behind them, each as long as all records.
-fn beside(mut columns: Vec<Vec<f64>>, starts: &[Vec<Vec<f64>>], lengths: &[usize]) -> Vec<Vec<f64>> {
+/// Append the columns of the initial terms, each zero outside its record.
+fn append_initial_terms(mut columns: Vec<Vec<f64>>, starts: &[Vec<Vec<f64>>], lengths: &[usize]) -> Vec<Vec<f64>> {
     let rows = lengths.iter().sum();
     let mut from = 0;
     for (own, &m) in starts.iter().zip(lengths) {

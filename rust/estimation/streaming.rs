@@ -1,44 +1,43 @@
-//! Recursion (44) while a run is recorded: rows in the order of time, each new one in constant time.
+//! Multi-innovation recursion (44) sample by sample, with constant time per sample.
 //!
 //! A new row needs the fractional integrals of every signal at the newest pulse, which depend on the whole past. The
-//! newest two pulses enter by the exact kernel (32); what is older has lag of at least one pulse and enters through
-//! the exponentials of [`crate::fractional::exponential_sum`], exact to rounding. An order above 1 is a running
-//! integral of the order less one. So a row costs O((signals + terms)·rates + p k² + k³), whatever the length of the
-//! run.
+//! newest two pulses enter by the exact kernel (32). Older pulses enter through a sum of exponentials,
+//! exact to rounding. An order above 1 is a running integral of the order minus one. A row costs
+//! O((signals + terms)·rates + p k² + k³), independent of the length of the run.
 
 use crate::equation::Structure;
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::estimation::multi_innovation::{Innovation, Rows};
+use crate::estimation::multi_innovation::{Innovation, RowBasis};
 use crate::fractional::exponential_sum::{decay, Rates};
 use crate::fractional::kernels::block_pulse_kernel;
 use crate::linalg::small::Recursion;
 
-/// Accuracy of the memory: at the rounding of the batch form's transforms.
-const TOLERANCE: f64 = 2e-15;
+/// Relative accuracy of the sum of exponentials, at the rounding level of the batch form.
+const MEMORY_TOLERANCE: f64 = 2e-15;
 
-/// The state of one signal: exponentials of all pulses but the newest two, and the last pulse.
+/// History of one signal: exponential states of all pulses except the newest two, and the last pulse.
 #[derive(Debug, Clone)]
-struct Past {
+struct SignalHistory {
     states: Vec<f64>,
     last: f64,
 }
 
-/// I^η of one signal at the newest pulse.
+/// Running integral I^η of one signal at the newest pulse.
 #[derive(Debug, Clone)]
-struct Integral {
+struct RunningIntegral {
     signal: usize,
-    /// On the newest pulse and the one before it.
-    near: [f64; 2],
-    far: Vec<f64>,
-    /// For orders above 1: the integral of the order less one, and its running integral so far.
-    inner: Option<Box<(Integral, f64)>>,
+    /// Weights of the newest pulse and of the previous one.
+    recent_weights: [f64; 2],
+    history_weights: Vec<f64>,
+    /// For orders above 1: the integral of the order minus one, and its running sum.
+    inner: Option<Box<(RunningIntegral, f64)>>,
     step: f64,
 }
 
-impl Integral {
+impl RunningIntegral {
     fn new(signal: usize, eta: f64, step: f64, rates: &Rates) -> Result<Self> {
         if eta == 0.0 {
-            return Ok(Self { signal, near: [1.0, 0.0], far: Vec::new(), inner: None, step });
+            return Ok(Self { signal, recent_weights: [1.0, 0.0], history_weights: Vec::new(), inner: None, step });
         }
         if !(eta > 0.0 && eta <= 2.0) {
             return Err(Error::OutOfRange {
@@ -53,7 +52,7 @@ impl Integral {
         let inner = if eta > 1.0 { Some(Box::new((Self::new(signal, q, step, rates)?, 0.0))) } else { None };
         let mut near = [kernel[0], kernel[1]];
         if eta > 1.0 {
-            // The running integral holds what the last pulse had amounted to at its end.
+            // The running sum already contains the contribution of the last pulse at its end.
             near[1] -= libm::pow(step, eta) / libm::tgamma(eta + 1.0);
         }
         let far = rates
@@ -65,13 +64,13 @@ impl Integral {
                 w * keep * if eta > 1.0 { step * last } else { first + last }
             })
             .collect();
-        Ok(Self { signal, near, far, inner, step })
+        Ok(Self { signal, recent_weights: near, history_weights: far, inner, step })
     }
 
     /// Mean over the newest pulse.
-    fn next(&mut self, newest: f64, past: &Past) -> f64 {
-        let older: f64 = self.far.iter().zip(&past.states).map(|(w, z)| w * z).sum();
-        let local = self.near[0] * newest + self.near[1] * past.last + older;
+    fn next(&mut self, newest: f64, past: &SignalHistory) -> f64 {
+        let older: f64 = self.history_weights.iter().zip(&past.states).map(|(w, z)| w * z).sum();
+        let local = self.recent_weights[0] * newest + self.recent_weights[1] * past.last + older;
         match &mut self.inner {
             None => local,
             Some(pair) => {
@@ -84,26 +83,26 @@ impl Integral {
     }
 }
 
-/// One equation in a stream.
+/// Recursion of one equation in a stream.
 #[derive(Debug, Clone)]
-struct Fit {
+struct EquationRecursion {
     output: usize,
-    integrals: Vec<Integral>,
+    integrals: Vec<RunningIntegral>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
-    /// The p newest rows, each with its target, as a ring.
+    /// Ring buffer of the p newest rows, each with its target.
     rows: Vec<(Vec<f64>, f64)>,
     at: usize,
 }
 
-/// Recursion (44) for several equations on one stream of samples.
+/// Multi-innovation recursion (44) of several equations on one stream of samples.
 #[derive(Debug, Clone)]
 pub struct Streaming {
     inputs: Vec<bool>,
     keep: Vec<f64>,
     share: Vec<f64>,
-    pasts: Vec<Past>,
-    fits: Vec<Fit>,
+    pasts: Vec<SignalHistory>,
+    fits: Vec<EquationRecursion>,
     sample: Option<Vec<f64>>,
     means: Vec<f64>,
     length: usize,
@@ -112,11 +111,13 @@ pub struct Streaming {
 }
 
 impl Streaming {
-    /// A stream of samples `step` s apart for at most `longest` pulses; `inputs` tells held inputs from outputs.
+    /// Stream of samples with the interval `step` \[s\], for at most `longest` pulses.
+    ///
+    /// `inputs` marks the zero-order-hold inputs; the other signals are outputs.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a step, length, prior or order of an integral that cannot be used;
-    /// [`Error::Length`] where `fixed` does not match the terms; [`Error::Structure`] for a signal that is not there.
+    /// [`Error::OutOfRange`] for an invalid step, length, prior or integration order; [`Error::Length`] if `fixed` does
+    /// not match the terms; [`Error::Structure`] for an unknown signal.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -139,9 +140,9 @@ impl Streaming {
         prior: f64,
     ) -> Result<Self> {
         check_step(step)?;
-        Innovation { length, prior_covariance: prior, rows: Rows::Time }.check()?;
+        Innovation { length, prior_covariance: prior, row_basis: RowBasis::Time }.check()?;
         #[allow(clippy::cast_precision_loss)]
-        let rates = Rates::new(step, step * (longest.max(2) as f64), TOLERANCE)?;
+        let rates = Rates::new(step, step * (longest.max(2) as f64), MEMORY_TOLERANCE)?;
         let mut fits = Vec::with_capacity(equations.len());
         for (structure, fixed) in equations {
             structure.check(inputs.len(), |s| inputs[s])?;
@@ -152,10 +153,10 @@ impl Streaming {
                 .terms
                 .iter()
                 .enumerate()
-                .map(|(k, term)| Integral::new(term.signal, structure.integration(k), step, &rates))
+                .map(|(k, term)| RunningIntegral::new(term.signal, structure.integration(k), step, &rates))
                 .collect::<Result<Vec<_>>>()?;
             let free = fixed.iter().filter(|f| f.is_none()).count();
-            fits.push(Fit {
+            fits.push(EquationRecursion {
                 output: structure.output,
                 integrals,
                 fixed: fixed.clone(),
@@ -170,7 +171,7 @@ impl Streaming {
             inputs: inputs.to_vec(),
             keep: decays.iter().map(|d| d.0).collect(),
             share: decays.iter().map(|d| step * (d.1 + d.2)).collect(),
-            pasts: vec![Past { states: vec![0.0; count], last: 0.0 }; inputs.len()],
+            pasts: vec![SignalHistory { states: vec![0.0; count], last: 0.0 }; inputs.len()],
             fits,
             sample: None,
             means: vec![0.0; inputs.len()],
@@ -180,11 +181,11 @@ impl Streaming {
         })
     }
 
-    /// Takes one sample of every signal. Constant time.
+    /// Add one sample of every signal, in constant time.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`]; [`Error::OutOfRange`] past the longest run;
-    /// [`Error::Diverged`] where the covariance loses its sign to rounding.
+    /// [`Error::Length`], [`Error::NotFinite`]; [`Error::OutOfRange`] beyond the longest run;
+    /// [`Error::Diverged`] if rounding makes the covariance indefinite.
     pub fn push(&mut self, sample: &[f64]) -> Result<()> {
         check_length("sample", self.inputs.len(), sample.len())?;
         check_finite("sample", sample)?;
@@ -214,21 +215,21 @@ impl Streaming {
         Ok(())
     }
 
-    /// Coefficients of every equation's terms after the newest sample, fixed ones as given.
+    /// Coefficients of the terms of every equation after the newest sample, fixed ones as given.
     #[must_use]
     pub fn coefficients(&self) -> Vec<Vec<f64>> {
-        self.fits.iter().map(Fit::coefficients).collect()
+        self.fits.iter().map(EquationRecursion::coefficients).collect()
     }
 
-    /// Pulses so far.
+    /// Number of pulses so far.
     #[must_use]
     pub fn pulses(&self) -> usize {
         self.pulses
     }
 }
 
-impl Fit {
-    fn step(&mut self, means: &[f64], pasts: &[Past], length: usize, pulse: usize) -> Result<()> {
+impl EquationRecursion {
+    fn step(&mut self, means: &[f64], pasts: &[SignalHistory], length: usize, pulse: usize) -> Result<()> {
         let mut target = means[self.output];
         let mut row = Vec::with_capacity(self.integrals.len());
         for (integral, fixed) in self.integrals.iter_mut().zip(&self.fixed) {

@@ -1,18 +1,19 @@
-//! Fractional memory in bounded space: the kernel of I^q as a sum of decaying exponentials, shared by every order.
+//! Kernel of I^q as a sum of decaying exponentials: fractional memory in bounded space, with rates for all orders.
 //!
-//! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. The trapezoidal rule in x converges like
-//! e^{−π²/Δx} for such integrands, so a few dozen rates e^x carry the whole past to any precision asked for; each rate
-//! needs one number of state a signal. What lies below the lowest rate is a geometric series and is put on four rates
-//! near zero with its first four moments kept. The rates do not depend on q: all orders on one signal share its states.
+//! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. For such integrands the trapezoidal rule in x
+//! converges like e^{−π²/Δx}. A few dozen rates e^x therefore represent the whole history at any requested accuracy,
+//! and each rate needs one state a signal. Nodes below the lowest rate form a geometric series. Four rates near zero
+//! replace them and match its first four moments. Rates do not depend on q, so all orders of one signal share its
+//! states.
 
 use crate::error::{check_finite, Error, Result};
 
-/// The lowest rate of the rule times the longest lag: below it four moments are enough (1e−3⁴/4! < 1e−13).
-const SLOWEST: f64 = 1e-3;
-/// Rates below the rule's, as fractions of its lowest.
-const TAIL: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
+/// Lowest rate of the rule times the longest lag. Below it four moments suffice (1e−3⁴/4! < 1e−13).
+const LOWEST_RATE_TIMES_LAG: f64 = 1e-3;
+/// Rates below those of the rule, relative to its lowest one.
+const TAIL_RATE_RATIOS: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
 
-/// Decay rates that serve every kernel t^{q−1}/Γ(q), 0 < q ≤ 1, for lags between two limits.
+/// Decay rates for all kernels t^{q−1}/Γ(q), 0 < q ≤ 1, and lags between two limits.
 #[derive(Debug, Clone)]
 pub struct Rates {
     rates: Vec<f64>,
@@ -24,7 +25,6 @@ impl Rates {
     /// Rates for lags in `[shortest, longest]` s at a relative accuracy of about `tolerance`, 1e−14 at best.
     ///
     /// Their number grows with ln(longest/shortest)·ln(1/tolerance): 70 for 10⁶ at 1e−9.
-    ///
     /// # Errors
     /// [`Error::OutOfRange`] where the lags do not increase or the tolerance is outside (1e−15, 0.1).
     pub fn new(shortest: f64, longest: f64, tolerance: f64) -> Result<Self> {
@@ -44,17 +44,17 @@ impl Rates {
             return Err(bad("tolerance", tolerance, "(1e-15, 0.1)"));
         }
         let digits = -libm::log(tolerance);
-        // Γ's growth off the axis costs a little more than e^{−π²/Δx} says.
+        // The growth of Γ off the real axis costs slightly more than e^{−π²/Δx}.
         let spacing = std::f64::consts::PI * std::f64::consts::PI / (digits + 4.0);
-        let lowest = SLOWEST / longest;
-        // Past this rate a lag of `shortest` leaves less than the tolerance even against t^{q−1} at q near 1.
+        let lowest = LOWEST_RATE_TIMES_LAG / longest;
+        // Above this rate the remainder at lag `shortest` is below the tolerance, even relative to t^{q−1} at q near 1.
         let highest = (digits + 8.0) / shortest;
         if !(highest / lowest).is_finite() {
             return Err(bad("longest lag", longest, "a range that floating point holds"));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let count = (libm::log(highest / lowest) / spacing).ceil() as usize + 1;
-        let mut rates: Vec<f64> = TAIL.iter().map(|f| f * lowest).collect();
+        let mut rates: Vec<f64> = TAIL_RATE_RATIOS.iter().map(|f| f * lowest).collect();
         #[allow(clippy::cast_precision_loss)]
         rates.extend((1..=count).map(|j| lowest * libm::exp(spacing * j as f64)));
         Ok(Self { rates, spacing, lowest })
@@ -75,7 +75,7 @@ impl Rates {
             return weights;
         }
         let scale = libm::sin(std::f64::consts::PI * q) / std::f64::consts::PI * self.spacing;
-        for (w, rate) in weights.iter_mut().zip(&self.rates).skip(TAIL.len()) {
+        for (w, rate) in weights.iter_mut().zip(&self.rates).skip(TAIL_RATE_RATIOS.len()) {
             *w = scale * libm::pow(*rate, 1.0 - q);
         }
         // Moments Σ_{j≥0} w_j (rate_j/lowest)^k of the rule's nodes at and below the lowest rate.
@@ -86,13 +86,13 @@ impl Rates {
             *moment = -at / libm::expm1(-power * self.spacing);
             power += 1.0;
         }
-        for (i, weight) in weights.iter_mut().take(TAIL.len()).enumerate() {
+        for (i, weight) in weights.iter_mut().take(TAIL_RATE_RATIOS.len()).enumerate() {
             // Lagrange's polynomial of this node, by its coefficients.
             let mut polynomial = [1.0, 0.0, 0.0, 0.0];
             let mut degree = 0;
-            for (k, node) in TAIL.iter().enumerate() {
+            for (k, node) in TAIL_RATE_RATIOS.iter().enumerate() {
                 if k != i {
-                    let gap = TAIL[i] - node;
+                    let gap = TAIL_RATE_RATIOS[i] - node;
                     for d in (0..=degree).rev() {
                         polynomial[d + 1] += polynomial[d] / gap;
                         polynomial[d] *= -node / gap;
@@ -106,7 +106,7 @@ impl Rates {
     }
 }
 
-/// Moments of a decay over a step of x = rate·step: e^{−x}, and the shares of the step's first and last value in
+/// Weights of a decay over a step, x = rate·step: e^{−x}, and the weights of the first and last value of the step in
 /// ∫₀¹ e^{−x(1−u)} (first·(1−u) + last·u) du.
 #[must_use]
 pub fn decay(x: f64) -> (f64, f64, f64) {
@@ -127,8 +127,9 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
     (keep, (1.0 - keep * (1.0 + x)) / square, (x - 1.0 + keep) / square)
 }
 
-/// I^q of a signal that is linear between its samples, sample by sample through the exponentials, and how many numbers
-/// held its past. O(samples · rates).
+/// I^q of a signal that is linear between samples, online by the sum of exponentials, and the number of states.
+///
+/// O(samples · rates).
 ///
 /// # Errors
 /// An order outside (0, 1], [`Error::NotFinite`], and as [`Rates::new`] for a step or a tolerance.

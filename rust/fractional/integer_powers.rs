@@ -1,10 +1,10 @@
-//! Powers and logarithms of whole numbers: n^e for all n up to m for the price of those of the primes.
+//! Powers and logarithms of the integers up to m at the cost of those of the primes.
 
 use std::cell::RefCell;
 use std::sync::Arc;
 use std::thread::LocalKey;
 
-use crate::parallel::Shared;
+use crate::parallel::ForkSafeLock;
 
 /// `n^exponent` for n = 0 … m−1. Powers are multiplicative: only primes cost a power, everything else one product, so
 /// the relative error grows by half an ε per prime factor, of which n < 2^20 has at most 19.
@@ -36,11 +36,12 @@ pub(crate) fn odd_powers(exponent: f64, m: usize) -> Vec<f64> {
     powers
 }
 
-/// A logarithm to twice the digits: rounded, and what that leaves out.
+/// Logarithm in double-double precision: the rounded value and its error.
 type Logarithm = (f64, f64);
 
-/// p^e of primes p < m, to some 1.5 ε from ln p: an exponential takes a third of the time of `pow`. Of a whole e, `pow` is
-/// exact as long as the power is.
+/// p^e of primes p < m from ln p, to about 1.5 ε. An exponential takes a third of the time of `pow`.
+///
+/// For an integer e `pow` is used, which is exact if the power is representable.
 #[allow(clippy::cast_precision_loss)]
 fn powers_of_primes(exponent: f64, m: usize) -> impl Fn(usize) -> f64 {
     let logarithms = if exponent.fract() == 0.0 { None } else { Some(prime_logarithms(m)) };
@@ -55,7 +56,7 @@ fn powers_of_primes(exponent: f64, m: usize) -> impl Fn(usize) -> f64 {
     }
 }
 
-/// a·b, rounded and what that leaves out (Dekker, doi:10.1007/BF01397083); for sizes far from the ends of the numbers.
+/// Product a·b, rounded, and its rounding error (Dekker, doi:10.1007/BF01397083). No overflow or underflow.
 fn exact_product(a: f64, b: f64) -> (f64, f64) {
     const HALVES: f64 = 134_217_729.0;
     let halves = |x: f64| {
@@ -67,16 +68,16 @@ fn exact_product(a: f64, b: f64) -> (f64, f64) {
     (product, ((a * b - product) + a * d + c * b) + c * d)
 }
 
-/// a + b, rounded and what that leaves out.
+/// Sum a + b, rounded, and its rounding error.
 fn exact_sum(a: f64, b: f64) -> (f64, f64) {
     let sum = a + b;
     let part = sum - a;
     (sum, (a - (sum - part)) + (b - part))
 }
 
-/// A table that only ever grows: one for all threads, and one of a thread's own for when that is not to be had.
+/// Table that only grows: one for all threads, and one of a thread if the lock is unavailable.
 struct Table<T: 'static> {
-    shared: &'static Shared<Values<T>>,
+    shared: &'static ForkSafeLock<Values<T>>,
     own: &'static LocalKey<RefCell<Values<T>>>,
     make: fn(usize) -> Vec<T>,
 }
@@ -84,7 +85,7 @@ struct Table<T: 'static> {
 type Values<T> = Option<Arc<Vec<T>>>;
 
 impl<T> Table<T> {
-    /// At least m values.
+    /// Table with at least m values.
     fn of(&self, m: usize) -> Arc<Vec<T>> {
         let enough = |values: &Values<T>| values.as_ref().filter(|values| values.len() >= m).map(Arc::clone);
         let own = || self.own.with_borrow(enough);
@@ -92,7 +93,7 @@ impl<T> Table<T> {
             return values;
         }
         let made = Arc::new((self.make)(m.next_power_of_two()));
-        // What is replaced is given back, so that its memory is not freed behind the lock.
+        // The caller drops the replaced table outside the lock.
         let kept = self.shared.with(|values| {
             let longer = values.as_ref().is_none_or(|values| values.len() < made.len());
             longer.then(|| values.replace(Arc::clone(&made)))
@@ -104,10 +105,10 @@ impl<T> Table<T> {
     }
 }
 
-/// Least prime divisor of each n < m (at least).
+/// Least prime divisor of each n < m, possibly of more.
 #[allow(clippy::cast_possible_truncation)]
 fn least_divisors(m: usize) -> Arc<Vec<u32>> {
-    static SHARED: Shared<Values<u32>> = Shared::new(None);
+    static SHARED: ForkSafeLock<Values<u32>> = ForkSafeLock::new(None);
     thread_local!(static OWN: RefCell<Values<u32>> = const { RefCell::new(None) });
     let make = |len| {
         let mut divisors: Vec<u32> = (0..len as u32).collect();
@@ -127,11 +128,12 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
     Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
-/// ln n to twice the digits for n < m (at least): of primes p from ln(p − 1) + 2 artanh(1/(2p − 1)), of others the sum over
-/// their divisors; 0 at 0 and 1.
+/// Logarithms ln n in double-double precision for n < m, possibly for more. 0 at 0 and 1.
+///
+/// For primes p by ln(p − 1) + 2 artanh(1/(2p − 1)), for others by the sum over their divisors.
 #[allow(clippy::cast_precision_loss)]
 fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
-    static SHARED: Shared<Values<Logarithm>> = Shared::new(None);
+    static SHARED: ForkSafeLock<Values<Logarithm>> = ForkSafeLock::new(None);
     thread_local!(static OWN: RefCell<Values<Logarithm>> = const { RefCell::new(None) });
     let make = |len| {
         let divisors = least_divisors(len);
@@ -149,7 +151,7 @@ fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
                 let first = 1.0 / odd;
                 let (product, left) = exact_product(first, odd);
                 let square = first * first;
-                // What the series leaves out is below 1e−19.
+                // The truncated part of the series is below 1e−19.
                 let rest = (1..13).rev().fold(0.0, |sum, k| (sum + 1.0 / f64::from(2 * k + 1)) * square);
                 let low = ((1.0 - product) - left) / odd + first * rest;
                 added(logarithms[n - 1], exact_sum(2.0 * first, 2.0 * low))
@@ -162,10 +164,10 @@ fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
     Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
-/// ln n for n < m (at least); 0 at n = 0, which nobody reads. Longer than m: zip it with what is m long.
+/// Logarithms ln n for n < m, possibly for more: zip them with a sequence of length m. 0 at n = 0, which is never read.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
-    static SHARED: Shared<Values<f64>> = Shared::new(None);
+    static SHARED: ForkSafeLock<Values<f64>> = ForkSafeLock::new(None);
     thread_local!(static OWN: RefCell<Values<f64>> = const { RefCell::new(None) });
     let make = |len| (0..len).map(|n: usize| libm::log(n.max(1) as f64)).collect();
     Table { shared: &SHARED, own: &OWN, make }.of(m)
@@ -177,10 +179,10 @@ mod tests {
 
     #[test]
     fn a_lock_that_is_never_given_back_stops_no_table() {
-        static SHARED: Shared<Values<usize>> = Shared::new(None);
+        static SHARED: ForkSafeLock<Values<usize>> = ForkSafeLock::new(None);
         thread_local!(static OWN: RefCell<Values<usize>> = const { RefCell::new(None) });
         let table = Table { shared: &SHARED, own: &OWN, make: |len| (0..len).collect() };
-        let (first, second) = SHARED.held(|| (table.of(5), table.of(8)));
+        let (first, second) = SHARED.hold_during(|| (table.of(5), table.of(8)));
         assert_eq!(*first, [0, 1, 2, 3, 4, 5, 6, 7]);
         assert!(Arc::ptr_eq(&first, &second), "made once");
         let longer = table.of(9);

@@ -4,7 +4,7 @@ use crate::error::{check_finite, check_step, Error, Result};
 use crate::fractional::kernels::{block_pulse_kernel, check_order, grunwald_letnikov_weights, SecondDifferences};
 use crate::series;
 
-/// How a fractional integral of samples is computed.
+/// Rule of a fractional integral of samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IntegralRule {
     /// The samples are means over pulses and so is the result: F^η (paper (31), (32)); second order in h.
@@ -15,10 +15,10 @@ pub enum IntegralRule {
     GrunwaldLetnikov,
 }
 
-/// Highest order of a derivative of samples: every one multiplies their noise by 1/h.
+/// Highest order of a derivative of samples. Each order multiplies their noise by 1/h.
 pub const MAX_DERIVATIVE: f64 = 3.0;
 
-/// Which fractional derivative.
+/// Definition of a fractional derivative.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Derivative {
     /// Grünwald–Letnikov sum (paper (2)); first order in h for signals that start at zero.

@@ -1,25 +1,26 @@
-//! Kernels of the fractional integral I^η and of its derivative with respect to η, Grünwald–Letnikov weights, and pulse
-//! means of powers of t.
+//! Kernels of the fractional integral I^η: block-pulse kernel, derivative in η, Grünwald–Letnikov weights,
+//! improper terms.
 //!
-//! Terms of a higher order than their equation's own output: kernels below η = 0.
-//!
-//! D^α y = c D^ν s + … with ν > α is integrated by ν, its highest order: I^{ν−α} y = c s + …. All operators commute, so
-//! that equation divided by the kernel of I^{ν−α} is y = c D^{ν−α} s + …, whose D^{ν−α} is the reciprocal of that kernel:
-//! one form for every term, of second order in the step, and D^q I^q is the identity to rounding.
+//! An improper term has an order above its equation's. D^α y = c D^ν s + … with ν > α is integrated by ν, its highest
+//! order: I^{ν−α} y = c s + …. All operators commute, so dividing by the kernel of I^{ν−α} gives y = c D^{ν−α} s + …
+//! with the reciprocal of that kernel as D^{ν−α}. All terms then have one form of second order in the step, and D^q I^q
+//! is the identity up to rounding.
 
 use crate::error::{Error, Result};
 use crate::fractional::integer_powers::{odd_powers, whole_logarithms, whole_powers};
 use crate::series::{multiply, reciprocal};
 
-/// Highest order of an integral, and of an equation: five lightly damped modes in one. The kernels are exact to a few ε
-/// up to here; what a division loses to rounding grows as (ωT)^α/Γ(α+1), so long records of many modes need fewer orders.
+/// Highest order of an integral and of an equation: five lightly damped modes.
+///
+/// Kernels are exact to a few ε up to this order. Rounding errors of a division grow like (ωT)^α/Γ(α+1), so long
+/// records of many modes need lower orders.
 pub const MAX_ORDER: f64 = 10.0;
 
 /// Lowest order of an input in an equation: a threefold integration.
 pub const MIN_INPUT_ORDER: f64 = -3.0;
 
-/// Below this pulse distance the even binomial sum converges slowly and gets [`TERMS_NEAR`] terms.
-const NEAR: usize = 8;
+/// Distance in pulses below which the even binomial sum converges slowly and needs [`TERMS_NEAR`] terms.
+const FAR_DISTANCE_PULSES: usize = 8;
 /// Terms for distances 2 … 7: 4^−25 is below the rounding error at distance 2.
 const TERMS_NEAR: usize = 25;
 /// Terms from distance 8 on: 64^−8 is below the rounding error.
@@ -42,12 +43,12 @@ const TERMS_FAR: usize = 8;
 pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
     let differences = SecondDifferences::new(eta);
-    if m < SIEVED {
+    if m < MIN_SIEVE_TERMS {
         return (1..=m).map(|n| scale * differences.value(n)).collect();
     }
     let powers = whole_powers(eta + 1.0, m);
-    let head = (1..=HEAD).map(|n| differences.near(n, powers[n - 1]));
-    let tail = powers.iter().enumerate().skip(HEAD).map(|(c, &power)| differences.far(c, power));
+    let head = (1..=LONG_SUM_TERMS).map(|n| differences.near_value(n, powers[n - 1]));
+    let tail = powers.iter().enumerate().skip(LONG_SUM_TERMS).map(|(c, &power)| differences.far_value(c, power));
     head.chain(tail).map(|v| scale * v).collect()
 }
 
@@ -59,21 +60,21 @@ pub fn block_pulse_kernel_derivative(eta: f64, m: usize, step: f64) -> Vec<f64> 
     kernel_with_derivative(eta, m, step).1
 }
 
-/// [`block_pulse_kernel`] and its derivative with respect to η, for little more than the price of one.
+/// [`block_pulse_kernel`] and its derivative with respect to η, at little more than the cost of one.
 #[must_use]
 pub fn kernel_with_derivative(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
     let slope = libm::log(step) - digamma(eta + 2.0);
     let differences = SecondDifferences::new(eta);
-    if m >= SIEVED {
+    if m >= MIN_SIEVE_TERMS {
         let powers = whole_powers(eta + 1.0, m);
         let logarithms = whole_logarithms(m);
         let (mut kernel, mut slopes) = (Vec::with_capacity(m), Vec::with_capacity(m));
         for (c, (&power, &logarithm)) in powers.iter().zip(logarithms.iter()).enumerate() {
-            let (v, dv) = if c < HEAD {
-                differences.near_with_slope(c + 1, power, logarithm)
+            let (v, dv) = if c < LONG_SUM_TERMS {
+                differences.near_value_and_slope(c + 1, power, logarithm)
             } else {
-                differences.far_with_slope(c, power, logarithm)
+                differences.far_value_and_slope(c, power, logarithm)
             };
             kernel.push(scale * v);
             slopes.push(scale * (v * slope + dv));
@@ -94,7 +95,7 @@ pub fn second_difference(eta: f64, n: usize) -> (f64, f64) {
     SecondDifferences::new(eta).value_and_slope(n)
 }
 
-/// The even binomial coefficients C(η+1, 2k), k = 1 … K, and their derivatives with respect to η: all n share them.
+/// Even binomial coefficients C(η+1, 2k), k = 1 … K, and their derivatives with respect to η. All n share them.
 pub(crate) struct SecondDifferences {
     eta: f64,
     coefficients: [f64; TERMS_NEAR],
@@ -119,15 +120,15 @@ impl SecondDifferences {
         Self { eta, coefficients, slopes }
     }
 
-    /// Σ_k a_k x^k over the terms that count at this distance, smallest first.
+    /// Σ_k a_k x^k over the terms that matter at this distance, smallest first.
     fn sum(coefficients: &[f64; TERMS_NEAR], centre: usize, shrink: f64) -> f64 {
-        let terms = if centre < NEAR { TERMS_NEAR } else { TERMS_FAR };
+        let terms = if centre < FAR_DISTANCE_PULSES { TERMS_NEAR } else { TERMS_FAR };
         coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink)
     }
 
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn value(&self, n: usize) -> f64 {
-        self.near(n, if n > 2 { libm::pow((n - 1) as f64, self.eta + 1.0) } else { 1.0 })
+        self.near_value(n, if n > 2 { libm::pow((n - 1) as f64, self.eta + 1.0) } else { 1.0 })
     }
 
     #[allow(clippy::cast_precision_loss)]
@@ -135,12 +136,12 @@ impl SecondDifferences {
         let centre = n.saturating_sub(1) as f64;
         let (power, logarithm) =
             if n > 2 { (libm::pow(centre, self.eta + 1.0), libm::log(centre)) } else { (1.0, 0.0) };
-        self.near_with_slope(n, power, logarithm)
+        self.near_value_and_slope(n, power, logarithm)
     }
 
     /// `v_n` from (n−1)^{η+1}.
     #[allow(clippy::cast_precision_loss)]
-    fn near(&self, n: usize, power: f64) -> f64 {
+    fn near_value(&self, n: usize, power: f64) -> f64 {
         match n {
             0 => 0.0,
             1 => 1.0,
@@ -154,8 +155,8 @@ impl SecondDifferences {
 
     /// `v_n` and its derivative from (n−1)^{η+1} and ln(n−1).
     #[allow(clippy::cast_precision_loss)]
-    fn near_with_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
-        let value = self.near(n, power);
+    fn near_value_and_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
+        let value = self.near_value(n, power);
         match n {
             0 | 1 => (value, 0.0),
             2 => (value, 2.0 * libm::exp2(self.eta) * std::f64::consts::LN_2),
@@ -168,12 +169,13 @@ impl SecondDifferences {
     }
 }
 
-/// From this many terms on, powers come from a sieve instead of one by one.
-const SIEVED: usize = 256;
-/// Terms before the sieve takes over: those whose sums are long.
-const HEAD: usize = 64;
+/// Shortest kernel whose powers come from a sieve instead of single evaluations.
+const MIN_SIEVE_TERMS: usize = 256;
+/// Terms with long binomial sums, before the formula for large distances.
+const LONG_SUM_TERMS: usize = 64;
 
-/// Terms of the even binomial sum that count at a distance of at least [`HEAD`]: c^{−2K} is below the rounding error.
+/// Terms of the even binomial sum that matter at a distance of at least [`LONG_SUM_TERMS`]: c^{−2K} is below the
+/// rounding error.
 const fn terms_at(centre: usize) -> usize {
     match centre {
         0..1024 => 5,
@@ -183,17 +185,17 @@ const fn terms_at(centre: usize) -> usize {
 }
 
 impl SecondDifferences {
-    /// `v_n` at n = centre + 1 > [`HEAD`] from centre^{η+1}.
+    /// `v_n` at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1}.
     #[allow(clippy::cast_precision_loss)]
-    fn far(&self, centre: usize, power: f64) -> f64 {
+    fn far_value(&self, centre: usize, power: f64) -> f64 {
         let shrink = 1.0 / (centre as f64 * centre as f64);
         let sum = self.coefficients[..terms_at(centre)].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink);
         2.0 * power * sum
     }
 
-    /// `v_n` and its derivative at n = centre + 1 > [`HEAD`] from centre^{η+1} and ln centre.
+    /// `v_n` and its derivative at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1} and ln centre.
     #[allow(clippy::cast_precision_loss)]
-    fn far_with_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
+    fn far_value_and_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let shrink = 1.0 / (centre as f64 * centre as f64);
         let terms = terms_at(centre);
         let (mut sum, mut slope) = (0.0, 0.0);
@@ -244,8 +246,9 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
     weights
 }
 
-/// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε (exponent > −1); of δ and its derivatives, as differences over
-/// the first pulses, for the exponents −1, −2, ….
+/// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε for exponents above −1.
+///
+/// For −1, −2, … these are differences over the first pulses, for δ and its derivatives.
 ///
 /// ```
 /// let means = ftlm::fractional::kernels::power_means(1.0, 3, 2.0);
@@ -255,17 +258,18 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
 #[allow(clippy::cast_precision_loss)]
 pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent <= -1.0 && exponent.fract() == 0.0 {
-        // Differences of the first pulses stand at their middle; half their span further back is one more difference.
+        // Differences of the first pulses are centered between them. One more difference shifts them back by half their
+        // length.
         let order = -exponent - 1.0;
         let (first, next) = (grunwald_letnikov_weights(order, m), grunwald_letnikov_weights(order + 1.0, m));
         let scale = libm::pow(step, exponent);
         return first.iter().zip(&next).map(|(a, b)| scale * (a + 0.5 * (order + 1.0) * b)).collect();
     }
     let means = PowerMeans::new(exponent, step);
-    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.near(k as f64)).collect();
+    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.endpoint_mean(k as f64)).collect();
     if out.len() < m {
         let odd = odd_powers(exponent, m);
-        out.extend(odd.iter().enumerate().skip(FEW).map(|(k, &power)| means.far(k, power)));
+        out.extend(odd.iter().enumerate().skip(ENDPOINT_PULSES).map(|(k, &power)| means.midpoint_mean(k, power)));
     }
     out
 }
@@ -273,7 +277,7 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 /// Derivative of [`power_means`] with respect to an exponent above −1.
 ///
 /// ```
-/// // Means of t^0 stay 1 whatever the pulse; of t^e they grow with e as ln t does: ∫ ln t over [0, 1] is −1.
+/// // Means of t^0 are always 1. Those of t^e change with e like ln t: ∫ ln t over [0, 1] is −1.
 /// let slope = ftlm::fractional::kernels::power_means_slope(0.0, 1, 1.0);
 /// assert!((slope[0] + 1.0).abs() < 1e-15);
 /// ```
@@ -281,26 +285,26 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 #[allow(clippy::cast_precision_loss)]
 pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let means = PowerMeans::new(exponent, step);
-    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.near_slope(k as f64)).collect();
+    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.endpoint_slope(k as f64)).collect();
     if out.len() < m {
         let (odd, logarithms) = (odd_powers(exponent, m), whole_logarithms(2 * m));
-        let far = odd.iter().enumerate().skip(FEW);
-        out.extend(far.map(|(k, &power)| means.far_slope(k, power, logarithms[2 * k + 1])));
+        let far = odd.iter().enumerate().skip(ENDPOINT_PULSES);
+        out.extend(far.map(|(k, &power)| means.midpoint_slope(k, power, logarithms[2 * k + 1])));
     }
     out
 }
 
-/// Pulses whose means come from powers of their ends in a long record, and terms about the middle of those before the
-/// [`HEAD`] after them: 33^−16 is below the rounding error.
-const FEW: usize = 16;
-const MIDDLE: usize = 8;
+/// Pulses whose means come from powers of their ends in a long record, and terms of the midpoint series of the pulses
+/// before [`LONG_SUM_TERMS`]: 33^−16 is below the rounding error.
+const ENDPOINT_PULSES: usize = 16;
+const MIDPOINT_SERIES_TERMS: usize = 8;
 
-/// Pulses whose means come from powers of their ends; those of all others from that of their middle.
+/// Number of pulses whose means come from powers of their ends. Other means come from powers of their midpoints.
 fn near_pulses(m: usize) -> usize {
-    m.min(if m < SIEVED { m } else { FEW })
+    m.min(if m < MIN_SIEVE_TERMS { m } else { ENDPOINT_PULSES })
 }
 
-/// Means of t^e over pulses of length h, one by one.
+/// Means of t^e over pulses of length h.
 struct PowerMeans {
     /// e + 1.
     a: f64,
@@ -308,15 +312,15 @@ struct PowerMeans {
     half: f64,
     ln_step: f64,
     /// C(a, 2j+1)/a and their derivatives.
-    sums: [f64; MIDDLE],
-    slopes: [f64; MIDDLE],
+    sums: [f64; MIDPOINT_SERIES_TERMS],
+    slopes: [f64; MIDPOINT_SERIES_TERMS],
 }
 
 impl PowerMeans {
     #[allow(clippy::cast_precision_loss)]
     fn new(exponent: f64, step: f64) -> Self {
         let (a, scale) = (exponent + 1.0, libm::pow(step, exponent));
-        let (mut sums, mut slopes) = ([0.0; MIDDLE], [0.0; MIDDLE]);
+        let (mut sums, mut slopes) = ([0.0; MIDPOINT_SERIES_TERMS], [0.0; MIDPOINT_SERIES_TERMS]);
         let (mut c, mut dc) = (1.0, 0.0);
         for (j, (sum, slope)) in sums.iter_mut().zip(&mut slopes).enumerate() {
             (*sum, *slope) = (c, dc);
@@ -328,44 +332,45 @@ impl PowerMeans {
         Self { a, scale, half: scale * libm::exp2(-exponent), ln_step: libm::log(step), sums, slopes }
     }
 
-    /// Mean over pulse k: k^a − (k−1)^a without the cancellation.
-    fn near(&self, k: f64) -> f64 {
+    /// Mean over pulse k, k^a − (k−1)^a, without cancellation.
+    fn endpoint_mean(&self, k: f64) -> f64 {
         let a = self.a;
         self.scale / a * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
     }
 
-    /// Its derivative.
-    fn near_slope(&self, k: f64) -> f64 {
+    /// Derivative of the mean over pulse k with respect to e.
+    fn endpoint_slope(&self, k: f64) -> f64 {
         let a = self.a;
         let turned = |k: f64| if k > 1.0 { libm::pow(k, a) * libm::log(k) } else { 0.0 };
-        self.near(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
+        self.endpoint_mean(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
     }
 
-    /// Σ over the terms that count at the middle of pulse k + 1, at d/2 for d = 2k + 1.
+    /// Sum over the terms that matter at the midpoint of pulse k + 1, d/2 with d = 2k + 1.
     #[allow(clippy::cast_precision_loss)]
-    fn sum(sums: &[f64; MIDDLE], k: usize) -> f64 {
+    fn sum(sums: &[f64; MIDPOINT_SERIES_TERMS], k: usize) -> f64 {
         let d = (2 * k + 1) as f64;
         let shrink = 1.0 / (d * d);
-        let terms = if k < HEAD { MIDDLE } else { terms_at(2 * k) };
+        let terms = if k < LONG_SUM_TERMS { MIDPOINT_SERIES_TERMS } else { terms_at(2 * k) };
         sums[..terms].iter().rev().fold(0.0, |sum, &c| sum * shrink + c)
     }
 
-    /// Mean over pulse k + 1 from d^e: about the middle it is (d/2)^e·Σ C(a, 2j+1)/a·d^−2j.
-    fn far(&self, k: usize, power: f64) -> f64 {
+    /// Mean over pulse k + 1 from d^e: (d/2)^e·Σ C(a, 2j+1)/a·d^−2j, a series about the midpoint.
+    fn midpoint_mean(&self, k: usize, power: f64) -> f64 {
         self.half * power * Self::sum(&self.sums, k)
     }
 
-    /// Its derivative.
-    fn far_slope(&self, k: usize, power: f64, logarithm: f64) -> f64 {
+    /// Derivative of the mean over pulse k + 1 with respect to e.
+    fn midpoint_slope(&self, k: usize, power: f64, logarithm: f64) -> f64 {
         let turned = self.ln_step - std::f64::consts::LN_2 + logarithm;
         self.half * power * (Self::sum(&self.sums, k) * turned + Self::sum(&self.slopes, k))
     }
 }
 
-/// Pulses that drive as t^e does, from their means: of −1 < e < 0 the first two carry what else moves a smooth answer by the
-/// power e + 2 of the step, the others' moments about their middles (corrected as in doi:10.1137/0517050, by one step).
+/// Pulse means of t^e as an input, corrected in the first two pulses for −1 < e < 0.
 ///
-/// Σ_j ∫_j (t − t_j) t^e dt over all pulses is h^{e+2} ζ(−1−e)/(1+e): so much of the first pulse belongs to the second.
+/// Without the correction a smooth response is wrong by the order e + 2 of the step, because of the moments of t^e
+/// about the midpoints (correction as in doi:10.1137/0517050, by one step). Σ_j ∫_j (t − t_j) t^e dt over all pulses is
+/// h^{e+2} ζ(−1−e)/(1+e). That much is moved from the first pulse to the second.
 #[must_use]
 pub fn power_pulses(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let mut pulses = power_means(exponent, m, step);
@@ -387,12 +392,12 @@ pub fn power_pulses_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     slopes
 }
 
-/// Whether a power of t is infinite where it begins, and no impulse.
+/// Whether a power of t is infinite at t = 0 and not an impulse.
 fn is_singular(exponent: f64) -> bool {
     exponent > -1.0 && exponent < 0.0
 }
 
-/// Takes this from the first pulse and gives it to the second.
+/// Move this value from the first pulse to the second.
 fn shift(pulses: &mut [f64], value: f64) {
     if let [first, second, ..] = pulses {
         *first -= value;
@@ -400,9 +405,9 @@ fn shift(pulses: &mut [f64], value: f64) {
     }
 }
 
-/// First moments of t^e about the middles of pulses of length 1, all together: ζ(−1−e)/(1+e), −1 < e < 0.
+/// Sum of the first moments of t^e about the midpoints of unit pulses: ζ(−1−e)/(1+e), −1 < e < 0.
 fn moment(exponent: f64) -> f64 {
-    // Euler and Maclaurin from ten on.
+    // Euler–Maclaurin summation from ten on.
     const FROM: f64 = 10.0;
     const BERNOULLI: [f64; 4] = [1.0 / 12.0, -1.0 / 720.0, 1.0 / 30240.0, -1.0 / 1_209_600.0];
     let a = exponent + 1.0;
@@ -419,7 +424,7 @@ fn moment(exponent: f64) -> f64 {
     zeta / a
 }
 
-/// Refuses an order outside [0, [`MAX_ORDER`]].
+/// Return an error for an order outside [0, [`MAX_ORDER`]].
 ///
 /// # Errors
 /// [`Error::OutOfRange`].
@@ -436,11 +441,12 @@ pub fn check_order(name: &str, order: f64) -> Result<()> {
     }
 }
 
-/// A term stays below its equation's α by more than minus this. The reciprocal kernel of D^1 is Tustin's rule, which
-/// rings from pulse to pulse for ever.
+/// Excess of a term's order over α must stay below this value. The reciprocal kernel of D^1 is Tustin's rule, which
+/// rings from pulse to pulse without decay.
 pub const MAX_EXCESS: f64 = 1.0;
 
-/// Kernel of I^η in pulse means for η > −[`MAX_EXCESS`]: as [`block_pulse_kernel`], below 0 its reciprocal at −η.
+/// Kernel of I^η in pulse means for η > −[`MAX_EXCESS`]. For η < 0 it is the reciprocal of [`block_pulse_kernel`] at
+/// −η.
 ///
 /// ```
 /// use ftlm::fractional::kernels::kernel;
@@ -469,9 +475,9 @@ pub fn kernel_and_slope(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     (made, multiply(&square, &slope, m))
 }
 
-/// The first number of [`kernel`]: what a pulse answers within itself.
+/// First coefficient of [`kernel`]: effect of a pulse on its own mean.
 #[must_use]
-pub fn first(eta: f64, step: f64) -> f64 {
+pub fn first_coefficient(eta: f64, step: f64) -> f64 {
     let size = eta.abs();
     let value = libm::pow(step, size) / libm::tgamma(size + 2.0);
     if eta >= 0.0 {

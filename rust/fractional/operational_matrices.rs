@@ -1,8 +1,6 @@
-//! Integration operational matrices: F^η of block pulses and P^η of Haar wavelets, dense, for study and as oracle.
+//! Operational matrices of integration for block pulses and Haar wavelets, and the fast Haar transform.
 //!
-//! Identification and simulation never need them: they apply F^η as a series ([`crate::series`]).
-//!
-//! The fast Haar transform and the dense Haar matrix: an orthogonal change of basis of pulse means.
+//! Identification and simulation apply F^η as a series instead ([`crate::series`]).
 
 use crate::error::{check_dense, check_step, Error, Result};
 use crate::fractional::kernels::{block_pulse_kernel, check_order};
@@ -27,8 +25,8 @@ pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
 
 /// P^η = Φ F^η Φᵀ (paper (37)), row-major m × m, at little more than the cost of writing it. O(m²).
 ///
-/// F is Toeplitz, so an entry depends on the two wavelets' widths and on how far apart they stand, nothing else: rows of
-/// a level are windows into one table for each other level, and all tables together hold O(m log m) numbers.
+/// F is Toeplitz, so an entry depends only on the widths of two wavelets and their distance. Rows of one level are
+/// windows into one table for each other level. All tables together have O(m log m) entries.
 ///
 /// # Errors
 /// As [`block_pulse_matrix`], and m must be a power of two.
@@ -46,7 +44,7 @@ pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     check_order("order", eta)?;
     check_step(step)?;
     check_dense(m)?;
-    // sums[k] holds the sums of 2^k successive kernel values, the last of them at n.
+    // sums[k] are the sums of 2^k successive kernel values, the last of them at n.
     let mut sums = vec![block_pulse_kernel(eta, m, step)];
     let mut width = 1;
     while width < m {
@@ -57,7 +55,7 @@ pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     }
     let mut out = Vec::with_capacity(m * m);
     let mut response = vec![0.0; m];
-    // The constant, then wavelets from the widest to the narrowest.
+    // Constant first, then wavelets from the widest to the narrowest.
     for level in 0..sums.len() {
         let rows = Wavelet::of(level, m);
         rows.respond(&sums, &mut response);
@@ -100,14 +98,14 @@ impl Wavelet {
     }
 }
 
-/// Entries of one level of rows with one level of columns, by distance, laid out so that every row is a window.
+/// Entries of one level of rows with one level of columns, by distance, such that every row is a window.
 struct Table {
     values: Vec<f64>,
     /// Columns of the level.
     count: usize,
-    /// Where the columns are wider than the rows: so many rows to a column, each with a stretch of its own.
+    /// If columns are wider than rows: rows to a column, each with its own window range.
     phases: usize,
-    /// Where they are not: columns to a row.
+    /// Otherwise: columns to a row.
     stride: usize,
     /// Rows of the level.
     rows: usize,
@@ -124,9 +122,9 @@ impl Table {
     }
 }
 
-/// The tables of a level of rows with all levels of columns, in the order of the columns.
+/// Tables of a level of rows with all levels of columns, in the order of the columns.
 fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
-    // ahead[m + d] holds the sum of as many responses from d on as the half width at hand.
+    // ahead[m + d] is the sum of the responses from d on over half a width.
     let mut ahead = vec![0.0; 2 * m];
     ahead[m..].copy_from_slice(response);
     let levels = m.trailing_zeros() as usize;
@@ -145,7 +143,7 @@ fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
     tables
 }
 
-/// `entry(m + d)` is the entry of a column that starts d pulses after its row.
+/// Table with `entry(m + d)` for a column that starts d pulses after its row.
 fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f64) -> Table {
     let count = m / columns.width;
     let (phases, stride) = ((columns.width / rows.width).max(1), (rows.width / columns.width).max(1));
@@ -164,7 +162,7 @@ fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f
 /// As [`operational_matrix`].
 #[cfg(feature = "oracles")]
 pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
-    let phi = matrix(m)?;
+    let phi = haar_matrix(m)?;
     let f = block_pulse_matrix(eta, m, step)?;
     let phi_f = dense::multiply(&phi, &f, m, m, m);
     let mut phi_transposed = phi;
@@ -187,7 +185,7 @@ fn transpose(a: &mut [f64], m: usize) {
     }
 }
 
-/// Refuses a length that is no power of two.
+/// Return an error for a length that is not a power of two.
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`] with the two nearest powers, [`Error::Length`] for m = 0.
@@ -203,7 +201,7 @@ pub fn check_power_of_two(m: usize) -> Result<()> {
     }
 }
 
-/// Φ f in place: Haar coefficients, coarse to fine, of pulse means. O(m).
+/// Haar transform Φ f in place: coefficients from coarse to fine, from pulse means. O(m).
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`].
@@ -216,18 +214,18 @@ pub fn check_power_of_two(m: usize) -> Result<()> {
 /// # Ok(())
 /// # }
 /// ```
-pub fn transform(f: &mut [f64]) -> Result<()> {
+pub fn haar_transform(f: &mut [f64]) -> Result<()> {
     check_power_of_two(f.len())?;
     let mut scratch = vec![0.0; f.len()];
-    forward(f, &mut scratch);
+    haar_transform_with_scratch(f, &mut scratch);
     Ok(())
 }
 
-/// Φᵀ c in place: pulse means from Haar coefficients. O(m).
+/// Inverse Haar transform Φᵀ c in place: pulse means from coefficients. O(m).
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`].
-pub fn inverse(c: &mut [f64]) -> Result<()> {
+pub fn haar_inverse(c: &mut [f64]) -> Result<()> {
     check_power_of_two(c.len())?;
     let mut scratch = vec![0.0; c.len()];
     let mut len = 1;
@@ -243,8 +241,8 @@ pub fn inverse(c: &mut [f64]) -> Result<()> {
     Ok(())
 }
 
-/// [`transform`] with the caller's scratch, for loops over rows; `f` has a power of two of elements.
-pub(crate) fn forward(f: &mut [f64], scratch: &mut [f64]) {
+/// [`haar_transform`] with scratch of the caller, for loops over rows. The length of `f` is a power of two.
+pub(crate) fn haar_transform_with_scratch(f: &mut [f64], scratch: &mut [f64]) {
     let mut len = f.len();
     while len > 1 {
         let half = len / 2;
@@ -258,12 +256,12 @@ pub(crate) fn forward(f: &mut [f64], scratch: &mut [f64]) {
     }
 }
 
-/// The orthogonal Haar matrix Φ, row-major m × m (paper (27), (29)), written from the definition.
+/// Orthogonal Haar matrix Φ by definition, row-major m × m (paper (27), (29)).
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`].
 #[allow(clippy::cast_precision_loss)]
-pub fn matrix(m: usize) -> Result<Vec<f64>> {
+pub fn haar_matrix(m: usize) -> Result<Vec<f64>> {
     check_power_of_two(m)?;
     check_dense(m)?;
     let mut phi = vec![0.0; m * m];

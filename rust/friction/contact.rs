@@ -1,44 +1,43 @@
-//! What friction does in one pulse to several bodies at once, each of which may stick or slide.
+//! Contact problem of bodies with friction: set-valued law of coupled bodies, solved pulse by pulse.
 //!
-//! By itself a body's friction is a function of where it would end the pulse without any ([`Law::pulse`]), and that is
-//! moved by the mean forces on the others: φ_a = T_a(p_a − Σ_{b≠a} G_ab φ_b), e = p − G φ. With Coulomb friction T_a rises
-//! with its argument by at most 1/G_aa, so that friction and end velocity of a body never move against each other: of two
-//! solutions Δe_a Δφ_a ≥ 0 for every a, while Δe = −G Δφ. Where G is a P-matrix (all of its principal minors positive, as
-//! those of an inverse of inertias are) no vector keeps all signs of its image, so there is exactly one solution: of all
-//! combinations of sliding to either side and resting, one is consistent. Newton's steps reach it in a few, and where one
-//! comes no nearer, a sweep from body to body does: it descends where G is that of inertias, symmetric but for scales.
+//! The friction of a single body is a function of its end velocity without friction ([`FrictionLaw::pulse`]), which the
+//! mean forces on the other bodies change: φ_a = T_a(p_a − Σ_{b≠a} G_ab φ_b), e = p − G φ. With Coulomb friction T_a
+//! rises with its argument by at most 1/G_aa, so that friction and end velocity of a body never change in opposite
+//! directions: two solutions have Δe_a Δφ_a ≥ 0 for every a, while Δe = −G Δφ. If G is a P-matrix (all principal minors
+//! are positive, as for an inverse inertia matrix), no vector keeps all signs of its image, so the solution is unique:
+//! exactly one combination of sliding and sticking is consistent. Newton steps find it in a few iterations. If one
+//! makes no progress, a Gauss–Seidel sweep over the bodies does. It decreases the error for inertia matrices, which are
+//! symmetric up to scaling.
 //!
-//! What friction has more near rest falls with speed, by little in a pulse; where a pulse is long beside that, several
-//! combinations may be consistent, and taken is what these steps reach from the forces of the pulse before.
-//!
-//! The set-valued law φ ∈ F(V) sgn(V), V = L − g ∗ φ, of all bodies that may stick, pulse by pulse, and what moves with it.
+//! Stribeck friction falls with speed. In long pulses several combinations may then be consistent. The one found from
+//! the forces of the previous pulse is used.
 
-use super::convolution::{Heads, Online};
-use super::law::{Law, Moves, Phase, Pulse};
+use super::convolution::{Heads, OnlineConvolution};
+use super::law::{FrictionLaw, Phase, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
-/// Bodies with friction, and what a unit of force on each takes from the velocities of all at the end of its pulse.
+/// Friction laws of coupled bodies, and the velocity change of each for a unit of force on each in one pulse.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Rubbing {
-    laws: Vec<Law>,
-    /// Velocities by forces, row by row.
+pub struct ContactLaw {
+    laws: Vec<FrictionLaw>,
+    /// Velocity changes per force, row by row.
     gains: Vec<f64>,
 }
 
-/// Steps to the frictions of a pulse; two bodies that hardly move each other need two.
-const STEPS: usize = 200;
-/// Share of what moves the bodies that the answer may miss.
-const MISSED: f64 = 1e-9;
+/// Most iterations for the frictions of a pulse. Two weakly coupled bodies need two.
+const MAX_FORCE_ITERATIONS: usize = 200;
+/// Largest error of a solution, relative to the velocities.
+const FORCE_TOLERANCE_RATIO: f64 = 1e-9;
 
-impl Rubbing {
+impl ContactLaw {
     /// Bodies with these laws.
     ///
     /// # Errors
-    /// [`Error::Diverged`] where bodies move each other, or what they carry them, so that a pulse has no one answer: the step is too long.
-    pub fn new(laws: Vec<Law>, gains: Vec<f64>) -> Result<Self> {
+    /// [`Error::Diverged`] if the coupling leaves no unique solution of a pulse: the step is too long.
+    pub fn new(laws: Vec<FrictionLaw>, gains: Vec<f64>) -> Result<Self> {
         if !is_p_matrix(&gains, laws.len()) {
-            // Reported like a step too far, so that a search shortens it.
+            // Same error as for a step that is too long, so that an optimizer shortens it.
             return Err(Error::Diverged {
                 what: "friction of bodies that move each other; the free run".into(),
                 index: 0,
@@ -53,29 +52,30 @@ impl Rubbing {
         self.laws.len()
     }
 
-    /// What a unit of force on a body takes from its own velocity at the end of the pulse.
+    /// Velocity change at the end of the pulse for a unit of force on the same body.
     #[must_use]
     pub fn own(&self, body: usize) -> f64 {
         self.gains[body * self.count() + body]
     }
 
-    /// The most that the friction of a body holds.
+    /// Breakaway force of a body.
     #[must_use]
     pub fn breakaway(&self, body: usize) -> f64 {
         self.laws[body].breakaway()
     }
 
-    /// What the others' forces take from a body's velocity.
-    fn others(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
+    /// Velocity change of a body by the forces on the others.
+    fn coupling_velocity(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
         (0..self.count()).filter(|&b| b != body).map(|b| self.gains[body * self.count() + b] * forces(b)).sum()
     }
 
-    /// A pulse that starts at the velocities v and would end at p without any friction: `at` becomes of each body where it
-    /// would end without its own, and what becomes of it. `near` are forces to begin at.
+    /// Solve a pulse that starts at the velocities `v` and would end at `p` without friction.
+    ///
+    /// `at` receives each body's end velocity without its own friction, and its pulse. `near` are the initial forces.
     pub fn pulse(&self, v: &[f64], p: &[f64], rounding: &[f64], near: &[f64], at: &mut Vec<(f64, Pulse)>) {
         let n = self.count();
         let of = |a: usize, forces: &[f64]| {
-            let free = p[a] - self.others(a, |b| forces[b]);
+            let free = p[a] - self.coupling_velocity(a, |b| forces[b]);
             (free, self.laws[a].pulse(v[a], free, self.own(a), rounding[a]))
         };
         at.clear();
@@ -89,7 +89,7 @@ impl Rubbing {
         };
         let mut miss = wrong(at, &forces);
         let size = (0..n).map(|a| v[a].abs() + p[a].abs() + self.own(a) * self.breakaway(a)).fold(0.0, f64::max);
-        for _ in 0..STEPS {
+        for _ in 0..MAX_FORCE_ITERATIONS {
             if miss <= 4.0 * f64::EPSILON * size {
                 break;
             }
@@ -102,7 +102,7 @@ impl Rubbing {
                 (forces, *at, miss) = (ahead, there, left);
                 continue;
             }
-            // One body after the other, which always comes nearer where they move each other less than themselves.
+            // Gauss–Seidel sweep over the bodies. It converges if each body moves others less than itself.
             for a in 0..n {
                 forces[a] = of(a, &forces).1.force;
             }
@@ -110,19 +110,19 @@ impl Rubbing {
             miss = wrong(at, &forces);
         }
         let falls = self.laws.iter().any(|law| law.stribeck > 0.0);
-        if !falls && miss > MISSED * size {
-            // Said as a run that leaves the range of numbers: none is better than a wrong one.
+        if !falls && miss > FORCE_TOLERANCE_RATIO * size {
+            // NaN counts as overflow: no solution is better than a wrong one.
             at.iter_mut().for_each(|(_, pulse)| pulse.end = f64::NAN);
         }
     }
 
-    /// By how much each body's friction rises with where it would end.
+    /// Derivative of each body's friction with respect to its end velocity without friction.
     fn rises(&self, v: &[f64], at: &[(f64, Pulse)]) -> Vec<f64> {
-        let unit = Moves { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
+        let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
         (0..self.count()).map(|a| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, &unit).0).collect()
     }
 
-    /// (1 + diag(rises) (G − diag G))⁻¹ of a vector.
+    /// Solution of (1 + diag(rises) (G − diag G)) x = `vector`.
     fn through(&self, rises: &[f64], vector: &[f64]) -> Vec<f64> {
         let n = self.count();
         let mut matrix = vec![0.0; n * n];
@@ -133,15 +133,15 @@ impl Rubbing {
         }
         match small::inverse(&matrix, n) {
             Ok(inverse) => (0..n).map(|a| (0..n).map(|b| inverse[a * n + b] * vector[b]).sum()).collect(),
-            // Of a P-matrix it is none that is singular; of no numbers there are none.
+            // A P-matrix is never singular here. NaN in gives NaN out.
             Err(_) => vec![f64::NAN; n],
         }
     }
 
-    /// How frictions and end velocities move: `moves` are, of each body, what it is made of but for the others' forces.
-    pub fn slope(&self, v: &[f64], at: &[(f64, Pulse)], moves: &[Moves], out: &mut Vec<(f64, f64)>) {
+    /// Derivatives of frictions and end velocities from those of each body without the forces on the others.
+    pub fn slope(&self, v: &[f64], at: &[(f64, Pulse)], moves: &[PulseDerivatives], out: &mut Vec<(f64, f64)>) {
         let n = self.count();
-        let of = |a: usize, moves: &Moves| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, moves);
+        let of = |a: usize, moves: &PulseDerivatives| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, moves);
         out.clear();
         out.extend((0..n).map(|a| of(a, &moves[a])));
         if n == 1 {
@@ -150,12 +150,13 @@ impl Rubbing {
         let alone: Vec<f64> = out.iter().map(|x| x.0).collect();
         let forces = self.through(&self.rises(v, at), &alone);
         for (a, moved) in out.iter_mut().enumerate() {
-            *moved = of(a, &Moves { free: moves[a].free - self.others(a, |b| forces[b]), ..moves[a] });
+            *moved =
+                of(a, &PulseDerivatives { free: moves[a].free - self.coupling_velocity(a, |b| forces[b]), ..moves[a] });
         }
     }
 }
 
-/// Whether all principal minors are positive: the first pivot, what is left without it, and what is left beside it.
+/// Whether all principal minors are positive, by recursion over the first pivot and its Schur complement.
 #[must_use]
 pub fn is_p_matrix(matrix: &[f64], n: usize) -> bool {
     if n == 0 {
@@ -171,44 +172,46 @@ pub fn is_p_matrix(matrix: &[f64], n: usize) -> bool {
     is_p_matrix(&without, n - 1) && is_p_matrix(&beside, n - 1)
 }
 
-/// What a body that may stick did.
+/// Trajectory of a body with friction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trace {
-    /// Mean of the friction over each pulse, in the unit of its D^α y, not beyond the most that it holds but for rounding.
+    /// Mean friction over each pulse, in the unit of D^α y, at most the breakaway force up to rounding.
     pub force: Vec<f64>,
-    /// Velocity at the edges of the pulses, one more than there are pulses; exactly 0 at rest.
+    /// Velocity at the pulse edges, one more than there are pulses. Exactly 0 at rest.
     pub edges: Vec<f64>,
-    /// What happened in each pulse.
+    /// State of the body in each pulse.
     pub phases: Vec<Phase>,
-    /// Velocity at the end of each pulse if there were no friction of its own in it.
+    /// Velocity at the end of each pulse without the body's friction in it.
     free: Vec<f64>,
 }
 
 impl Trace {
-    /// Whether it never left its rest.
+    /// Whether the body never moves.
     #[must_use]
-    pub fn is_still(&self) -> bool {
+    pub fn is_always_at_rest(&self) -> bool {
         self.edges.iter().all(|v| *v == 0.0)
     }
 }
 
-/// A march over all pulses.
+/// Solution of the contact problem over all pulses.
 #[derive(Debug, Clone, PartialEq)]
-pub struct March {
-    /// Of each body that may stick.
+pub struct ContactSolution {
+    /// Trajectory of each body with friction.
     pub bodies: Vec<Trace>,
-    rubbing: Rubbing,
+    contact_law: ContactLaw,
 }
 
-/// Share of the largest velocity without friction that may be rounding: a force that equals friction moves nothing.
-const ROUNDING: f64 = 1e-12;
+/// Rounding error relative to the largest velocity without friction. A force that equals friction moves nothing.
+const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
 
-impl March {
-    /// Marches from velocities: `linear` is L of each body at the ends of the pulses, `responses` g, those of a body's
-    /// velocity to forces on each.
+impl ContactSolution {
+    /// Solve pulse by pulse from initial velocities.
+    ///
+    /// `linear` is L of each body at the ends of the pulses, `responses` are the responses g of the velocities (rows)
+    /// to forces.
     #[must_use]
-    pub fn new(linear: &[Vec<f64>], responses: &[Vec<Heads>], rubbing: Rubbing, start: &[f64]) -> Self {
-        let n = rubbing.count();
+    pub fn new(linear: &[Vec<f64>], responses: &[Vec<Heads>], contact_law: ContactLaw, start: &[f64]) -> Self {
+        let n = contact_law.count();
         let m = linear.first().map_or(0, Vec::len);
         let mut bodies: Vec<Trace> = (start.iter())
             .map(|&v| {
@@ -218,16 +221,19 @@ impl March {
                 Trace { force, edges, phases, free }
             })
             .collect();
-        let rounding: Vec<f64> =
-            linear.iter().map(|row| ROUNDING * row.iter().fold(0.0_f64, |a, v| a.max(v.abs()))).collect();
-        let mut pasts: Vec<Vec<Online>> = responses.iter().map(|row| row.iter().map(Online::new).collect()).collect();
+        let rounding: Vec<f64> = linear
+            .iter()
+            .map(|row| VELOCITY_ROUNDING_RATIO * row.iter().fold(0.0_f64, |a, v| a.max(v.abs())))
+            .collect();
+        let mut pasts: Vec<Vec<OnlineConvolution>> =
+            responses.iter().map(|row| row.iter().map(OnlineConvolution::new).collect()).collect();
         let (mut v, mut forces) = (start.to_vec(), vec![0.0; n]);
         let (mut p, mut at) = (vec![0.0; n], Vec::with_capacity(n));
         for k in 0..m {
             for ((p, row), linear) in p.iter_mut().zip(&pasts).zip(linear) {
-                *p = linear[k] - row.iter().map(Online::past).sum::<f64>();
+                *p = linear[k] - row.iter().map(OnlineConvolution::past).sum::<f64>();
             }
-            rubbing.pulse(&v, &p, &rounding, &forces, &mut at);
+            contact_law.pulse(&v, &p, &rounding, &forces, &mut at);
             for (a, &(free, Pulse { force, end, phase })) in at.iter().enumerate() {
                 pasts.iter_mut().for_each(|row| row[a].push(force));
                 let body = &mut bodies[a];
@@ -240,18 +246,19 @@ impl March {
         if let Some(row) = pasts.into_iter().next() {
             bodies.iter_mut().zip(row).for_each(|(body, past)| body.force = past.into_signal());
         }
-        Self { bodies, rubbing }
+        Self { bodies, contact_law }
     }
 
-    /// The laws of the bodies and what moves what within a pulse.
+    /// Friction laws and gains of the bodies.
     #[must_use]
-    pub fn rubbing(&self) -> &Rubbing {
-        &self.rubbing
+    pub fn contact_law(&self) -> &ContactLaw {
+        &self.contact_law
     }
 
-    /// How the frictions move with a parameter: `moved` is the derivative of L − g ∗ φ of each body at the ends of the
-    /// pulses while φ stands, `first` that of its own g₀, `laws` those of its fc, fs and vs, `start` that of its velocity
-    /// at the start. None where no friction moves.
+    /// Derivatives of the frictions with respect to a parameter. None if all are zero.
+    ///
+    /// `moved` is the derivative of L − g ∗ φ of each body at the ends of the pulses for constant φ, `first` that of
+    /// its own g₀, `laws` those of its fc, fs and vs, `start` that of its initial velocity.
     #[must_use]
     pub fn slope(
         &self,
@@ -263,7 +270,8 @@ impl March {
     ) -> Option<Vec<Vec<f64>>> {
         let n = self.bodies.len();
         let m = moved.first().map_or(0, Vec::len);
-        let mut pasts: Vec<Vec<Online>> = responses.iter().map(|row| row.iter().map(Online::new).collect()).collect();
+        let mut pasts: Vec<Vec<OnlineConvolution>> =
+            responses.iter().map(|row| row.iter().map(OnlineConvolution::new).collect()).collect();
         let mut dv = start.to_vec();
         let (mut v, mut at, mut moves) = (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
         let mut slopes = Vec::with_capacity(n);
@@ -276,11 +284,11 @@ impl March {
                 v.push(body.edges[k]);
                 let (force, end, phase) = (body.force[k], body.edges[k + 1], body.phases[k]);
                 at.push((body.free[k], Pulse { force, end, phase }));
-                let past: f64 = pasts[a].iter().map(Online::past).sum();
+                let past: f64 = pasts[a].iter().map(OnlineConvolution::past).sum();
                 let free = moved[k] + first[a] * force - past;
-                moves.push(Moves { start: dv[a], free, first: first[a], law: laws[a] });
+                moves.push(PulseDerivatives { start: dv[a], free, first: first[a], law: laws[a] });
             }
-            self.rubbing.slope(&v, &at, &moves, &mut slopes);
+            self.contact_law.slope(&v, &at, &moves, &mut slopes);
             for (a, &(force, end)) in slopes.iter().enumerate() {
                 dv[a] = end;
                 any |= force != 0.0;
@@ -288,6 +296,6 @@ impl March {
             }
         }
         let row = pasts.into_iter().next()?;
-        any.then(|| row.into_iter().map(Online::into_signal).collect())
+        any.then(|| row.into_iter().map(OnlineConvolution::into_signal).collect())
     }
 }

@@ -1,30 +1,28 @@
-//! A convolution whose signal becomes known one value at a time, each once the sum over its past is: O(N log² N).
+//! Convolution for friction: online convolution in O(N log² N), and signals integrated by any order.
 //!
-//! A block of the past meets the block of equal length that follows it as soon as it is complete, by one transform
-//! (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6); what is left within a short block is summed directly.
-//!
-//! Signals integrated by any order: pulse means on the level of an output, and its velocity at edges.
+//! A block of the past is multiplied with the equally long block that follows as soon as it is complete, by one
+//! transform (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6). Within a short block terms are summed directly.
 
 use crate::fractional::kernels::{digamma, kernel_and_slope};
 use crate::series::{Buffers, Kernel};
 
-/// Values that are summed directly: below it a transform costs more.
-const DIRECT: usize = 64;
+/// Length of a block that is summed directly. Transforms of shorter blocks cost more.
+const DIRECT_SUM_LENGTH: usize = 64;
 
-/// Spectra of the heads of a kernel, each twice as long as the last, shared by all signals that it meets.
+/// Spectra of the heads of a kernel, each twice as long as the previous one, shared by all signals.
 pub struct Heads {
     kernel: Vec<f64>,
     spectra: Vec<Kernel>,
 }
 
 impl Heads {
-    /// The kernel of a convolution of as many values.
+    /// Heads of a kernel for a convolution of as many values.
     #[must_use]
     pub fn new(kernel: &[f64]) -> Self {
         let mut spectra = Vec::new();
-        let mut length = DIRECT;
+        let mut length = DIRECT_SUM_LENGTH;
         while length < kernel.len() {
-            // Of two blocks only the later one is read, so that what wraps around does not matter.
+            // Only the later of two blocks is read, so wrapped-around terms do not matter.
             spectra.push(Kernel::with_length(&kernel[..(2 * length).min(kernel.len())], 2 * length));
             length *= 2;
         }
@@ -32,8 +30,8 @@ impl Heads {
     }
 }
 
-/// Sums over the past of one signal.
-pub struct Online<'a> {
+/// Online convolution of one signal with a kernel.
+pub struct OnlineConvolution<'a> {
     heads: &'a Heads,
     sums: Vec<f64>,
     signal: Vec<f64>,
@@ -41,8 +39,8 @@ pub struct Online<'a> {
     block: Vec<f64>,
 }
 
-impl<'a> Online<'a> {
-    /// Nothing is known yet.
+impl<'a> OnlineConvolution<'a> {
+    /// Convolution before its first value.
     #[must_use]
     pub fn new(heads: &'a Heads) -> Self {
         let m = heads.kernel.len();
@@ -50,24 +48,24 @@ impl<'a> Online<'a> {
         Self { heads, sums: vec![0.0; m], signal, buffers: Buffers::default(), block }
     }
 
-    /// Σ_{j<k} κ_{k−j} x_j for the value k that comes next.
+    /// Sum Σ_{j<k} κ_{k−j} x_j for the next value k.
     #[must_use]
     pub fn past(&self) -> f64 {
         let k = self.signal.len();
-        let first = k - k % DIRECT;
+        let first = k - k % DIRECT_SUM_LENGTH;
         let recent = self.signal[first..].iter().rev().zip(&self.heads.kernel[1..]).map(|(x, c)| x * c).sum::<f64>();
         self.sums.get(k).copied().unwrap_or(0.0) + recent
     }
 
-    /// The next value of the signal.
+    /// Append the next value of the signal.
     pub fn push(&mut self, value: f64) {
         self.signal.push(value);
         let known = self.signal.len();
-        if known % DIRECT != 0 || known >= self.sums.len() {
+        if known % DIRECT_SUM_LENGTH != 0 || known >= self.sums.len() {
             return;
         }
-        let level = (known / DIRECT).trailing_zeros() as usize;
-        let length = DIRECT << level;
+        let level = (known / DIRECT_SUM_LENGTH).trailing_zeros() as usize;
+        let length = DIRECT_SUM_LENGTH << level;
         let past = &self.signal[known - length..];
         let Some(spectrum) = self.heads.spectra.get(level).filter(|_| past.iter().any(|x| *x != 0.0)) else { return };
         self.block.resize(2 * length, 0.0);
@@ -75,21 +73,21 @@ impl<'a> Online<'a> {
         self.sums[known..].iter_mut().zip(&self.block[length..2 * length]).for_each(|(sum, v)| *sum += v);
     }
 
-    /// The signal.
+    /// Signal so far.
     #[must_use]
     pub fn into_signal(self) -> Vec<f64> {
         self.signal
     }
 }
 
-/// What pulses of a signal give at the ends of pulses, integrated by η > 0, and its derivative with respect to η.
+/// Response at the ends of pulses to the pulses of a signal integrated by η > 0, and its derivative in η.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
     let turn = libm::log(step) - digamma(eta + 1.0);
     (0..m)
         .map(|n| {
-            // (n + 1)^η − n^η without the cancellation.
+            // (n + 1)^η − n^η without cancellation.
             let (value, slope) = if n == 0 {
                 (1.0, 0.0)
             } else {
@@ -102,27 +100,28 @@ pub(super) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
         .unzip()
 }
 
-/// Below this integration a signal shows at an edge as the pulses on either side have it.
+/// Integration order below which a signal has direct feedthrough to the velocity at an edge, as the mean of the
+/// neighboring pulses.
 const SEEN_AT_ONCE: f64 = 1e-6;
 
-/// A signal integrated as its term asks, or the slope of that with respect to the order.
+/// Signal integrated by the order of its term, or the derivative of that in the order.
 #[derive(Debug, Clone)]
-pub(super) struct Integrated {
-    /// Pulse means on the level of the output.
+pub(super) struct IntegratedSignal {
+    /// Pulse means at the level of the output.
     pub(super) output: Vec<f64>,
-    /// The velocity at the ends of pulses.
+    /// Velocity at the ends of pulses.
     pub(super) edges: Vec<f64>,
 }
 
-/// Kernels of a signal that drives the body, integrated by η on the level of the output: values and slopes.
-pub(super) struct Driver {
+/// Kernels of an input integrated by η, at the level of the output: values and derivatives in η.
+pub(super) struct InputKernels {
     pub(super) output: [Vec<f64>; 2],
-    /// What a pulse does at the ends of pulses; of a signal that shows at once, to means.
+    /// Response to a pulse at the ends of pulses. With direct feedthrough: response in pulse means.
     pub(super) edges: [Vec<f64>; 2],
     at_once: bool,
 }
 
-impl Driver {
+impl InputKernels {
     pub(super) fn new(eta: f64, m: usize, step: f64) -> Self {
         let output = kernel_and_slope(eta, m, step);
         let at_once = eta - 1.0 <= SEEN_AT_ONCE;
@@ -130,23 +129,23 @@ impl Driver {
         Self { output: [output.0, output.1], edges: [edges.0, edges.1], at_once }
     }
 
-    /// The signal through the kernels (0) or their slopes (1).
-    pub(super) fn of(&self, signal: &Kernel, which: usize) -> Integrated {
+    /// Signal through the kernels (0) or their derivatives (1).
+    pub(super) fn of(&self, signal: &Kernel, which: usize) -> IntegratedSignal {
         let edges = product(signal, &self.edges[which]);
-        let edges = if self.at_once { between(&edges) } else { edges };
-        Integrated { output: product(signal, &self.output[which]), edges }
+        let edges = if self.at_once { average_neighbors(&edges) } else { edges };
+        IntegratedSignal { output: product(signal, &self.output[which]), edges }
     }
 }
 
-/// A product with what was cached.
+/// Product with a cached series.
 pub(super) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; series.len()];
     cached.apply(series, &mut out, &mut Buffers::default());
     out
 }
 
-/// Values at the ends of the pulses from means: those on either side, the last extended.
-fn between(means: &[f64]) -> Vec<f64> {
+/// Values at pulse ends from means: averages of neighboring pulses, the last value extrapolated.
+fn average_neighbors(means: &[f64]) -> Vec<f64> {
     let m = means.len();
     let mut out: Vec<f64> = means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
     let last = means.last().copied().unwrap_or(0.0);

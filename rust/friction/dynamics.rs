@@ -1,51 +1,49 @@
-//! Bodies between their inputs and their friction: operators on pulse means, velocities at the edges of pulses, free
-//! runs.
+//! Linear dynamics of bodies with friction: operators on pulse means, velocities at pulse edges, simulation.
 //!
-//! The outputs follow from the equations as every linear free run does, friction being one more input once it is known. The
-//! velocities obey the same equations, all that drives them differentiated once, and so do their values at the edges of
-//! the pulses: what drives them is there what its pulses add up to, exactly for what is constant within each, and they
-//! themselves are lines between edges, whose integrals have the kernels of pulse means
-//! ([`crate::fractional::kernels::block_pulse_kernel`]). So a body feels at once what carries it, friction of the pulse
-//! included.
+//! Outputs follow from the equations like any linear response, with friction as one more input. Velocities obey the
+//! same equations with all inputs differentiated once, and so do their values at the pulse edges. There an input is the
+//! sum of its pulses, which is exact for inputs that are constant within pulses. Velocities are linear between edges,
+//! so their integrals have the kernels of pulse means ([`crate::fractional::kernels::block_pulse_kernel`]). Friction of
+//! a pulse therefore acts within that pulse.
 
-use super::contact::{is_p_matrix, March, Rubbing, Trace};
-use super::convolution::{product, Driver, Heads, Integrated};
-use super::initial_state::{Forcing, Link};
-use super::law::Law;
+use super::contact::{is_p_matrix, ContactLaw, ContactSolution, Trace};
+use super::convolution::{product, Heads, InputKernels, IntegratedSignal};
+use super::initial_state::{InitialForcing, Link};
+use super::law::FrictionLaw;
 use crate::equation::{check_regular, Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::fractional::kernels::{kernel_and_slope, MAX_EXCESS};
 use crate::linalg::small;
-use crate::regressors::{add_impulses, parted, Record};
+use crate::regressors::{add_impulses, split_impulses, Record};
 use crate::series::{self, Kernel, Solver};
 
-/// Equations that follow each other's outputs, some of them with friction of their own output's velocity.
+/// System of coupled equations, some of them with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Body {
-    /// D^α y = Σ c D^ν s; of those with friction 1 < α ≤ 2. Orders of inputs are below α; other bodies may lean on
-    /// accelerations.
+    /// D^α y = Σ c D^ν s, with 1 < α ≤ 2 for equations with friction. Orders of inputs are below α. Terms of other
+    /// bodies may include accelerations.
     pub equations: Vec<Equation>,
-    /// Which of them have friction, and F of − F(Dy) sgn(Dy).
-    pub frictions: Vec<(usize, Law)>,
+    /// Equations with friction, and F of − F(Dy) sgn(Dy).
+    pub frictions: Vec<(usize, FrictionLaw)>,
 }
 
-/// A free run.
+/// Motion found by simulation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Motion {
     /// Pulse means of each equation's output.
     pub outputs: Vec<Vec<f64>>,
-    /// What each body that may stick did.
+    /// Trajectory of each body with friction.
     pub bodies: Vec<Trace>,
 }
 
 impl Body {
-    /// One equation by itself.
+    /// System of one equation.
     #[must_use]
-    pub fn alone(equation: Equation, friction: Law) -> Self {
+    pub fn single(equation: Equation, friction: FrictionLaw) -> Self {
         Self { equations: vec![equation], frictions: vec![(0, friction)] }
     }
 
-    /// Refuses orders that this law does not know, and coefficients that are no numbers.
+    /// Return an error for orders that this law does not support, and for coefficients that are not finite.
     ///
     /// # Errors
     /// [`Error::OutOfRange`], [`Error::Structure`], [`Error::Length`], [`Error::NotFinite`].
@@ -75,7 +73,7 @@ impl Body {
                 });
             }
         }
-        for &(place, Law { coulomb, stribeck, speed }) in &self.frictions {
+        for &(place, FrictionLaw { coulomb, stribeck, speed }) in &self.frictions {
             check_finite("friction", &[coulomb, stribeck, speed])?;
             let alpha = self.equations[place].structure.order;
             if !(alpha > 1.0 && alpha <= 2.0) {
@@ -94,7 +92,8 @@ impl Body {
             }
         }
         for (i, Equation { structure, .. }) in self.equations.iter().enumerate() {
-            // An input must not jump in a velocity; other bodies, which it moves, may lean on each other's accelerations.
+            // An input must not jump in a velocity. Other bodies, which friction moves, may depend on each other's
+            // accelerations.
             let above = |order: f64| order >= structure.order - ORDER_GRAIN;
             if let Some(term) = structure.terms.iter().find(|t| above(t.order) && self.place(t.signal).is_none()) {
                 let rubs = self.frictions.iter().any(|f| f.0 == i);
@@ -106,10 +105,12 @@ impl Body {
         self.check_yields()
     }
 
-    /// Refuses accelerations that bodies hand each other by which a force on one would move it against the force, so that
-    /// what friction does has no one answer. Orders above a body's own are left to the grid, which sees the same.
+    /// Return an error if coupled accelerations move a body against a force on it, so that friction has no unique
+    /// solution.
+    ///
+    /// Terms above a body's own order are checked on the grid instead.
     fn check_yields(&self) -> Result<()> {
-        let (n, sticks, links) = (self.equations.len(), self.sticks(), self.links());
+        let (n, sticks, links) = (self.equations.len(), self.friction_equations(), self.links());
         if links.iter().flatten().any(|link| link.integration < -ORDER_GRAIN) {
             return Ok(());
         }
@@ -134,33 +135,34 @@ impl Body {
         })
     }
 
-    /// Equations with friction.
-    pub(super) fn sticks(&self) -> Vec<usize> {
+    /// Indices of the equations with friction.
+    pub(super) fn friction_equations(&self) -> Vec<usize> {
         self.frictions.iter().map(|f| f.0).collect()
     }
 
-    /// Which equation a signal is the output of.
+    /// Index of the equation with this signal as output.
     pub(super) fn place(&self, signal: usize) -> Option<usize> {
         self.equations.iter().position(|e| e.structure.output == signal)
     }
 
-    /// Free run with given initial terms, (exponent, coefficient) pairs of powers of t by equation. O(n² m log² m).
+    /// Simulation with initial terms, (exponent, coefficient) pairs of powers of t by equation. O(n² m log² m).
     ///
-    /// The exponents −1, −2, … are an impulse and its derivatives in the output alone, which move no body: through a filter
-    /// that the output passes they become what it still held when the run began.
+    /// The exponents −1, −2, … are an impulse and its derivatives in the output alone, which do not move a body. After
+    /// the filter of an output they become its initial transient.
     ///
     /// # Errors
-    /// As [`Body::check`]; [`Error::Diverged`] where the run leaves the range of numbers, [`Error::LeadingZero`] where the
-    /// grid makes the equations unsolvable.
+    /// [`Error::Diverged`] if the simulation overflows, [`Error::LeadingZero`] if the equations are singular on this
+    /// grid, and as [`Body::check`].
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
-    /// use ftlm::friction::{Body, Law};
+    /// use ftlm::friction::Body;
+    /// use ftlm::friction::Law;
     /// use ftlm::regressors::Record;
     /// # fn main() -> ftlm::error::Result<()> {
-    /// // A block slides at 1 m/s on friction of 2 m/s²: it stops after half a second, 0.25 m on, and stays.
+    /// // A block slides at 1 m/s with friction of 2 m/s²: it stops after half a second and 0.25 m.
     /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
-    /// let block = Body::alone(Equation::new(structure, vec![1.0])?, Law::coulomb(2.0));
+    /// let block = Body::single(Equation::new(structure, vec![1.0])?, FrictionLaw::coulomb(2.0));
     /// let run = Record::new(0.01, vec![vec![0.0; 100], vec![0.0; 100]], None)?;
     /// let motion = block.run(&run, &[vec![(1.0, 1.0)]])?;
     /// let velocity = &motion.bodies[0].edges;
@@ -172,19 +174,19 @@ impl Body {
     pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Motion> {
         self.check(record.len())?;
         check_length("initial terms", self.equations.len(), initial.len())?;
-        let (powers, impulses) = parted(initial);
+        let (powers, impulses) = split_impulses(initial);
         for terms in &powers {
             let (exponents, values): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
             check_finite("coefficients of the initial terms", &values)?;
             Initial::Powers(exponents).check()?;
         }
-        let forcing = Forcing::of(&powers, &self.links(), record.m(), record.step())?;
+        let forcing = InitialForcing::of(&powers, &self.links(), record.m(), record.step())?;
         let mut run = Run::new(self, &Operators::new(self, record)?, &forcing)?;
         add_impulses(&mut run.outputs, &impulses, record.step());
         Ok(Motion { outputs: run.outputs, bodies: run.march.bodies })
     }
 
-    /// Of each equation the terms of outputs that are followed.
+    /// Terms of each equation with a simulated output as signal.
     pub(super) fn links(&self) -> Vec<Vec<Link>> {
         let of = |Equation { structure, coefficients }: &Equation| {
             (structure.terms.iter().zip(coefficients))
@@ -198,13 +200,13 @@ impl Body {
     }
 }
 
-/// Everything linear about bodies on a record.
+/// Linear operators of bodies on a record.
 pub(super) struct Operators {
-    /// Kernels and spectrum of each term's signal, where it is no output that is followed, by equation.
-    pub(super) drivers: Vec<Vec<Option<(Driver, Kernel)>>>,
-    /// Each driver's signal, integrated.
-    pub(super) driven: Vec<Vec<Option<Integrated>>>,
-    /// Kernel of each term of a followed output, on means and at edges, and its slope.
+    /// Kernels and spectrum of each term's input signal, by equation. None for a simulated output.
+    pub(super) drivers: Vec<Vec<Option<(InputKernels, Kernel)>>>,
+    /// Signal of each input term, integrated.
+    pub(super) integrated_inputs: Vec<Vec<Option<IntegratedSignal>>>,
+    /// Kernel of each term of a simulated output, on means and at edges, and its derivative in the order.
     pub(super) own: Vec<Vec<Option<[Vec<f64>; 2]>>>,
     /// A of A y = b.
     matrix: Vec<Vec<Vec<f64>>>,
@@ -213,17 +215,17 @@ pub(super) struct Operators {
     /// Inverse of A's leading coefficients.
     leading: Vec<f64>,
     /// Kernels of friction, of each body that may stick.
-    pub(super) frictions: Vec<Driver>,
-    /// What a pulse of force on each body (columns) does to the velocity of each (rows) at the ends of pulses.
+    pub(super) frictions: Vec<InputKernels>,
+    /// Responses of the velocities (rows) at pulse ends to a pulse of force on each body (columns).
     pub(super) responses: Vec<Vec<Heads>>,
-    /// Their first numbers, row by row.
+    /// First values of these responses, row by row.
     gains: Vec<f64>,
     sticks: Vec<usize>,
 }
 
 impl Operators {
     pub(super) fn new(body: &Body, record: &Record) -> Result<Self> {
-        let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.sticks());
+        let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.friction_equations());
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let (mut drivers, mut driven, mut own) = (Vec::new(), Vec::new(), Vec::new());
         for (i, Equation { structure, coefficients }) in body.equations.iter().enumerate() {
@@ -232,7 +234,7 @@ impl Operators {
             for (term, &c) in structure.terms.iter().zip(coefficients) {
                 let eta = structure.order - term.order;
                 if eta <= -MAX_EXCESS {
-                    // Reported like a step too far, so that a search shortens it.
+                    // Same error as for a step that is too long, so that an optimizer shortens it.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
                 if let Some(j) = body.place(term.signal) {
@@ -242,7 +244,7 @@ impl Operators {
                     row_drivers.push(None);
                     row_driven.push(None);
                 } else {
-                    let driver = Driver::new(eta, m, step);
+                    let driver = InputKernels::new(eta, m, step);
                     let signal = Kernel::new(record.signal(term.signal));
                     row_driven.push(Some(driver.of(&signal, 0)));
                     row_drivers.push(Some((driver, signal)));
@@ -256,8 +258,8 @@ impl Operators {
         let leading: Vec<f64> = matrix.iter().flatten().map(|a| a.first().copied().unwrap_or(0.0)).collect();
         let leading = small::inverse(&leading, n)?;
         let inverse = Solver::new(&matrix)?.inverse_spectra(2 * m)?;
-        let frictions: Vec<Driver> =
-            sticks.iter().map(|&b| Driver::new(body.equations[b].structure.order, m, step)).collect();
+        let frictions: Vec<InputKernels> =
+            sticks.iter().map(|&b| InputKernels::new(body.equations[b].structure.order, m, step)).collect();
         let count = sticks.len();
         let mut gains = vec![0.0; count * count];
         let mut responses: Vec<Vec<Heads>> = (0..count).map(|_| Vec::with_capacity(count)).collect();
@@ -268,7 +270,18 @@ impl Operators {
                 row.push(Heads::new(&response));
             }
         }
-        Ok(Self { drivers, driven, own, matrix, inverse, leading, frictions, responses, gains, sticks })
+        Ok(Self {
+            drivers,
+            integrated_inputs: driven,
+            own,
+            matrix,
+            inverse,
+            leading,
+            frictions,
+            responses,
+            gains,
+            sticks,
+        })
     }
 
     /// A⁻¹ of right-hand sides, empty ones being zero.
@@ -280,8 +293,8 @@ impl Operators {
         self.inverse.iter().map(of).collect()
     }
 
-    /// Velocities at the ends of pulses of the bodies that may stick, without their friction.
-    pub(super) fn at_edges(&self, total: &Forcing) -> Vec<Vec<f64>> {
+    /// Velocities of the bodies with friction at pulse ends, without their friction.
+    pub(super) fn at_edges(&self, total: &InitialForcing) -> Vec<Vec<f64>> {
         let of = |&b: &usize| {
             let mut out = vec![total.start[b]; total.edges[b].len()];
             for (kernel, edges) in self.inverse[b].iter().zip(&total.edges) {
@@ -292,8 +305,10 @@ impl Operators {
         self.sticks.iter().map(of).collect()
     }
 
-    /// Derivative of the first number of a body's response to its own friction from those of its α (`turn`) and of each
-    /// own term of each equation: (coefficient's, integration's).
+    /// Derivative of the first value of a body's response to its own friction.
+    ///
+    /// `turn` is the derivative of its α, `moves` those of (coefficient, integration order) of each term of each
+    /// equation.
     pub(super) fn first_slope(&self, body: &Body, which: usize, turn: f64, moves: &[Vec<(f64, f64)>]) -> f64 {
         let (n, b) = (self.matrix.len(), self.sticks[which]);
         let [first, first_slope] = [0, 1].map(|k| self.frictions[which].edges[k].first().copied().unwrap_or(0.0));
@@ -309,22 +324,22 @@ impl Operators {
     }
 }
 
-/// A free run with all that its derivatives are made of.
+/// Simulation with the intermediate results that its derivatives need.
 pub(super) struct Run {
     pub(super) outputs: Vec<Vec<f64>>,
-    /// Those of the bodies that may stick as the equations have them, without what [`at_rest`] takes away.
+    /// Outputs of the bodies with friction as solved, before [`remove_creep`].
     pub(super) solved: Vec<Vec<f64>>,
-    /// Velocities at the ends of pulses, less those at the start.
+    /// Velocities at pulse ends minus initial velocities.
     pub(super) moved: Vec<Vec<f64>>,
-    pub(super) march: March,
+    pub(super) march: ContactSolution,
     /// Spectra of the frictions.
     pub(super) forces: Vec<Kernel>,
 }
 
 impl Run {
-    pub(super) fn new(body: &Body, operators: &Operators, forcing: &Forcing) -> Result<Self> {
+    pub(super) fn new(body: &Body, operators: &Operators, forcing: &InitialForcing) -> Result<Self> {
         let mut total = forcing.clone();
-        for (i, (row, equation)) in operators.driven.iter().zip(&body.equations).enumerate() {
+        for (i, (row, equation)) in operators.integrated_inputs.iter().zip(&body.equations).enumerate() {
             for (driven, &c) in row.iter().zip(&equation.coefficients) {
                 if let Some(driven) = driven {
                     total.add_to(i, c, driven);
@@ -337,18 +352,20 @@ impl Run {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
         let laws = body.frictions.iter().map(|f| f.1).collect();
-        let rubbing = Rubbing::new(laws, operators.gains.clone())?;
+        let rubbing = ContactLaw::new(laws, operators.gains.clone())?;
         let start: Vec<f64> = operators.sticks.iter().map(|&b| total.start[b]).collect();
-        let march = March::new(&linear, &operators.responses, rubbing, &start);
+        let march = ContactSolution::new(&linear, &operators.responses, rubbing, &start);
         if let Some(index) = march.bodies.iter().find_map(|x| x.edges.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
-        // What friction holds back though nothing else would is a difference of two large numbers, which its own size
-        // does not show: nothing is left of it but their rounding.
+        // If the velocity without friction is huge, the difference of motion and friction is lost to rounding, although
+        // the result itself has a normal size.
         let largest = |values: &[f64]| values.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
         let drives = total.edges.iter().chain([&total.start]).map(|row| largest(row)).fold(0.0, f64::max);
         for (a, row) in linear.iter().enumerate() {
-            if largest(row) > LOST * (drives + march.rubbing().breakaway(a) * march.rubbing().own(a)) {
+            if largest(row)
+                > MAX_CANCELLATION_RATIO * (drives + march.contact_law().breakaway(a) * march.contact_law().own(a))
+            {
                 return Err(Error::Diverged { what: "free run without its friction".into(), index: row.len() });
             }
         }
@@ -359,7 +376,7 @@ impl Run {
             total.edges[b].iter_mut().zip(&held.edges).for_each(|(b, v)| *b -= v);
         }
         let alone = body.equations.len() == 1;
-        let mut outputs = if alone && march.bodies.iter().all(Trace::is_still) {
+        let mut outputs = if alone && march.bodies.iter().all(Trace::is_always_at_rest) {
             total.levels.iter().map(|&level| vec![level; m]).collect()
         } else {
             let rhs: Vec<&[f64]> = total.output.iter().map(Vec::as_slice).collect();
@@ -367,11 +384,11 @@ impl Run {
         };
         let solved = operators.sticks.iter().map(|&b| outputs[b].clone()).collect();
         for (&b, moved) in operators.sticks.iter().zip(&march.bodies) {
-            if moved.is_still() {
-                // What never leaves its rest is where it was, not where rounding puts it.
+            if moved.is_always_at_rest() {
+                // A body that never moves stays exactly at its initial position, without rounding errors.
                 outputs[b] = vec![total.levels[b]; m];
             } else if !alone {
-                at_rest(&mut outputs[b], moved);
+                remove_creep(&mut outputs[b], moved);
             }
         }
         if let Some(index) = outputs.iter().find_map(|y| y.iter().position(|v| !v.is_finite())) {
@@ -382,11 +399,11 @@ impl Run {
     }
 }
 
-/// Takes from an output, or its slope, what it creeps while the body rests.
+/// Remove the creep of a resting body from its output or from a derivative of it.
 ///
-/// Its velocity is 0 at the edges of each pulse, but a force that another body exerts changes within it while friction's
-/// mean stands, which moves the mean position by a share of the square of the step.
-pub(super) fn at_rest(output: &mut [f64], body: &Trace) {
+/// Its velocity is 0 at the edges of each pulse. Within a pulse the force of another body changes while the mean of
+/// friction is constant, which moves the mean position in proportion to the square of the step.
+pub(super) fn remove_creep(output: &mut [f64], body: &Trace) {
     let (mut crept, mut before) = (0.0, output.first().copied().unwrap_or(0.0));
     for (value, edges) in output.iter_mut().skip(1).zip(body.edges.windows(3)) {
         let now = *value;
@@ -398,5 +415,5 @@ pub(super) fn at_rest(output: &mut [f64], body: &Trace) {
     }
 }
 
-/// How much larger than what drives a body its velocity without friction may become: of sixteen digits eight are left.
-const LOST: f64 = 1e8;
+/// Largest ratio of the velocity without friction to the inputs. Beyond, fewer than eight of sixteen digits remain.
+const MAX_CANCELLATION_RATIO: f64 = 1e8;

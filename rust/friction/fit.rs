@@ -1,48 +1,48 @@
-//! Output error of bodies with friction, by Levenberg–Marquardt: orders, coefficients, and the states of every run.
+//! Output-error fit of bodies with friction by Levenberg–Marquardt: orders, coefficients and initial states.
 
 use super::model::{Evaluation, FrictionModel, Point};
 use crate::error::{check_finite, check_length, Result};
 use crate::estimation::optimization::damped_step::Problem;
-use crate::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
+use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
 use crate::estimation::output_error::Experiment;
 use crate::linalg::orthogonal::extend_orthonormal;
 use crate::parallel::Stop;
 
-/// Where a fit starts.
+/// Initial guess of a fit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Start {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free numbers of inputs.
+    /// Free parameters of inputs.
     pub inputs: Vec<f64>,
-    /// States of each run; empty: those that suit the start best.
+    /// Initial states of each run. If empty, they are estimated at the initial guess.
     pub states: Vec<Vec<f64>>,
 }
 
-/// The optimum and what describes it.
+/// Optimum of a fit and its diagnostics.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free numbers of inputs.
+    /// Free parameters of inputs.
     pub inputs: Vec<f64>,
-    /// States of each run.
+    /// Initial states of each run.
     pub states: Vec<Vec<f64>>,
-    /// The initial terms that they are, (exponent, coefficient), run by run and equation by equation.
+    /// Initial terms of the states, (exponent, coefficient), by run and equation.
     pub initial: Vec<Vec<Vec<(f64, f64)>>>,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Weighted residuals, run after run.
+    /// Residuals with weights, run after run.
     pub residuals: Vec<f64>,
-    /// Their derivatives with respect to orders, coefficients and inputs, what states can follow taken out.
+    /// Derivatives with respect to orders, coefficients and inputs, after projecting out the states.
     pub jacobian: Vec<Vec<f64>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Termination status.
     pub status: Status,
 }
 
@@ -70,7 +70,7 @@ impl Problem for OutputError<'_> {
         self.model.jacobian(self.experiments, point, evaluation, true)
     }
 
-    fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+    fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
         let mut next = point.clone();
         let mut moved: f64 = 0.0;
         let (orders, rest) = steps.split_at(point.orders.len());
@@ -84,8 +84,8 @@ impl Problem for OutputError<'_> {
         let share = |before: f64, after: f64| (after - before).abs() / before.abs().max(f64::MIN_POSITIVE);
         for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
             let before = *value;
-            *value = self.model.coordinates[j].shifted(before, *step);
-            if self.model.rubs(j) {
+            *value = self.model.coordinates[j].shift(before, *step);
+            if self.model.is_friction_force(j) {
                 *value = value.max(0.0);
             }
             moved = moved.max(share(before, *value));
@@ -106,15 +106,15 @@ impl Problem for OutputError<'_> {
         (next, moved)
     }
 
-    fn stretch(&self, point: &Point, parameter: usize) -> f64 {
+    fn coordinate_derivative(&self, point: &Point, parameter: usize) -> f64 {
         parameter
             .checked_sub(point.orders.len())
             .filter(|j| *j < point.coefficients.len())
-            .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
+            .map_or(1.0, |j| self.model.coordinates[j].derivative(point.coefficients[j]))
     }
 
-    /// Orders and inputs' numbers have bounds, and friction is not negative.
-    fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
+    /// Orders and input parameters have bounds, friction is not negative.
+    fn distance_to_bounds(&self, point: &Point, parameter: usize) -> (f64, f64) {
         if let Some(order) = point.orders.get(parameter) {
             let (low, high) = self.model.order_bounds[parameter];
             return (order - low, high - order);
@@ -124,25 +124,25 @@ impl Problem for OutputError<'_> {
         if let Some((value, free)) = input.and_then(|i| point.inputs.get(i).zip(self.model.inputs.get(i))) {
             return (value - free.bounds.0, free.bounds.1 - value);
         }
-        let plain = self.model.coordinates.get(j).is_some_and(|c| c.stretch(2.0) == 1.0);
-        if plain && self.model.rubs(j) {
+        let plain = self.model.coordinates.get(j).is_some_and(|c| c.derivative(2.0) == 1.0);
+        if plain && self.model.is_friction_force(j) {
             return (point.coefficients[j], f64::INFINITY);
         }
         (f64::INFINITY, f64::INFINITY)
     }
 
-    /// Instants at which the body stops or turns pass from pulse to pulse, whatever moves them.
-    fn kinked(&self, _point: &Point, _parameter: usize) -> bool {
+    /// Times at which a body stops or reverses move from pulse to pulse with any parameter.
+    fn has_kinks(&self, _point: &Point, _parameter: usize) -> bool {
         true
     }
 
-    fn size(&self, evaluation: &Evaluation) -> f64 {
+    fn signal_norm(&self, evaluation: &Evaluation) -> f64 {
         evaluation.size
     }
 }
 
-/// The same of one run with everything but its states known.
-struct Begun<'a> {
+/// Estimation of the initial state of one run with all other parameters fixed.
+struct InitialStateProblem<'a> {
     model: &'a FrictionModel,
     experiment: &'a Experiment,
     orders: &'a [f64],
@@ -151,7 +151,7 @@ struct Begun<'a> {
     stop: &'a Stop,
 }
 
-impl Begun<'_> {
+impl InitialStateProblem<'_> {
     fn at(&self, states: &[f64]) -> Point {
         Point {
             orders: self.orders.to_vec(),
@@ -162,7 +162,7 @@ impl Begun<'_> {
     }
 }
 
-impl Problem for Begun<'_> {
+impl Problem for InitialStateProblem<'_> {
     type Point = Vec<f64>;
     type Evaluation = Evaluation;
 
@@ -179,28 +179,28 @@ impl Problem for Begun<'_> {
         self.model.jacobian(std::slice::from_ref(self.experiment), &self.at(states), evaluation, false)
     }
 
-    fn moved(&self, states: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
+    fn apply_step(&self, states: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
         let next: Vec<f64> = states.iter().zip(steps).map(|(x, step)| x + step).collect();
         let share = |(x, step): (&f64, &f64)| step.abs() / x.abs().max(f64::MIN_POSITIVE);
         (next, states.iter().zip(steps).map(share).fold(0.0, f64::max))
     }
 
-    fn kinked(&self, _states: &Vec<f64>, _parameter: usize) -> bool {
+    fn has_kinks(&self, _states: &Vec<f64>, _parameter: usize) -> bool {
         true
     }
 
-    fn size(&self, evaluation: &Evaluation) -> f64 {
+    fn signal_norm(&self, evaluation: &Evaluation) -> f64 {
         evaluation.size
     }
 }
 
-/// Constants at which the states of a run are begun, as shares of each friction while others are 0: where a body rests
-/// hangs on the sign of what is left of the two, which a descent does not cross.
-const BEGUN: [f64; 3] = [0.0, 0.5, -0.5];
-const BEGUN_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
+/// Constant forces tried as initial guesses, relative to each friction. The rest position depends on the sign of the
+/// net force, which a local optimization does not change.
+const INITIAL_FORCE_RATIOS: [f64; 3] = [0.0, 0.5, -0.5];
+const INITIAL_STATE_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
 
-/// States of a run at given numbers: the best that descents from its first samples reach.
-fn begun(
+/// Initial state of a run at fixed parameters: best result of local optimizations from its first samples.
+fn estimate_initial_state(
     model: &FrictionModel,
     orders: &[f64],
     coefficients: &[f64],
@@ -208,11 +208,13 @@ fn begun(
     experiment: &Experiment,
     stop: &Stop,
 ) -> Vec<f64> {
-    let problem = Begun { model, experiment, orders, coefficients, inputs, stop };
+    let problem = InitialStateProblem { model, experiment, orders, coefficients, inputs, stop };
     let held: Vec<f64> = model.frictions.iter().map(|(_, law)| law.at(coefficients).breakaway()).collect();
     let plain = model.first_states(orders, experiment, &vec![0.0; held.len()]);
     let mut best = (f64::INFINITY, plain.clone());
-    for (share, which) in BEGUN.iter().flat_map(|share| (0..held.len()).map(move |which| (*share, which))) {
+    for (share, which) in
+        INITIAL_FORCE_RATIOS.iter().flat_map(|share| (0..held.len()).map(move |which| (*share, which)))
+    {
         if share == 0.0 && which > 0 {
             continue;
         }
@@ -222,8 +224,8 @@ fn begun(
         if share != 0.0 && start == plain {
             continue;
         }
-        // One whose run leaves the range of numbers is none.
-        if let Ok(found) = minimise(&problem, start, BEGUN_SETTINGS) {
+        // A start with a simulation that overflows is skipped.
+        if let Ok(found) = minimize(&problem, start, INITIAL_STATE_SETTINGS) {
             if found.cost < best.0 {
                 best = (found.cost, found.point);
             }
@@ -232,16 +234,16 @@ fn begun(
     best.1
 }
 
-/// Weighted least squares on the output error from a start.
+/// Least-squares fit with weights of the output error from an initial guess.
 ///
 /// # Errors
-/// A start whose free run is not finite ([`crate::error::Error::Diverged`]); a model that names what is not there,
+/// An initial guess whose simulation overflows ([`crate::error::Error::Diverged`]), an inconsistent model or
 /// experiments that do not fit it ([`FrictionModel::check`]).
 pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, settings: Settings) -> Result<Fit> {
     fit_until(model, experiments, start, settings, &Stop::default())
 }
 
-/// [`fit`], until it is told to stop.
+/// Interruptible [`fit`].
 ///
 /// # Errors
 /// As [`fit`]; [`crate::error::Error::Interrupted`].
@@ -263,7 +265,7 @@ pub fn fit_until(
         start.orders.iter().zip(&model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
     model.check_orders(&orders)?;
     let mut coefficients = start.coefficients.clone();
-    for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.rubs(*j)) {
+    for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.is_friction_force(*j)) {
         *value = value.max(0.0);
     }
     let inputs: Vec<f64> =
@@ -271,17 +273,20 @@ pub fn fit_until(
     let count = model.states(&orders).0.len();
     let mut states = start.states.clone();
     if states.len() != experiments.len() || states.iter().any(|s| s.len() != count) {
-        states = experiments.iter().map(|e| begun(model, &orders, &coefficients, &inputs, e, stop)).collect();
+        states = experiments
+            .iter()
+            .map(|e| estimate_initial_state(model, &orders, &coefficients, &inputs, e, stop))
+            .collect();
     }
     for values in &states {
         check_finite("states of the start", values)?;
     }
     let problem = OutputError { model, experiments, stop };
-    let found = minimise(&problem, Point { orders, coefficients, inputs, states }, settings)?;
+    let found = minimize(&problem, Point { orders, coefficients, inputs, states }, settings)?;
     let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
     let mut basis = Vec::new();
     for column in found.jacobian.iter().skip(numbers) {
-        extend_orthonormal(&mut basis, column.clone(), SPANNED);
+        extend_orthonormal(&mut basis, column.clone(), DEPENDENCE_TOLERANCE);
     }
     let mut jacobian = found.jacobian;
     jacobian.truncate(numbers);
@@ -306,5 +311,5 @@ pub fn fit_until(
     })
 }
 
-/// A state whose response lies in the span of the others up to this share adds nothing.
-const SPANNED: f64 = 1e-12;
+/// Relative distance from the span of other responses below which a state is linearly dependent.
+const DEPENDENCE_TOLERANCE: f64 = 1e-12;

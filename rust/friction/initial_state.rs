@@ -1,49 +1,49 @@
-//! What a run starts with, and the constants on its right-hand sides, as powers of t that drive outputs and velocities.
+//! Initial states and constant forces of a run, as powers of t that enter outputs and velocities.
 
-use super::convolution::Integrated;
+use super::convolution::IntegratedSignal;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, power_means};
 use crate::linalg::small;
 use crate::regressors::is_impulse;
 
-/// A term of an output that is followed.
+/// Term of an equation with a simulated output as signal.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Link {
     /// Equation of the output.
     pub(super) output: usize,
     pub(super) order: f64,
-    /// α of the equation in which it stands less that order.
+    /// Integration order: α of the equation minus the order of the term.
     pub(super) integration: f64,
     pub(super) coefficient: f64,
 }
 
-/// What drives bodies besides their inputs: on the level of their outputs and of their velocities, by equation.
+/// Initial states and constant forces as inputs at the levels of outputs and velocities, by equation.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Forcing {
-    /// Pulse means on the level of the output.
+pub(super) struct InitialForcing {
+    /// Pulse means at the level of the output.
     pub(super) output: Vec<Vec<f64>>,
-    /// At the ends of the pulses what drives a velocity on from where it starts.
+    /// Contribution to the velocity at pulse ends, relative to the initial velocity.
     pub(super) edges: Vec<Vec<f64>>,
-    /// The velocities at the start.
+    /// Initial velocities.
     pub(super) start: Vec<f64>,
-    /// The outputs at the start.
+    /// Initial outputs.
     pub(super) levels: Vec<f64>,
     m: usize,
 }
 
-impl Forcing {
-    pub(super) fn none(m: usize, n: usize) -> Self {
+impl InitialForcing {
+    pub(super) fn zeros(m: usize, n: usize) -> Self {
         let rows = vec![vec![0.0; m]; n];
         Self { output: rows.clone(), edges: rows, start: vec![0.0; n], levels: vec![0.0; n], m }
     }
 
-    /// The same size, nothing in it.
-    pub(super) fn nothing(&self) -> Self {
-        Self::none(self.m, self.levels.len())
+    /// Zero forcing of the same size.
+    pub(super) fn zeros_like(&self) -> Self {
+        Self::zeros(self.m, self.levels.len())
     }
 
-    /// Adds another one, weighted.
+    /// Add a weighted forcing.
     pub(super) fn add(&mut self, weight: f64, other: &Self) {
         let rows = self.output.iter_mut().chain(&mut self.edges).zip(other.output.iter().chain(&other.edges));
         for (sum, part) in rows {
@@ -53,27 +53,27 @@ impl Forcing {
         self.levels.iter_mut().zip(&other.levels).for_each(|(s, v)| *s += weight * v);
     }
 
-    /// Adds an integrated signal to one equation, weighted.
-    pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &Integrated) {
+    /// Add a weighted integrated signal to one equation.
+    pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &IntegratedSignal) {
         let add = |sum: &mut Vec<f64>, part: &[f64]| sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
         add(&mut self.output[equation], &part.output);
         add(&mut self.edges[equation], &part.edges);
     }
 
-    /// Powers of t on the level of the outputs, as (exponent, coefficient) by equation, beside terms of followed outputs.
+    /// Forcing of powers of t at the level of the outputs, (exponent, coefficient) by equation, with coupling terms.
     ///
-    /// A level x₀ at the start is integrated by these terms, and so is the jump to it: to the velocity it is
-    /// c x₀ t^{η−1}/Γ(η). A velocity v₀ at the start is c v₀ t^η/Γ(η + 1) to the velocities that follow it.
+    /// Coupling terms integrate an initial level x₀, and also the jump to it: in the velocity it is c x₀ t^{η−1}/Γ(η).
+    /// An initial velocity v₀ is c v₀ t^η/Γ(η + 1) in the velocities coupled to it.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] where the
-    /// levels or velocities at the start follow from no equation.
+    /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] if the
+    /// initial levels or velocities are not determined by the equations.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn of(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
         let n = powers.len();
-        let mut out = Self::none(m, n);
+        let mut out = Self::zeros(m, n);
         let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
-        out.levels = at_once(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
+        out.levels = solve_feedthrough(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
         let mut all = vec![Sum::default(); n];
         for (i, own) in powers.iter().enumerate() {
             for &(exponent, value) in own {
@@ -102,7 +102,7 @@ impl Forcing {
         }
         let given: Vec<f64> =
             all.iter().map(|own| own.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
-        out.start = at_once(&given, links)?;
+        out.start = solve_feedthrough(&given, links)?;
         for (i, own) in all.iter_mut().enumerate() {
             own.add(0.0, -out.start[i]);
             for link in &links[i] {
@@ -118,7 +118,7 @@ impl Forcing {
     }
 }
 
-/// Powers of t, equal exponents together.
+/// Sum of powers of t with distinct exponents.
 #[derive(Debug, Clone, Default)]
 struct Sum(Vec<(f64, f64, f64)>);
 
@@ -130,13 +130,13 @@ impl Sum {
         }
     }
 
-    /// (exponent, coefficient): what one adds and another takes away again is nothing, but for rounding.
+    /// (exponent, coefficient) of the powers that do not cancel up to rounding.
     fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
         self.0.iter().filter(|r| r.1.abs() > 1e-13 * r.2).map(|r| (r.0, r.1))
     }
 }
 
-/// Pulse means of t^e; of a negative power as the kernels of derivatives make it of a jump, which it takes away again.
+/// Pulse means of t^e. Negative powers are those of the derivative kernels applied to a step.
 fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent >= 0.0 {
         return power_means(exponent, m, step);
@@ -149,8 +149,8 @@ fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     kernel(exponent, m, step).into_iter().map(summed).collect()
 }
 
-/// What outputs or velocities start at: what is given of each, and what of the others feeds through at once.
-fn at_once(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+/// Initial outputs or velocities from the given values, with direct feedthrough between equations.
+fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
     let n = given.len();
     if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
         return Ok(given.to_vec());
@@ -166,29 +166,31 @@ fn at_once(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
     Ok((0..n).map(|i| (0..n).map(|j| inverse[i * n + j] * given[j]).sum()).collect())
 }
 
-/// What is free of a run's start: each a combination of powers of t, of the equation named first.
+/// Free initial state of a run: a combination of powers of t in the named equation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum State {
-    /// The level at which the output stood before, and moved on from.
+    /// Initial level of the output.
     Level(usize),
-    /// Its velocity.
+    /// Initial velocity of the output.
     Rate(usize),
-    /// The power of t by which a term starts whose signal did not start at 0.
+    /// Power of t of a term whose signal does not start at 0.
     Jump {
         /// Equation and term.
         at: (usize, usize),
-        /// One more for each derivative of the signal.
+        /// Number of derivatives of the signal.
         more: u32,
     },
-    /// A constant on the right-hand side, or a ramp (1).
+    /// Constant on the right-hand side (0) or ramp (1).
     Offset(usize, u32),
-    /// A power of t that was asked for; −1, −2, …: an impulse that the filter of an output gets, and its derivatives.
+    /// Power of t that was requested. −1, −2, …: impulse of an output's filter and its derivatives.
     Power(usize, f64),
 }
 
 impl State {
-    /// Those of a run; `free` says of which term of an equation the integration moves with an order. Each output that
-    /// passes a filter before it is compared (`filtered`, empty: none does) has the free motions of the filter besides.
+    /// States of a run.
+    ///
+    /// `free` says whether the integration order of an equation's term depends on a free order. Each filtered output
+    /// (`filtered`, empty if none) also has the transients of the filter.
     pub(super) fn all(
         equations: &[Equation],
         initial: &Initial,
@@ -228,14 +230,14 @@ impl State {
         all
     }
 
-    /// Whether it moves no body, only the filter of an output.
+    /// Whether the state acts on the filter of an output only and not on a body.
     pub(super) fn is_impulse(&self) -> bool {
         matches!(self, Self::Power(_, e) if is_impulse(*e))
     }
 
-    /// The powers of t that a unit of it is, on the level of the outputs: equation, exponent, coefficient.
+    /// Powers of t of a unit of this state at the level of the outputs: equation, exponent, coefficient.
     pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
-        // Caputo's derivative of a level is 0, so a term does not see it unless its order is 0.
+        // Caputo derivatives of a constant are 0, so only terms of order 0 respond to a level.
         let unseen = |output: usize, whole: f64| {
             let mut all = vec![(output, whole, 1.0)];
             for (i, row) in links.iter().enumerate() {
@@ -259,8 +261,8 @@ impl State {
     }
 }
 
-/// Powers of t of several states together by equation, equal exponents merged.
-pub(super) fn together(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+/// Merge the powers of t of several states by equation and exponent.
+pub(super) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
     let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
     for (i, exponent, value) in parts {
         match out[i].iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {

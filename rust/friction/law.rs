@@ -1,62 +1,61 @@
-//! What friction does to a body in one pulse: F(v) sgn v, F(v) = fc + fs exp(−(v/vs)²), set-valued at rest.
+//! Coulomb–Stribeck friction in one pulse: F(v) sgn v with F(v) = fc + fs exp(−(v/vs)²), set-valued at rest.
 //!
-//! Within a pulse the velocity is taken as linear between rests, and the friction of the pulse is its mean over it, in
-//! closed form: the mean of the Gaussian is a difference of error functions. A velocity that reaches zero stays there if
-//! friction can hold the body, and else turns at that instant, so that the mean follows continuously from both ends.
+//! Within a pulse the velocity is linear between rests. The friction of the pulse is its mean in closed form: the mean
+//! of the Gaussian is a difference of error functions. A velocity that reaches zero stays there if friction can hold
+//! the body. Otherwise the body reverses at that time, so that the mean is continuous from both ends.
 //!
-//! F falls with speed, so the equation of the
-//! end velocity may have several roots where the pulse is long beside what F takes to fall; taken is the one that the body
-//! meets first on its way from where it starts.
+//! F falls with speed. For long pulses the equation of the end velocity may therefore have several roots. The first
+//! root on the way from the initial velocity is used.
 
 use core::f64::consts::PI;
 
-/// What the body did in a pulse.
+/// State of a body in a pulse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// It slid, the sign of its velocity standing.
+    /// Sliding, without change of sign.
     Slip,
-    /// It was at rest at the end: it stayed so, or came to rest.
+    /// At rest at the end of the pulse.
     Stick,
-    /// It passed through rest to the other side.
+    /// Reversal of direction.
     Turn,
 }
 
-/// Coulomb friction and what is more of it near rest (Stribeck).
+/// Coulomb friction with Stribeck effect.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Law {
-    /// fc, not negative, in the unit of D^α y: what is left at speed.
+pub struct FrictionLaw {
+    /// Coulomb friction fc, not negative, in the unit of D^α y.
     pub coulomb: f64,
-    /// fs, not negative: what comes on top near rest.
+    /// Stribeck friction fs at rest in addition to fc, not negative.
     pub stribeck: f64,
-    /// vs, positive: the speed at which it has fallen to fs/e.
+    /// Stribeck speed vs, positive: the additional friction has fallen to fs/e.
     pub speed: f64,
 }
 
-/// A pulse with friction.
+/// Friction and motion in one pulse.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pulse {
-    /// Mean of the friction over it, positive against a positive velocity.
+    /// Mean friction over the pulse, positive against a positive velocity.
     pub force: f64,
-    /// Velocity at its end; exactly 0 at rest.
+    /// Velocity at the end, exactly 0 at rest.
     pub end: f64,
-    /// What the body did.
+    /// State of the body.
     pub phase: Phase,
 }
 
-/// How what a pulse is made of moves with a parameter.
+/// Derivatives of the quantities of a pulse with respect to a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Moves {
-    /// Velocity at its start.
+pub struct PulseDerivatives {
+    /// Velocity at the start.
     pub start: f64,
-    /// Velocity at its end if there were no friction in it.
+    /// Velocity at the end without friction in the pulse.
     pub free: f64,
-    /// What a unit of force in it does to the velocity at its end.
+    /// Change of the end velocity for a unit of force in the pulse.
     pub first: f64,
-    /// fc, fs and vs.
+    /// Friction parameters fc, fs and vs.
     pub law: [f64; 3],
 }
 
-/// The mean of F over the speeds between two, and its derivatives.
+/// Mean of F between two speeds, and its derivatives.
 struct Mean {
     value: f64,
     /// With respect to the two speeds.
@@ -66,21 +65,24 @@ struct Mean {
     law: [f64; 3],
 }
 
-/// Speeds closer than this share of vs: a difference of error functions would lose digits, five points are exact.
-const NEAR: f64 = 0.2;
-/// Points and weights of Gauss and Legendre on [0, 1].
-const POINTS: [(f64, f64); 5] = [
+/// Difference of speeds, relative to vs, below which quadrature replaces a difference of error functions. Five points
+/// are exact there, and the difference would lose digits.
+const QUADRATURE_SPEED_RATIO: f64 = 0.2;
+/// Gauss–Legendre nodes and weights on [0, 1].
+const GAUSS_LEGENDRE_NODES: [(f64, f64); 5] = [
     (0.046_910_077_030_668, 0.118_463_442_528_094_54),
     (0.230_765_344_947_158_45, 0.239_314_335_249_683_24),
     (0.5, 0.284_444_444_444_444_44),
     (0.769_234_655_052_841_6, 0.239_314_335_249_683_24),
     (0.953_089_922_969_332, 0.118_463_442_528_094_54),
 ];
-/// Most sweeps to the end velocity; each gains a digit or more unless two roots are about to meet.
-const SWEEPS: usize = 500;
+/// Most fixed-point iterations for the end velocity. Each gains a digit or more unless two roots nearly coincide.
+const MAX_SLIDE_ITERATIONS: usize = 500;
 
-/// Mean sign and end velocity of a pulse that starts at v, would end at p without friction, which takes b at most and
-/// holds what exceeds it by rounding.
+/// Mean sign, end velocity and state of a pulse with Coulomb friction.
+///
+/// `v` is the initial velocity, `p` the end velocity without friction, `b` the largest velocity change by friction. A
+/// force that exceeds friction by `rounding` still holds.
 #[must_use]
 pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
     if v == 0.0 {
@@ -101,24 +103,24 @@ pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
     (sign, p - b * sign, Phase::Turn)
 }
 
-impl Law {
-    /// Friction that is the same at every speed.
+impl FrictionLaw {
+    /// Friction that does not depend on speed.
     #[must_use]
     pub const fn coulomb(coulomb: f64) -> Self {
         Self { coulomb, stribeck: 0.0, speed: 1.0 }
     }
 
-    /// The most that friction holds.
+    /// Breakaway force: largest friction at rest.
     #[must_use]
     pub fn breakaway(&self) -> f64 {
         self.coulomb + self.stribeck
     }
 
-    /// What is left of the Stribeck term between two speeds that are not negative, on the average of a linear velocity.
+    /// Mean of the Stribeck term's exponential between two nonnegative speeds of a linear velocity.
     fn share(&self, from: f64, to: f64) -> f64 {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
-        if d.abs() < NEAR {
-            return POINTS.iter().map(|(u, w)| w * libm::exp(-(x + u * d).powi(2))).sum();
+        if d.abs() < QUADRATURE_SPEED_RATIO {
+            return GAUSS_LEGENDRE_NODES.iter().map(|(u, w)| w * libm::exp(-(x + u * d).powi(2))).sum();
         }
         0.5 * libm::sqrt(PI) * (libm::erf(x + d) - libm::erf(x)) / d
     }
@@ -131,15 +133,15 @@ impl Law {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
         let share = self.share(from, to);
         let gauss = |z: f64| libm::exp(-z * z);
-        let (by_from, by_to) = if d.abs() < NEAR {
+        let (by_from, by_to) = if d.abs() < QUADRATURE_SPEED_RATIO {
             let sloped = |weight: fn(f64) -> f64| -> f64 {
-                POINTS.iter().map(|(u, w)| -2.0 * w * weight(*u) * (x + u * d) * gauss(x + u * d)).sum()
+                GAUSS_LEGENDRE_NODES.iter().map(|(u, w)| -2.0 * w * weight(*u) * (x + u * d) * gauss(x + u * d)).sum()
             };
             (sloped(|u| 1.0 - u), sloped(|u| u))
         } else {
             ((share - gauss(x)) / d, (gauss(x + d) - share) / d)
         };
-        // Of a function of x and x + d alone.
+        // Function of x and x + d only.
         let by_speed = -(x * by_from + (x + d) * by_to) / self.speed;
         let s = self.stribeck;
         Mean {
@@ -150,15 +152,14 @@ impl Law {
         }
     }
 
-    /// Where a body that slides at a speed v ends a pulse in which the others would bring it to p, a unit of force taking
-    /// g; none if it comes to rest before.
+    /// End velocity of a body that slides at speed v and would end at p without friction, a unit of force taking g.
     ///
-    /// The mean falls as the end rises, so each sweep from v goes on in the direction of the first and never passes the
-    /// first root.
+    /// None if the body comes to rest. The mean falls as the end velocity rises, so iterates from v are monotone and
+    /// never pass the first root.
     fn slide(&self, v: f64, p: f64, g: f64) -> Option<f64> {
         let rounding = 4.0 * f64::EPSILON * (v + p.abs());
         let mut end = v;
-        for _ in 0..SWEEPS {
+        for _ in 0..MAX_SLIDE_ITERATIONS {
             let next = p - g * self.mean(v, end);
             if next < 0.0 {
                 return None;
@@ -172,8 +173,9 @@ impl Law {
         Some(end)
     }
 
-    /// A pulse that starts at v and would end at p without friction, a unit of force in it taking g from its end; what
-    /// exceeds the friction by rounding is held.
+    /// Pulse that starts at v and would end at p without friction, a unit of force taking g from the end velocity.
+    ///
+    /// A force that exceeds friction by `rounding` still holds.
     #[must_use]
     pub fn pulse(&self, v: f64, p: f64, g: f64, rounding: f64) -> Pulse {
         if self.stribeck == 0.0 {
@@ -197,15 +199,15 @@ impl Law {
         let before = self.mean(0.0, speed);
         let until = speed / (g * before + push);
         let left = 1.0 - until;
-        // From rest, what is left of the push against what is left of the friction.
+        // From rest: remaining push against remaining friction.
         let back = self.slide(0.0, left * push, left * g).unwrap_or(0.0);
         let force = side * (until * before - left * self.mean(0.0, back));
         Pulse { force, end: -side * back, phase: Phase::Turn }
     }
 
-    /// How the friction and the end velocity of a pulse move.
+    /// Derivatives of the friction and of the end velocity of a pulse.
     #[must_use]
-    pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, moves: &Moves) -> (f64, f64) {
+    pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, moves: &PulseDerivatives) -> (f64, f64) {
         let of = |mean: &Mean| mean.law.iter().zip(&moves.law).map(|(a, b)| a * b).sum::<f64>();
         match at.phase {
             Phase::Stick if g > 0.0 && self.breakaway() > 0.0 => ((moves.free - at.force * moves.first) / g, 0.0),

@@ -1,18 +1,18 @@
-//! Bodies with friction whose orders and coefficients are free: residuals on every experiment, and their derivatives.
+//! Parameters of bodies with friction: residuals of all experiments and their derivatives.
 
-use super::convolution::{product, Integrated};
-use super::dynamics::{at_rest, Body, Operators, Run};
-use super::initial_state::{together, Forcing, State};
-use super::law::Law;
+use super::convolution::{product, IntegratedSignal};
+use super::dynamics::{remove_creep, Body, Operators, Run};
+use super::initial_state::{merge_powers, InitialForcing, State};
+use super::law::FrictionLaw;
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
-use crate::regressors::{add_impulses, parted, Record};
+use crate::regressors::{add_impulses, split_impulses, Record};
 use crate::series::Kernel;
 
-/// Friction each of whose numbers may be free: a multiple of one coefficient.
+/// Friction law with free parameters, each a multiple of one coefficient.
 #[derive(Debug, Clone, PartialEq)]
-pub struct FreeLaw {
+pub struct FreeFrictionLaw {
     /// fc.
     pub coulomb: Monomial,
     /// fs.
@@ -21,8 +21,8 @@ pub struct FreeLaw {
     pub speed: Monomial,
 }
 
-impl FreeLaw {
-    /// Friction that is the same at every speed.
+impl FreeFrictionLaw {
+    /// Friction that does not depend on speed.
     #[must_use]
     pub fn coulomb(coulomb: Monomial) -> Self {
         let known = |factor: f64| Monomial { factor, powers: Vec::new() };
@@ -33,55 +33,55 @@ impl FreeLaw {
         [&self.coulomb, &self.stribeck, &self.speed]
     }
 
-    /// At coefficients.
-    pub(super) fn at(&self, coefficients: &[f64]) -> Law {
+    /// Law at these coefficients.
+    pub(super) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
         let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
-        Law { coulomb, stribeck, speed }
+        FrictionLaw { coulomb, stribeck, speed }
     }
 
-    /// Whether a coefficient is one of its forces, which are not negative.
-    pub(super) fn rubs(&self, coefficient: usize) -> bool {
+    /// Whether a coefficient is a force of this law, which must not be negative.
+    pub(super) fn is_force(&self, coefficient: usize) -> bool {
         [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
     }
 }
 
-/// Which outputs pass a filter before they are compared.
+/// Outputs that pass a filter before the comparison.
 #[must_use]
-pub fn passing(experiments: &[Experiment]) -> Vec<bool> {
+pub fn filtered_outputs(experiments: &[Experiment]) -> Vec<bool> {
     experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
 }
 
-/// What is estimated: equations that follow each other's outputs, some with friction of their own output's velocity.
+/// Model with free parameters: coupled equations, some with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionModel {
-    /// The linear terms.
+    /// Linear equations.
     pub equations: Vec<FreeEquation>,
-    /// Which of them have friction, and F of − F(Dy) sgn(Dy).
-    pub frictions: Vec<(usize, FreeLaw)>,
-    /// What is free of inputs, one number of an input at most.
+    /// Equations with friction, and F of − F(Dy) sgn(Dy).
+    pub frictions: Vec<(usize, FreeFrictionLaw)>,
+    /// Free parameters of inputs, at most one an input.
     pub inputs: Vec<FreeInput>,
     /// Bounds of each free order.
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
     pub coordinates: Vec<Coordinate>,
-    /// Initial terms of each record, offsets, and free motions of the filter that outputs pass.
+    /// Initial terms of each record, offsets, and filter transients of filtered outputs.
     pub initial: Initial,
-    /// Which outputs pass the filter of every experiment before they are compared; empty: none.
+    /// Outputs that pass the filter of every experiment before the comparison. Empty if none does.
     pub filtered: Vec<bool>,
 }
 
-/// Values of all that is free.
+/// Values of all free parameters.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Point {
     pub(super) orders: Vec<f64>,
     pub(super) coefficients: Vec<f64>,
-    /// Free numbers of inputs.
+    /// Free parameters of inputs.
     pub(super) inputs: Vec<f64>,
-    /// Of each run.
+    /// Initial states of each run.
     pub(super) states: Vec<Vec<f64>>,
 }
 
-/// Residuals at a point, and what their derivatives are made of.
+/// Residuals at a point, with intermediate results for their derivatives.
 pub(super) struct Evaluation {
     pub(super) residuals: Vec<f64>,
     pub(super) size: f64,
@@ -91,28 +91,28 @@ pub(super) struct Evaluation {
 struct Part {
     operators: Operators,
     run: Run,
-    /// How the means of each input with a free number move with it.
-    bent: Vec<Vec<f64>>,
+    /// Derivatives of the means of each input with respect to its free parameter.
+    input_slopes: Vec<Vec<f64>>,
 }
 
-/// Samples from which a run's first velocity is taken.
+/// Samples for the initial velocity of a run.
 const FIRST_SAMPLES: usize = 8;
 
-/// Powers of t move smoothly with orders: the error of a central difference is 1e−10.
-const SHIFT: f64 = 1e-5;
+/// Step of central differences. Powers of t are smooth in the orders, so the error is about 1e−10.
+const DIFFERENCE_STEP: f64 = 1e-5;
 
-/// What a parameter moves.
-enum Moved {
-    /// A free order, a free coefficient, a state of one run.
+/// Parameter of a derivative.
+enum Parameter {
+    /// Free order, free coefficient, or state of one run.
     Order(usize),
     Coefficient(usize),
     State(usize, usize),
-    /// A free number of an input.
+    /// Free parameter of an input.
     Input(usize),
 }
 
 impl FrictionModel {
-    /// Refuses what names something that is not there, or an experiment that this model cannot be compared with.
+    /// Return an error for an inconsistent model, or for experiments that do not fit it.
     ///
     /// # Errors
     /// [`Error::Structure`], [`Error::Length`].
@@ -156,7 +156,7 @@ impl FrictionModel {
         for experiment in experiments {
             experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
-            if experiment.own.is_some() {
+            if experiment.nonuniform.is_some() {
                 return refuse("friction with samples at times of their own", "leave them out");
             }
             let passes = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
@@ -167,12 +167,12 @@ impl FrictionModel {
         self.initial.check()
     }
 
-    /// Whether a coefficient is a force of some friction, which is not negative.
-    pub(super) fn rubs(&self, coefficient: usize) -> bool {
-        self.frictions.iter().any(|(_, law)| law.rubs(coefficient))
+    /// Whether a coefficient is a friction force, which must not be negative.
+    pub(super) fn is_friction_force(&self, coefficient: usize) -> bool {
+        self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
     }
 
-    /// Refuses free orders that make no equation.
+    /// Return an error for invalid free orders.
     pub(super) fn check_orders(&self, orders: &[f64]) -> Result<()> {
         let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
         body.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
@@ -196,7 +196,7 @@ impl FrictionModel {
         }
     }
 
-    /// States of every run at these orders, and the equations without their coefficients.
+    /// States of every run at these orders, and the equations with zero coefficients.
     pub(super) fn states(&self, orders: &[f64]) -> (Vec<State>, Vec<Equation>) {
         let moves = |i: usize, term: usize| {
             let alpha = &self.equations[i].order.weights;
@@ -207,8 +207,8 @@ impl FrictionModel {
         (State::all(&body.equations, &self.initial, &self.filtered, moves), body.equations)
     }
 
-    /// States of a run as its first samples have them: where the bodies are and how fast, constants beside frictions as
-    /// given, the rest 0.
+    /// Initial states from the first samples of a run: positions and velocities of the bodies, given constants for the
+    /// frictions, all other states 0.
     pub(super) fn first_states(&self, orders: &[f64], experiment: &Experiment, constants: &[f64]) -> Vec<f64> {
         let (states, equations) = self.states(orders);
         let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
@@ -224,7 +224,7 @@ impl FrictionModel {
         states.iter().map(value).collect()
     }
 
-    /// Powers of t of a run's states by equation: (exponent, coefficient).
+    /// Initial terms of a run's states by equation: (exponent, coefficient).
     pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
         let body = self.body(orders, coefficients);
         let links = body.links();
@@ -232,24 +232,30 @@ impl FrictionModel {
         let parts = states.iter().zip(values).flat_map(|(state, &x)| {
             state.powers(&body.equations, &links).into_iter().map(move |(i, e, c)| (i, e, x * c))
         });
-        together(body.equations.len(), parts)
+        merge_powers(body.equations.len(), parts)
     }
 
-    fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Result<Forcing> {
+    fn initial_forcing(
+        &self,
+        orders: &[f64],
+        coefficients: &[f64],
+        values: &[f64],
+        record: &Record,
+    ) -> Result<InitialForcing> {
         let body = self.body(orders, coefficients);
-        let (powers, _) = parted(&self.powers(orders, coefficients, values));
-        Forcing::of(&powers, &body.links(), record.m(), record.step())
+        let (powers, _) = split_impulses(&self.powers(orders, coefficients, values));
+        InitialForcing::of(&powers, &body.links(), record.m(), record.step())
     }
 
-    /// The record as its inputs act, none where that is as they are, and how these move with their free numbers.
-    fn acting(&self, record: &Record, values: &[f64]) -> Result<(Option<Record>, Vec<Vec<f64>>)> {
+    /// Record with transformed inputs, and their derivatives in the free parameters. None without free inputs.
+    fn transform_inputs(&self, record: &Record, values: &[f64]) -> Result<(Option<Record>, Vec<Vec<f64>>)> {
         if self.inputs.is_empty() {
             return Ok((None, Vec::new()));
         }
         let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
         let mut bent = Vec::with_capacity(self.inputs.len());
         for (input, &value) in self.inputs.iter().zip(values) {
-            let (means, slope) = input.law.acted(&signals[input.signal], value, record.step(), 0.0)?;
+            let (means, slope) = input.law.apply(&signals[input.signal], value, record.step(), 0.0)?;
             signals[input.signal] = means;
             bent.push(slope);
         }
@@ -258,30 +264,32 @@ impl FrictionModel {
 
     pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point) -> Result<Evaluation> {
         let body = self.body(&point.orders, &point.coefficients);
-        // Reported like a step too far, so that a search shortens it.
+        // Same error as for a step that is too long, so that an optimizer shortens it.
         let far = |_| Error::Diverged { what: "orders or friction out of range; the free run".into(), index: 0 };
         body.check(usize::MAX).map_err(far)?;
         let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
         for (experiment, values) in experiments.iter().zip(&point.states) {
-            let (acting, bent) = self.acting(&experiment.record, &point.inputs)?;
+            let (acting, bent) = self.transform_inputs(&experiment.record, &point.inputs)?;
             let operators = Operators::new(&body, acting.as_ref().unwrap_or(&experiment.record))?;
-            let forcing = self.forcing(&point.orders, &point.coefficients, values, &experiment.record)?;
+            let forcing = self.initial_forcing(&point.orders, &point.coefficients, values, &experiment.record)?;
             let run = Run::new(&body, &operators, &forcing)?;
-            let mut residuals = experiment.measured();
+            let mut residuals = experiment.measured_samples();
             out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
             let mut outputs = run.outputs.clone();
-            let (_, impulses) = parted(&self.powers(&point.orders, &point.coefficients, values));
+            let (_, impulses) = split_impulses(&self.powers(&point.orders, &point.coefficients, values));
             add_impulses(&mut outputs, &impulses, experiment.record.step());
-            let sampled = experiment.sampled(&outputs);
+            let sampled = experiment.weighted_samples(&outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
             out.residuals.extend(residuals);
-            out.parts.push(Part { operators, run, bent });
+            out.parts.push(Part { operators, run, input_slopes: bent });
         }
         Ok(out)
     }
 
-    /// Derivatives of the residuals with respect to orders, coefficients, then the states of run after run; without
-    /// `numbers` to states alone.
+    /// Derivatives of the residuals with respect to orders, coefficients and inputs, then to the states of run after
+    /// run.
+    ///
+    /// Without `numbers` only with respect to the states.
     pub(super) fn jacobian(
         &self,
         experiments: &[Experiment],
@@ -289,27 +297,27 @@ impl FrictionModel {
         at: &Evaluation,
         numbers: bool,
     ) -> Result<Vec<Vec<f64>>> {
-        let mut all: Vec<Moved> = Vec::new();
+        let mut all: Vec<Parameter> = Vec::new();
         if numbers {
-            all.extend((0..point.orders.len()).map(Moved::Order));
-            all.extend((0..point.coefficients.len()).map(Moved::Coefficient));
-            all.extend((0..point.inputs.len()).map(Moved::Input));
+            all.extend((0..point.orders.len()).map(Parameter::Order));
+            all.extend((0..point.coefficients.len()).map(Parameter::Coefficient));
+            all.extend((0..point.inputs.len()).map(Parameter::Input));
         }
         for (run, states) in point.states.iter().enumerate() {
-            all.extend((0..states.len()).map(|state| Moved::State(run, state)));
+            all.extend((0..states.len()).map(|state| Parameter::State(run, state)));
         }
         let body = self.body(&point.orders, &point.coefficients);
         let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
-            let spectra = Spectra::new(part, &body.sticks());
+            let spectra = Spectra::new(part, &body.friction_equations());
             for (column, moved) in columns.iter_mut().zip(&all) {
-                if matches!(moved, Moved::State(run, _) if *run != index) {
-                    column.extend(std::iter::repeat_n(0.0, self.equations.len() * experiment.compared()));
+                if matches!(moved, Parameter::State(run, _) if *run != index) {
+                    column.extend(std::iter::repeat_n(0.0, self.equations.len() * experiment.compared_count()));
                     continue;
                 }
                 let slopes = self.slopes(&body, experiment, part, &spectra, point, index, moved)?;
-                // Residuals fall where the response rises.
-                column.extend(experiment.sampled(&slopes).into_iter().map(|v| -v));
+                // Residuals are measurement minus response.
+                column.extend(experiment.weighted_samples(&slopes).into_iter().map(|v| -v));
             }
         }
         if columns.iter().flatten().any(|v| !v.is_finite()) {
@@ -318,7 +326,7 @@ impl FrictionModel {
         Ok(columns)
     }
 
-    /// How the outputs' means move with one parameter.
+    /// Derivatives of the outputs' means with respect to one parameter.
     #[allow(clippy::too_many_arguments)]
     fn slopes(
         &self,
@@ -328,12 +336,12 @@ impl FrictionModel {
         spectra: &Spectra,
         point: &Point,
         run: usize,
-        moved: &Moved,
+        moved: &Parameter,
     ) -> Result<Vec<Vec<f64>>> {
         let (operators, motion, record) = (&part.operators, &part.run, &experiment.record);
-        if let Moved::State(_, state) = *moved {
+        if let Parameter::State(_, state) = *moved {
             if let Some(State::Power(i, e)) = self.states(&point.orders).0.get(state).filter(|s| s.is_impulse()) {
-                // What a filter still holds moves no body.
+                // A filter transient does not move a body.
                 let mut slopes = vec![vec![0.0; record.m()]; self.equations.len()];
                 let mut own = vec![Vec::new(); self.equations.len()];
                 own[*i].push((*e, 1.0));
@@ -341,9 +349,9 @@ impl FrictionModel {
                 return Ok(slopes);
             }
         }
-        let Moves { alphas, terms: moves, frictions } = self.moves(point, moved);
+        let BodyDerivatives { alphas, terms: moves, frictions } = self.moves(point, moved);
         let mut total = self.forcing_slope(point, &point.states[run], record, moved)?;
-        let mut add = |i: usize, weight: f64, part: &Integrated| {
+        let mut add = |i: usize, weight: f64, part: &IntegratedSignal| {
             if weight != 0.0 {
                 total.add_to(i, weight, part);
             }
@@ -351,14 +359,16 @@ impl FrictionModel {
         for (i, equation) in body.equations.iter().enumerate() {
             for (k, (&(dc, deta), &c)) in moves[i].iter().zip(&equation.coefficients).enumerate() {
                 let signal = equation.structure.terms[k].signal;
-                if let (Some(driven), Some((driver, spectrum))) = (&operators.driven[i][k], &operators.drivers[i][k]) {
+                if let (Some(driven), Some((driver, spectrum))) =
+                    (&operators.integrated_inputs[i][k], &operators.drivers[i][k])
+                {
                     add(i, dc, driven);
                     if deta != 0.0 {
                         add(i, c * deta, &driver.of(spectrum, 1));
                     }
-                    if let Moved::Input(input) = moved {
+                    if let Parameter::Input(input) = moved {
                         if signal == self.inputs[*input].signal {
-                            add(i, c, &driver.of(&Kernel::new(&part.bent[*input]), 0));
+                            add(i, c, &driver.of(&Kernel::new(&part.input_slopes[*input]), 0));
                         }
                     }
                 }
@@ -372,7 +382,7 @@ impl FrictionModel {
                 }
             }
         }
-        let sticks = body.sticks();
+        let sticks = body.friction_equations();
         for ((&b, friction), force) in sticks.iter().zip(&operators.frictions).zip(&motion.forces) {
             if alphas[b] != 0.0 {
                 add(b, -alphas[b], &friction.of(force, 1));
@@ -389,20 +399,20 @@ impl FrictionModel {
         }
         let mut slopes = operators.through(&total.output);
         if slopes.len() > 1 {
-            sticks.iter().zip(&motion.march.bodies).for_each(|(&b, moved)| at_rest(&mut slopes[b], moved));
+            sticks.iter().zip(&motion.march.bodies).for_each(|(&b, moved)| remove_creep(&mut slopes[b], moved));
         }
         Ok(slopes)
     }
 
-    /// What a parameter moves of the body's numbers.
-    fn moves(&self, point: &Point, moved: &Moved) -> Moves {
-        let mut out = Moves {
+    /// Derivatives of the orders, coefficients and friction parameters with respect to a parameter.
+    fn moves(&self, point: &Point, moved: &Parameter) -> BodyDerivatives {
+        let mut out = BodyDerivatives {
             alphas: vec![0.0; self.equations.len()],
             terms: self.equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len()]).collect(),
             frictions: vec![[0.0; 3]; self.frictions.len()],
         };
         match *moved {
-            Moved::Order(j) => {
+            Parameter::Order(j) => {
                 let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
                 for (i, equation) in self.equations.iter().enumerate() {
                     let alpha = of(&equation.order.weights);
@@ -410,7 +420,7 @@ impl FrictionModel {
                     out.terms[i] = equation.terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect();
                 }
             }
-            Moved::Coefficient(j) => {
+            Parameter::Coefficient(j) => {
                 for (terms, equation) in out.terms.iter_mut().zip(&self.equations) {
                     *terms = equation.terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect();
                 }
@@ -418,24 +428,30 @@ impl FrictionModel {
                     *moves = law.numbers().map(|number| number.slope(&point.coefficients, j));
                 }
             }
-            Moved::State(..) | Moved::Input(_) => {}
+            Parameter::State(..) | Parameter::Input(_) => {}
         }
         out
     }
 
-    /// How what a run starts with moves: it is linear in states and coefficients, and smooth in orders.
-    fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Result<Forcing> {
+    /// Derivative of the initial forcing, which is linear in states and coefficients and smooth in orders.
+    fn forcing_slope(
+        &self,
+        point: &Point,
+        values: &[f64],
+        record: &Record,
+        moved: &Parameter,
+    ) -> Result<InitialForcing> {
         let idle = values.is_empty() || values.iter().all(|x| *x == 0.0);
-        let none = || Ok(Forcing::none(record.m(), self.equations.len()));
+        let none = || Ok(InitialForcing::zeros(record.m(), self.equations.len()));
         match *moved {
-            Moved::State(_, state) => {
+            Parameter::State(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
-                self.forcing(&point.orders, &point.coefficients, &unit, record)
+                self.initial_forcing(&point.orders, &point.coefficients, &unit, record)
             }
-            // What a run starts with knows nothing of its inputs.
-            Moved::Input(_) => none(),
+            // Initial forcing does not depend on inputs.
+            Parameter::Input(_) => none(),
             _ if idle => none(),
-            Moved::Coefficient(j) => {
+            Parameter::Coefficient(j) => {
                 let followed = |signal: usize| self.equations.iter().any(|e| e.output == signal);
                 let mut terms = self.equations.iter().flat_map(|e| &e.terms);
                 if !terms.any(|t| followed(t.0) && t.2.slope(&point.coefficients, j) != 0.0) {
@@ -444,37 +460,37 @@ impl FrictionModel {
                 let at = |by: f64| {
                     let mut shifted = point.coefficients.clone();
                     shifted[j] += by;
-                    self.forcing(&point.orders, &shifted, values, record)
+                    self.initial_forcing(&point.orders, &shifted, values, record)
                 };
                 let size = point.coefficients[j].abs().max(1.0);
-                // Of one equation no more than a square; levels and velocities that feed through others at once are none.
-                let by = if self.equations.len() == 1 { size } else { SHIFT * size };
+                // Quadratic at most for one equation. With direct feedthrough between equations it is rational.
+                let by = if self.equations.len() == 1 { size } else { DIFFERENCE_STEP * size };
                 Ok(difference(&at(by)?, &at(-by)?, 2.0 * by))
             }
-            Moved::Order(j) => {
+            Parameter::Order(j) => {
                 let shifted = |by: f64| {
                     let mut orders = point.orders.clone();
                     orders[j] += by;
-                    self.forcing(&orders, &point.coefficients, values, record)
+                    self.initial_forcing(&orders, &point.coefficients, values, record)
                 };
-                Ok(difference(&shifted(SHIFT)?, &shifted(-SHIFT)?, 2.0 * SHIFT))
+                Ok(difference(&shifted(DIFFERENCE_STEP)?, &shifted(-DIFFERENCE_STEP)?, 2.0 * DIFFERENCE_STEP))
             }
         }
     }
 }
 
-/// Derivatives of each α, of (coefficient, integration) of each term, and of each fc, fs and vs.
-struct Moves {
+/// Derivatives of each α, of (coefficient, integration order) of each term, and of each fc, fs and vs.
+struct BodyDerivatives {
     alphas: Vec<f64>,
     terms: Vec<Vec<(f64, f64)>>,
     frictions: Vec<[f64; 3]>,
 }
 
-/// Level and velocity of an output as its first samples have them.
+/// Initial position and velocity of an output from its first samples.
 fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     let near = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]
-    let (count, step) = (near.len() as f64, experiment.record.step() * experiment.every as f64);
+    let (count, step) = (near.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);
     let middle = 0.5 * (count - 1.0);
     let mean = near.iter().sum::<f64>() / count.max(1.0);
     #[allow(clippy::cast_precision_loss)]
@@ -489,14 +505,14 @@ fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     (mean - rate * middle * step, rate)
 }
 
-fn difference(up: &Forcing, down: &Forcing, step: f64) -> Forcing {
-    let mut out = up.nothing();
+fn difference(up: &InitialForcing, down: &InitialForcing, step: f64) -> InitialForcing {
+    let mut out = up.zeros_like();
     out.add(1.0 / step, up);
     out.add(-1.0 / step, down);
     out
 }
 
-/// Spectra of outputs, and of velocities at edges, which terms of them take in.
+/// Spectra of outputs and of edge velocities that enter terms.
 struct Spectra(Vec<(Kernel, Kernel)>);
 
 impl Spectra {
@@ -509,9 +525,9 @@ impl Spectra {
         Self(run.outputs.iter().zip(&run.moved).enumerate().map(of).collect())
     }
 
-    /// Share of a term of an output through its kernels (0) or their slopes (1).
-    fn own(&self, output: usize, kernels: &[Vec<f64>; 2], which: usize) -> Integrated {
+    /// Contribution of a term of an output through its kernels (0) or their derivatives (1).
+    fn own(&self, output: usize, kernels: &[Vec<f64>; 2], which: usize) -> IntegratedSignal {
         let (position, velocity) = &self.0[output];
-        Integrated { output: product(position, &kernels[which]), edges: product(velocity, &kernels[which]) }
+        IntegratedSignal { output: product(position, &kernels[which]), edges: product(velocity, &kernels[which]) }
     }
 }

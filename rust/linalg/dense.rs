@@ -1,4 +1,4 @@
-//! Dense matrix products, Gram matrices and QR factors; the only user of `faer`.
+//! Dense matrices: products, Gram matrices, QR factors and singular values. The only user of `faer`.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
@@ -6,13 +6,13 @@ use faer::{Accum, Mat, MatRef, Par};
 use crate::linalg::orthogonal;
 use crate::parallel::{self, Stop};
 
-/// Rows over which one product of long columns is summed, at least, and into how many such parts their rows are cut at
-/// most; the parts do not depend on the threads, nor do their sums.
-const PIECE: usize = 1 << 14;
-const PIECES: usize = 16;
-/// Columns of a Gram matrix that are multiplied with one another at a time.
-const TILE: usize = 64;
-/// Rows of scattered columns that are laid out for a product at a time: what fits a cache.
+/// Fewest rows of one part of a product of long columns, and largest number of parts. Neither depends on the number of
+/// threads, so the sums do not either.
+const MIN_PART_ROWS: usize = 1 << 14;
+const MAX_ROW_PARTS: usize = 16;
+/// Width of the column tiles in which a Gram matrix is multiplied.
+const GRAM_TILE_COLUMNS: usize = 64;
+/// Rows of scattered columns that are gathered for one product. They fit in the cache.
 const LAID_OUT: usize = 1 << 10;
 
 /// Row-major product of an a×b and a b×c matrix, one thread. O(abc).
@@ -30,20 +30,22 @@ pub fn multiply(left: &[f64], right: &[f64], a: usize, b: usize, c: usize) -> Ve
     out
 }
 
-/// Gram matrix of columns that lie one behind another, and of a target as the last one: row-major, exactly symmetric.
-/// O(k²m), on the threads of the pool at hand; the columns are read where they lie. What it comes to once it was told to
-/// stop is of no use.
+/// Gram matrix of contiguous columns with a target as last column: row-major, exactly symmetric.
+///
+/// O(k²m) on the threads of the current pool. The columns are not copied. The result is invalid after `stop` was set.
 ///
 /// # Panics
-/// Where the columns are not as long as the target.
+/// If the columns are not as long as the target.
 #[must_use]
 pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     let m = target.len();
     let k = columns.len() / m.max(1);
     let x = MatRef::from_column_major_slice(columns, m, k);
     let y = MatRef::from_column_major_slice(target, m, 1);
-    let mut tiles: Vec<(usize, MatRef<'_, f64>)> =
-        (0..k).step_by(TILE).map(|first| (first, x.subcols(first, TILE.min(k - first)))).collect();
+    let mut tiles: Vec<(usize, MatRef<'_, f64>)> = (0..k)
+        .step_by(GRAM_TILE_COLUMNS)
+        .map(|first| (first, x.subcols(first, GRAM_TILE_COLUMNS.min(k - first))))
+        .collect();
     tiles.push((k, y));
     let rows = pieces(m);
     let pairs = (0..tiles.len()).flat_map(|b| (0..=b).map(move |a| (a, b)));
@@ -76,9 +78,9 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     out
 }
 
-/// Where so many rows are cut: first row and number of each part.
+/// First row and number of rows of each part of a product.
 fn pieces(m: usize) -> Vec<(usize, usize)> {
-    let len = m.div_ceil(PIECES).max(PIECE);
+    let len = m.div_ceil(MAX_ROW_PARTS).max(MIN_PART_ROWS);
     (0..m).step_by(len).map(|from| (from, len.min(m - from))).collect()
 }
 
@@ -90,7 +92,7 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     if let Some(factor) = orthogonal::triangular_factor(columns) {
         return factor;
     }
-    // Squares leave the numbers: norms are to be scaled.
+    // Squares overflow: norms must be scaled.
     let k = columns.len();
     let m = columns.iter().map(Vec::len).max().unwrap_or(0);
     let x = Mat::from_fn(m.max(k), k, |i, j| columns[j].get(i).copied().unwrap_or(0.0));
@@ -105,41 +107,42 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     out
 }
 
-/// Singular values of columns, as many as the lesser of their number and length, none smaller than the next.
-pub struct Singular {
-    /// Left vectors, each as long as the columns.
+/// Singular value decomposition of columns. Values are in descending order.
+pub struct SingularValues {
+    /// Singular vectors on the left, each as long as the columns.
     pub left: Vec<Vec<f64>>,
-    /// The values.
-    pub sizes: Vec<f64>,
-    /// Right vectors, each of as many numbers as there are columns.
+    /// Singular values. There are as many as the smaller of the number and the length of the columns.
+    pub values: Vec<f64>,
+    /// Singular vectors on the right, with one element a column.
     pub right: Vec<Vec<f64>>,
 }
 
-/// Singular values and vectors of columns of one length. O(k²m), one thread.
+/// Singular values and vectors of columns of equal length. O(k²m), one thread.
 ///
-/// None where the iteration does not end, which finite numbers do not make happen.
+/// None if the iteration does not converge, which does not occur for finite values.
 ///
 /// ```
 /// # fn run() -> Option<()> {
-/// let found = ftlm::linalg::dense::singular(&[vec![0.0, 3.0, 0.0], vec![0.0, 0.0, -2.0]])?;
-/// assert!((found.sizes[0] - 3.0).abs() < 1e-15 && (found.sizes[1] - 2.0).abs() < 1e-15);
+/// let found = ftlm::linalg::dense::singular_values(&[vec![0.0, 3.0, 0.0], vec![0.0, 0.0, -2.0]])?;
+/// assert!((found.values[0] - 3.0).abs() < 1e-15 && (found.values[1] - 2.0).abs() < 1e-15);
 /// assert!((found.left[0][1] * found.right[0][0] - 1.0).abs() < 1e-15);
 /// # Some(())
 /// # }
 /// # assert!(run().is_some());
 /// ```
 #[must_use]
-pub fn singular(columns: &[Vec<f64>]) -> Option<Singular> {
+pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
     let m = columns.first().map_or(0, Vec::len);
     let x = Mat::from_fn(m, columns.len(), |i, j| columns[j][i]);
     let found = x.thin_svd().ok()?;
     let vectors = |of: MatRef<'_, f64>| of.col_iter().map(|column| column.iter().copied().collect()).collect();
     let sizes = found.S().column_vector().iter().copied().collect();
-    Some(Singular { left: vectors(found.U()), sizes, right: vectors(found.V()) })
+    Some(SingularValues { left: vectors(found.U()), values: sizes, right: vectors(found.V()) })
 }
 
-/// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m), on
-/// the threads of the pool at hand. What they come to once it was told to stop is of no use.
+/// Inner products of every left with every right column of equal length, row-major left × right.
+///
+/// O(left·right·m) on the threads of the current pool. The result is invalid after `stop` was set.
 #[must_use]
 pub fn inner_products(left: &[&[f64]], right: &[&[f64]], stop: &Stop) -> Vec<f64> {
     let m = left.first().map_or(0, |c| c.len());

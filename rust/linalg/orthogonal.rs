@@ -1,20 +1,20 @@
-//! Long columns against one another: orthonormal bases, projections, triangular factors, in the widest vectors at hand.
+//! Orthonormal bases, projections and triangular factors of long columns, vectorized.
 
 use crate::error::Result;
 use crate::parallel::{self, Stop};
-use crate::simd::{dot, widest, Kernel};
+use crate::simd::{dispatch_simd, dot, Kernel};
 
-/// Rows that are taken into a triangular factor at a time: what fits a cache.
-const ROWS: usize = 1 << 10;
+/// Rows of one block of a triangular factorization. They fit in the cache.
+const QR_BLOCK_ROWS: usize = 1 << 10;
 
-/// Directions that are taken out of a column between two looks at whether to stop.
+/// Directions that are projected out between two checks for cancellation.
 const AT_ONCE: usize = 16;
 
-/// Squares of what is factored lie between these: beyond, sums of them are not what they should be.
-const LEAST: f64 = 1e-280;
-const MOST: f64 = 1e280;
+/// Range of squared norms in factorizations. Beyond it sums of squares overflow or lose accuracy.
+const MIN_SQUARED_NORM: f64 = 1e-280;
+const MAX_SQUARED_NORM: f64 = 1e280;
 
-/// Upper triangle R of [R; rows] by Householder's reflections, column by column; false where a square leaves the numbers.
+/// Upper triangle R of [R; rows] by Householder reflections, column by column. False if a square is out of range.
 struct Reflections<'a> {
     columns: &'a mut [Vec<f64>],
 }
@@ -32,7 +32,7 @@ impl Kernel for Reflections<'_> {
             if square == 0.0 && reflected.iter().all(|v| *v == 0.0) {
                 continue;
             }
-            if !(LEAST..=MOST).contains(&square) {
+            if !(MIN_SQUARED_NORM..=MAX_SQUARED_NORM).contains(&square) {
                 return false;
             }
             let first = reflected[0];
@@ -52,24 +52,25 @@ impl Kernel for Reflections<'_> {
     }
 }
 
-/// Upper-triangular factor of the given columns, row-major k × k, part of the rows after part; none where squares leave the
-/// numbers. O(k²m).
+/// Upper-triangular QR factor of columns, row-major k × k, by blocks of rows. O(k²m).
+///
+/// None if a squared norm is out of range.
 pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     let k = columns.len();
     let m = columns.iter().map(Vec::len).max().unwrap_or(0);
-    // R of what is done on top, the next rows below.
-    let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + ROWS.min(m)); k];
+    // R of the processed rows on top, the next rows below.
+    let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + QR_BLOCK_ROWS.min(m)); k];
     stacked.iter_mut().for_each(|column| column.resize(k, 0.0));
-    for from in (0..m).step_by(ROWS) {
+    for from in (0..m).step_by(QR_BLOCK_ROWS) {
         for (j, (column, given)) in stacked.iter_mut().zip(columns).enumerate() {
-            // What a reflection leaves below the triangle is its own vector.
+            // A reflection leaves its own vector below the triangle.
             column.truncate(k);
             column.iter_mut().skip(j + 1).for_each(|v| *v = 0.0);
-            let rows = given.get(from..given.len().min(from + ROWS)).unwrap_or_default();
+            let rows = given.get(from..given.len().min(from + QR_BLOCK_ROWS)).unwrap_or_default();
             column.extend_from_slice(rows);
-            column.resize(k + ROWS.min(m - from), 0.0);
+            column.resize(k + QR_BLOCK_ROWS.min(m - from), 0.0);
         }
-        if !widest(Reflections { columns: &mut stacked }) {
+        if !dispatch_simd(Reflections { columns: &mut stacked }) {
             return None;
         }
     }
@@ -82,7 +83,7 @@ pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Takes what lies along an orthonormal basis out of a column, `times` over.
+/// Removal of the components along an orthonormal basis from a column, `times` over.
 struct Projection<'a> {
     basis: &'a [Vec<f64>],
     column: &'a mut [f64],
@@ -105,16 +106,16 @@ impl Kernel for Projection<'_> {
     }
 }
 
-/// Takes what lies along an orthonormal basis out of a column of the same length. O(k m).
+/// Remove the components along an orthonormal basis from a column of equal length. O(k m).
 pub fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
-    widest(Projection { basis, column, times: 1 });
+    dispatch_simd(Projection { basis, column, times: 1 });
 }
 
-/// Adds a column to an orthonormal basis unless less than this share of it lies outside the span. O(k m).
+/// Add a column to an orthonormal basis unless its relative distance from the span is below `share`. O(k m).
 pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
     let whole = norm(&column);
-    // Twice is enough (Kahan, Parlett).
-    widest(Projection { basis, column: &mut column, times: 2 });
+    // Two passes are enough (Kahan, Parlett).
+    dispatch_simd(Projection { basis, column: &mut column, times: 2 });
     let left = norm(&column);
     if left > share * whole && left.is_finite() {
         column.iter_mut().for_each(|v| *v /= left);
@@ -122,11 +123,11 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
     }
 }
 
-/// Orthonormal directions of which less than this share of any of the columns is left over. O(k² m), on the threads of the
-/// pool at hand.
+/// Orthonormal basis from which every column has a relative distance of at most `share`.
 ///
-/// The column that is farthest from the directions before it comes next: what rounding does to columns is divided by the
-/// share once, not once a column. A column of noughts has no direction, nor has one whose squares are no numbers.
+/// O(k² m) on the threads of the current pool. Pivoting: the column farthest from the basis comes next, so that
+/// rounding errors are amplified once by 1/`share`, not once a column. Zero columns and columns whose squared norm
+/// overflows are skipped.
 ///
 /// # Errors
 /// [`crate::error::Error::Interrupted`].
@@ -146,7 +147,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
             return Ok(basis);
         };
         let (_, mut direction) = waiting.remove(next);
-        // Twice is enough (Kahan, Parlett).
+        // Two passes are enough (Kahan, Parlett).
         for before in basis.chunks(AT_ONCE) {
             stop.check()?;
             project_out(before, &mut direction);
@@ -156,7 +157,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
         basis.push(direction);
         let last = &basis[basis.len() - 1..];
         let without = |(): &mut (), (left, mut column): (f64, Vec<f64>)| {
-            // What is half done once it was told to stop is thrown away.
+            // A column that is half processed after cancellation is discarded.
             if stop.is_set() {
                 return (left, column);
             }
@@ -179,8 +180,8 @@ impl Kernel for Norm<'_> {
     }
 }
 
-/// Euclidean length of a column whose squares are numbers.
+/// Euclidean norm of a column whose squares do not overflow.
 #[must_use]
 pub fn norm(column: &[f64]) -> f64 {
-    widest(Norm(column))
+    dispatch_simd(Norm(column))
 }

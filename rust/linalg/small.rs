@@ -1,18 +1,18 @@
-//! Fixed-size solves and the recursions of the estimators; the only user of `nalgebra`.
+//! Small dense systems: inverses, LU, batched LDLᵀ solves, recursive least squares. The only user of `nalgebra`.
 
 use nalgebra::{DMatrix, DVector, Dyn, FullPivLU};
 
 use crate::error::{check_length, Error, Result};
 use crate::simd::Lanes;
 
-/// A pivot of a correlation matrix below this marks a regressor that rounding cannot tell from the others:
-/// the Gram matrix of m = 2048 products carries about 1e−13.
+/// Pivot of a correlation matrix below which a regressor is linearly dependent within rounding. The Gram matrix of m =
+/// 2048 products has errors of about 1e−13.
 pub const PIVOT_FLOOR: f64 = 1e-13;
 
-/// Row-major inverse of a row-major n × n matrix.
+/// Inverse of a row-major n × n matrix, row-major.
 ///
 /// # Errors
-/// [`Error::LeadingZero`] with the determinant where it is singular, [`Error::Length`].
+/// [`Error::LeadingZero`] with the determinant of a singular matrix, [`Error::Length`].
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -38,29 +38,29 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
     }
 }
 
-/// A square matrix whose rows and columns may differ in scale by any factor, ready to be solved with.
-pub struct Scaled {
+/// LU factorization of an equilibrated square matrix, whose rows and columns may differ in scale by any factor.
+pub struct EquilibratedLu {
     /// Largest element of each row, then of each column.
     rows: Vec<f64>,
     columns: Vec<f64>,
-    /// None of a matrix without rows.
+    /// None for a matrix without rows.
     factor: Option<FullPivLU<f64, Dyn, Dyn>>,
 }
 
-impl Scaled {
-    /// Of a row-major k × k matrix.
+impl EquilibratedLu {
+    /// Factorization of a row-major k × k matrix.
     ///
     /// # Errors
-    /// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
+    /// [`Error::Singular`] for a matrix that is singular within rounding, [`Error::Length`].
     ///
     /// ```
-    /// let solved = ftlm::linalg::small::Scaled::new(&[2.0, 0.0, 0.0, 0.25], 2)?.solve(&[1.0, 1.0]);
+    /// let solved = ftlm::linalg::small::EquilibratedLu::new(&[2.0, 0.0, 0.0, 0.25], 2)?.solve(&[1.0, 1.0]);
     /// assert_eq!(solved, [0.5, 4.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn new(matrix: &[f64], k: usize) -> Result<Self> {
         check_length("matrix", k * k, matrix.len())?;
-        // Rows, then columns, to unit largest element: what is then nearly singular is so whatever the units.
+        // Scale rows, then columns, to unit largest element. Near singularity then does not depend on units.
         let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
         let mut a = DMatrix::from_row_slice(k, k, matrix);
         let rows: Vec<f64> = (0..k).map(|i| largest(&mut a.row(i).iter().copied())).collect();
@@ -83,7 +83,7 @@ impl Scaled {
         Ok(Self { rows, columns, factor })
     }
 
-    /// The solution of a system with this right-hand side, one value a row.
+    /// Solution for this right-hand side, one value a row.
     #[must_use]
     pub fn solve(&self, rhs: &[f64]) -> Vec<f64> {
         let mut x = DVector::from_iterator(rhs.len(), rhs.iter().zip(&self.rows).map(|(v, scale)| v / scale));
@@ -93,7 +93,7 @@ impl Scaled {
         x.iter().zip(&self.columns).map(|(v, scale)| v / scale).collect()
     }
 
-    /// The inverse, row-major.
+    /// Inverse, row-major.
     #[must_use]
     pub fn inverse(&self) -> Vec<f64> {
         let k = self.rows.len();
@@ -107,36 +107,36 @@ impl Scaled {
     }
 }
 
-/// Row-major inverse of a row-major k × k matrix whose rows and columns may differ in scale by any factor.
+/// Inverse of a row-major k × k matrix whose rows and columns may differ in scale by any factor.
 ///
 /// # Errors
-/// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
+/// [`Error::Singular`] for a matrix that is singular within rounding, [`Error::Length`].
 ///
 /// ```
 /// assert_eq!(ftlm::linalg::small::scaled_inverse(&[2.0, 0.0, 0.0, 0.25], 2), Ok(vec![0.5, 0.0, 0.0, 4.0]));
-/// // Of nothing, nothing.
+/// // The inverse of an empty matrix is empty.
 /// assert_eq!(ftlm::linalg::small::scaled_inverse(&[], 0), Ok(vec![]));
 /// ```
 pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
-    Ok(Scaled::new(matrix, k)?.inverse())
+    Ok(EquilibratedLu::new(matrix, k)?.inverse())
 }
 
-/// Position of element (i, j), j ≤ i, of a symmetric matrix kept by its lower rows.
+/// Index of element (i, j), j ≤ i, of a symmetric matrix stored by its lower rows.
 #[inline(always)]
 #[must_use]
-pub const fn packed(i: usize, j: usize) -> usize {
+pub const fn packed_index(i: usize, j: usize) -> usize {
     i * (i + 1) / 2 + j
 }
 
-/// Solves L symmetric positive systems of k unknowns side by side, in place, by the factor L D Lᵀ.
+/// Solve L symmetric positive definite systems of k unknowns side by side, in place, by L D Lᵀ.
 ///
-/// `gram` holds the lower rows ([`packed`]) of correlation matrices: their diagonals are 1, or 0 for a column that is
-/// not there. `rhs` is overwritten with the solutions. The first `needed` unknowns must be independent: the returned
-/// flags say where they are not. Later ones that are combinations of those before them are dropped: their unknown is 0.
-/// O(k³). The operations of a lane do not depend on the others, nor on L.
+/// `gram` has the lower rows ([`packed_index`]) of correlation matrices. Their diagonals are 1, or 0 for an absent
+/// column. `rhs` is overwritten with the solutions. The first `needed` unknowns must be independent; the returned flags
+/// mark the lanes in which they are not. Later dependent unknowns are set to 0. O(k³). The operations of a lane depend
+/// neither on other lanes nor on L.
 #[inline(always)]
 pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
-    // The usual sizes get loops of known length.
+    // Common sizes get loops of constant length.
     match rhs.len() {
         1 => solve_sized(1, gram, rhs, needed),
         2 => solve_sized(2, gram, rhs, needed),
@@ -149,24 +149,24 @@ pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], 
 
 #[inline(always)]
 fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
-    let (gram, rhs) = (&mut gram[..packed(k, 0)], &mut rhs[..k]);
+    let (gram, rhs) = (&mut gram[..packed_index(k, 0)], &mut rhs[..k]);
     let mut singular = [false; L];
     for i in 0..k {
-        let mut pivot = gram[packed(i, i)];
+        let mut pivot = gram[packed_index(i, i)];
         for j in 0..i {
             // Row i of L D, then of L.
-            let mut sum = gram[packed(i, j)];
+            let mut sum = gram[packed_index(i, j)];
             for l in 0..j {
-                let (a, b) = (gram[packed(i, l)], gram[packed(j, l)]);
+                let (a, b) = (gram[packed_index(i, l)], gram[packed_index(j, l)]);
                 for n in 0..L {
                     sum[n] -= a[n] * b[n];
                 }
             }
-            gram[packed(i, j)] = sum;
+            gram[packed_index(i, j)] = sum;
         }
         for j in 0..i {
-            let (u, inverse) = (gram[packed(i, j)], gram[packed(j, j)]);
-            let row = &mut gram[packed(i, j)];
+            let (u, inverse) = (gram[packed_index(i, j)], gram[packed_index(j, j)]);
+            let row = &mut gram[packed_index(i, j)];
             for n in 0..L {
                 row[n] = u[n] * inverse[n];
                 pivot[n] -= u[n] * row[n];
@@ -180,10 +180,10 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
             all &= fits;
             singular[n] |= !fits && i < needed;
         }
-        gram[packed(i, i)] = inverse;
+        gram[packed_index(i, i)] = inverse;
         let mut value = rhs[i];
         for j in 0..i {
-            let (row, z) = (gram[packed(i, j)], rhs[j]);
+            let (row, z) = (gram[packed_index(i, j)], rhs[j]);
             for n in 0..L {
                 value[n] -= row[n] * z[n];
             }
@@ -191,7 +191,7 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
         rhs[i] = value;
         if !all {
             for n in (0..L).filter(|&n| inverse[n] == 0.0) {
-                (0..i).for_each(|j| gram[packed(i, j)][n] = 0.0);
+                (0..i).for_each(|j| gram[packed_index(i, j)][n] = 0.0);
                 rhs[i][n] = 0.0;
             }
         }
@@ -199,10 +199,10 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
     for i in (0..k).rev() {
         let mut value = rhs[i];
         for n in 0..L {
-            value[n] *= gram[packed(i, i)][n];
+            value[n] *= gram[packed_index(i, i)][n];
         }
         for j in i + 1..k {
-            let (row, x) = (gram[packed(j, i)], rhs[j]);
+            let (row, x) = (gram[packed_index(j, i)], rhs[j]);
             for n in 0..L {
                 value[n] -= row[n] * x[n];
             }
@@ -212,7 +212,7 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
     singular
 }
 
-/// Solution of a small symmetric row-major system; none where it is not positive definite. O(k³).
+/// Solution of a small symmetric row-major system. None if it is not positive definite. O(k³).
 #[must_use]
 pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     let k = rhs.len();
@@ -220,7 +220,7 @@ pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     Some(solved.iter().copied().collect())
 }
 
-/// Solves `R x = c` for upper-triangular row-major R (k × k with row stride `stride`).
+/// Solve `R x = c` for upper-triangular row-major R, k × k with row stride `stride`.
 #[must_use]
 pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
     let k = rhs.len();
@@ -234,7 +234,7 @@ pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
     x
 }
 
-/// The state of recursion (44): the coefficients and the inverse covariance.
+/// State of recursion (44): coefficients and inverse covariance.
 #[derive(Debug, Clone)]
 pub struct Recursion {
     coefficients: DVector<f64>,
@@ -242,7 +242,7 @@ pub struct Recursion {
 }
 
 impl Recursion {
-    /// Starts at coefficients `start` with covariance `prior`·I.
+    /// Recursion from coefficients `start` with covariance `prior`·I.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a prior that is not positive and finite.
@@ -262,7 +262,7 @@ impl Recursion {
         })
     }
 
-    /// One step of (44): the innovation of these rows (newest first or not: the sum does not know).
+    /// One update of (44) with the innovation of these rows, in any order.
     ///
     /// # Errors
     /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for a row of another length.

@@ -1,34 +1,36 @@
-//! The candidates of a lattice by index: which columns each one names, from tables, so that none costs a look-up.
+//! Candidate index of an order grid: from the number of a candidate to its regressor columns.
+//!
+//! Tables replace a look-up per candidate.
 
 use std::borrow::Cow;
 
 use crate::equation::Initial;
 use crate::error::{check_length, Result};
-use crate::order_search::candidate::columns::Needed;
+use crate::order_search::candidate::columns::RequiredRegressors;
 use crate::order_search::candidate::problem::Problem;
 use crate::order_search::dual_bound::lower_bound::Bound;
-use crate::order_search::grid::independent::Lattice;
+use crate::order_search::grid::independent::OrderGrid;
 use crate::order_search::grid::traversal::Cursor;
 use crate::order_search::options::{Budget, Options};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
-/// All candidates of a lattice over one equation, and what they share.
-pub(crate) struct Catalogue<'a> {
+/// All candidates of an order grid for one equation, with the data they share.
+pub(crate) struct CandidateIndex<'a> {
     pub(crate) problem: Problem,
-    pub(crate) lattice: Cow<'a, Lattice>,
+    pub(crate) lattice: Cow<'a, OrderGrid>,
     pub(crate) options: Options,
-    /// What is left of the memory limit [bytes].
-    pub(crate) spare: u64,
-    /// Column of each value of each term, per block of the lattice.
+    /// Memory that remains of the limit [bytes].
+    pub(crate) spare_bytes: u64,
+    /// Column of each value of each term, per block of the order grid.
     tables: Vec<Vec<Vec<usize>>>,
 }
 
-impl<'a> Catalogue<'a> {
-    /// Builds regressors, their products and test vectors for all candidates.
+impl<'a> CandidateIndex<'a> {
+    /// Build regressors, their products and test vectors for all candidates.
     pub(crate) fn new(
         records: &[Record],
-        lattice: Cow<'a, Lattice>,
+        lattice: Cow<'a, OrderGrid>,
         fixed: &[Option<f64>],
         options: &Options,
         pool: &rayon::ThreadPool,
@@ -38,43 +40,43 @@ impl<'a> Catalogue<'a> {
         for record in records {
             lattice.structure(0).check(record.len(), |_| true)?;
         }
-        let mut needed = Needed::new(&options.initial);
+        let mut needed = RequiredRegressors::new(&options.initial);
         for block in lattice.blocks() {
-            needed.alpha(block.alpha);
-            for (group, slice) in lattice.groups().iter().zip(&block.slices) {
+            needed.add_alpha(block.alpha);
+            for (group, slice) in lattice.groups().iter().zip(&block.tuples) {
                 for (axis, &first) in group.axes.iter().zip(&slice.first) {
-                    axis[first..].iter().for_each(|&order| needed.term(block.alpha, group.signal, order));
+                    axis[first..].iter().for_each(|&order| needed.add_term(block.alpha, group.signal, order));
                 }
             }
         }
-        let (output, index, mut budget) = (lattice.output(), needed.index(), Budget::default());
-        budget.add(records, output, &index, options, Bound::POOL);
+        let (output, index, mut budget) = (lattice.output(), needed.into_index(), Budget::default());
+        budget.add(records, output, &index, options, Bound::MAX_TEST_VECTORS);
         budget.check(options.memory)?;
-        let spare = budget.left(options.memory);
+        let spare = budget.remaining_bytes(options.memory);
         let problem = pool.install(|| {
             Ok(Problem::new(records, output, index, fixed, options, stop)?.with_bound(lattice.count(), stop))
         })?;
         stop.check()?;
         let tables = tables(&lattice, &problem)?;
-        Ok(Self { problem, lattice, options: options.clone(), spare, tables })
+        Ok(Self { problem, lattice, options: options.clone(), spare_bytes: spare, tables })
     }
 
-    /// Columns of the terms where a walk stands.
+    /// Columns of the terms at a cursor.
     pub(crate) fn positions(&self, cursor: &Cursor<'_>, positions: &mut [usize]) {
         let table = &self.tables[cursor.block()];
         cursor.each(0, |term, digit| positions[term] = table[term][digit]);
     }
 
-    /// Columns of the initial terms where a walk stands.
+    /// Columns of the initial terms at a cursor.
     pub(crate) fn initial(&self, cursor: &Cursor<'_>, initial: &mut Vec<usize>) {
         if self.options.initial != Initial::Rest {
             self.problem.initial_positions(&cursor.structure(), initial);
         }
     }
 
-    /// Columns of the values of one term in the block where a walk stands.
+    /// Columns of the values of one term in the cursor's block.
     #[inline(always)]
-    pub(crate) fn of_term(&self, cursor: &Cursor<'_>, term: usize) -> &[usize] {
+    pub(crate) fn term_columns(&self, cursor: &Cursor<'_>, term: usize) -> &[usize] {
         &self.tables[cursor.block()][term]
     }
 
@@ -83,7 +85,7 @@ impl<'a> Catalogue<'a> {
         &self.tables[block][term]
     }
 
-    /// Goes to the next candidate and its columns.
+    /// Advance to the next candidate and update its columns.
     #[inline(always)]
     pub(crate) fn next(&self, cursor: &mut Cursor<'_>, terms: &mut [usize]) {
         let changed = cursor.advance();
@@ -92,20 +94,20 @@ impl<'a> Catalogue<'a> {
     }
 }
 
-/// The column of every value of every term, per block, so that a candidate costs no look-up.
-fn tables(lattice: &Lattice, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
+/// Column of every value of every term, per block. The tables save a look-up per candidate.
+fn tables(lattice: &OrderGrid, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
     lattice
         .blocks()
         .iter()
         .map(|block| {
             let mut table = vec![Vec::new(); lattice.width()];
-            for (group, slice) in lattice.groups().iter().zip(&block.slices) {
+            for (group, slice) in lattice.groups().iter().zip(&block.tuples) {
                 for ((&term, axis), &first) in group.terms.iter().zip(&group.axes).zip(&slice.first) {
                     table[term] = axis
                         .iter()
                         .enumerate()
                         .map(|(i, &order)| {
-                            // Values out of this α's range are never asked for.
+                            // Values outside this α's range are never used.
                             if i < first {
                                 Ok(0)
                             } else {

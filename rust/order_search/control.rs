@@ -1,4 +1,4 @@
-//! What a search and its caller share while it runs: stop, progress and checkpoints.
+//! Stop request, progress and checkpoints that a search shares with its caller.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -7,103 +7,104 @@ use crate::error::{Error, Result};
 use crate::order_search::result::Part;
 use crate::parallel::Stop;
 
-/// Shared with the caller while a search runs: any thread may read the counters, stop the search, take its checkpoints.
+/// State shared with the caller during a search. Any thread may read the counters, stop the search and take its
+/// checkpoints.
 #[derive(Debug, Default)]
 pub struct Control {
     /// Set to end the search with [`Error::Interrupted`].
     pub stop: Stop,
-    /// Candidates dealt with so far.
+    /// Number of candidates processed so far.
     pub done: AtomicU64,
-    /// Candidates in all, once known.
+    /// Total number of candidates, once known.
     pub total: AtomicU64,
-    /// Candidates among those done that were left before the end of the record.
+    /// Number of processed candidates whose evaluation ended before the end of the record.
     pub pruned: AtomicU64,
     /// Set by a caller that takes checkpoints.
     pub saving: AtomicBool,
-    /// The latest checkpoint that the caller has not taken yet.
+    /// Latest checkpoint not yet taken by the caller.
     pub checkpoint: Mutex<Option<Checkpoint>>,
 }
 
 impl Control {
-    /// Leaves a checkpoint; rows of one that was not taken are passed on.
+    /// Publish a checkpoint. Rows of a previous one that was not taken are merged into it.
     pub(crate) fn save(&self, mut checkpoint: Checkpoint) {
         let mut slot = self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(missed) = slot.take() {
             checkpoint.part.rows.extend(missed.part.rows);
-            checkpoint.anew |= missed.anew;
+            checkpoint.replaces_previous |= missed.replaces_previous;
         }
         *slot = Some(checkpoint);
     }
 
-    /// Takes the latest checkpoint; none if there is no new one.
-    pub fn take(&self) -> Option<Checkpoint> {
+    /// Take the latest checkpoint, if there is a new one.
+    pub fn take_checkpoint(&self) -> Option<Checkpoint> {
         self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
-    /// Refuses to go on once the caller has asked to stop.
+    /// Return an error once the caller has requested a stop.
     pub(crate) fn check_stop(&self) -> Result<()> {
         self.stop.check()
     }
 
-    pub(crate) fn stopped(&self) -> bool {
+    pub(crate) fn is_stopped(&self) -> bool {
         self.stop.is_set()
     }
 
-    /// Counts candidates as done, and so many of them as left early.
+    /// Count candidates as processed, and some of them as pruned.
     pub(crate) fn count(&self, done: u64, pruned: u64) {
         self.done.fetch_add(done, Ordering::Relaxed);
         self.pruned.fetch_add(pruned, Ordering::Relaxed);
     }
 }
 
-/// Where a stretch of rounds stands.
+/// Position within a range of batches.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Place {
-    /// Number of the round; those of the stretch before it are done.
-    pub round: u64,
-    /// How many of its open candidates have been followed, in order of visiting.
-    pub followed: u64,
-    /// End and length of the batch that this lies in; 0 if the round has not been screened.
+pub struct BatchPosition {
+    /// Number of the batch. Earlier batches of the range are complete.
+    pub batch: u64,
+    /// Number of its open candidates that have been evaluated, in evaluation order.
+    pub evaluated_count: u64,
+    /// End and length of the current chunk of candidates, 0 if the batch has not been screened.
     pub end: u64,
     /// See `end`.
     pub size: u64,
-    /// The limit of that batch.
+    /// Limit of that chunk.
     pub limit: f64,
-    /// Digest of the order in which the round's open candidates are visited, below 2^63; 0 where `end` is.
+    /// Digest of the evaluation order of the batch's open candidates, below 2^63. It is 0 if `end` is 0.
     pub order: u64,
 }
 
-impl Place {
-    /// Before a round.
-    pub(crate) fn start(round: u64) -> Self {
-        Self { round, followed: 0, end: 0, size: 0, limit: f64::INFINITY, order: 0 }
+impl BatchPosition {
+    /// Return the position before a batch.
+    pub(crate) fn start(batch: u64) -> Self {
+        Self { batch, evaluated_count: 0, end: 0, size: 0, limit: f64::INFINITY, order: 0 }
     }
 
-    /// Whether a search may stand here.
-    pub(crate) fn sound(&self) -> bool {
+    /// Whether the position is consistent.
+    pub(crate) fn is_valid(&self) -> bool {
         let begun = self.end == 0 || (self.size > 0 && self.limit >= 0.0);
-        begun && self.followed <= self.end
+        begun && self.evaluated_count <= self.end
     }
 
-    /// Whether this lies before a round, or in one that visits so many open candidates in the order of this digest.
+    /// Whether the position is before a batch, or in one with enough open candidates and this digest.
     pub(crate) fn fits(&self, open: u64, order: u64) -> bool {
         self.end == 0 || (self.end <= open && self.order == order)
     }
 }
 
-/// A stretch of rounds, half done.
+/// Checkpoint within a range of batches.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Checkpoint {
-    /// Where it stands.
-    pub place: Place,
-    /// Whether this is the first one of a stretch that was begun at its start: what was kept of it before does not count.
-    pub anew: bool,
-    /// What it came to so far. A checkpoint that is taken holds only the rows found since the one before; one to go on
-    /// from must hold all of them.
+    /// Position of the checkpoint.
+    pub place: BatchPosition,
+    /// Whether this is the first checkpoint since the range was started. It then replaces any earlier result.
+    pub replaces_previous: bool,
+    /// Partial result so far. A checkpoint that is taken holds only the rows found since the previous one. A checkpoint
+    /// to resume from must hold all rows.
     pub part: Part,
 }
 
-/// The refusal of a checkpoint, a part or a verdict that does not belong to the search at hand.
-pub(crate) fn another(what: String) -> Error {
+/// Error for a checkpoint, partial result or verdict of another search.
+pub(crate) fn mismatch_error(what: String) -> Error {
     Error::Structure { what, remedy: "start the search again".into() }
 }

@@ -1,4 +1,6 @@
-//! Errors of candidates given as points, each with orders and coefficients of its own: what a genetic algorithm asks for.
+//! Output errors of given candidates, each with its own orders and coefficients.
+//!
+//! A genetic algorithm evaluates its population this way.
 
 use std::collections::HashMap;
 
@@ -7,28 +9,28 @@ use rayon::prelude::*;
 use crate::equation::{Structure, Term};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::fractional::kernels::block_pulse_kernel;
-use crate::order_search::candidate::simulation::March;
+use crate::order_search::candidate::simulation::BlockSimulation;
 use crate::order_search::control::Control;
 use crate::order_search::options::Norm;
 use crate::order_search::result::Verdict;
 use crate::parallel::{pool, PerThread};
 use crate::regressors::{Key, Record};
 
-/// Memory for regressors kept from one call to the next; a population that has settled asks for the same ones again.
-const KEPT_BYTES: usize = 256 << 20;
+/// Maximum memory of regressors cached between calls [bytes]. A converged population reuses them.
+const MAX_CACHE_BYTES: usize = 256 << 20;
 
-/// One candidate: an order and a coefficient for each term.
+/// Candidate with an order and a coefficient for each term.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Point {
-    /// Highest order.
+    /// Order of the equation.
     pub order: f64,
     /// Orders of the terms.
     pub orders: Vec<f64>,
-    /// Their coefficients.
+    /// Coefficients of the terms.
     pub coefficients: Vec<f64>,
 }
 
-/// One equation on some records, evaluated at any orders and coefficients, at rest.
+/// Evaluator of one equation at arbitrary orders and coefficients, with zero initial conditions.
 pub struct Points {
     records: Vec<Record>,
     output: usize,
@@ -36,15 +38,15 @@ pub struct Points {
     inputs: Vec<bool>,
     norm: Norm,
     samples: usize,
-    /// Per record: the kernel of an own-output term, the integral of any other signal.
-    kept: HashMap<Key, Vec<Vec<f64>>>,
+    /// Cache by record: the kernel of an own-output term, the integral of any other signal.
+    cache: HashMap<Key, Vec<Vec<f64>>>,
 }
 
 impl Points {
-    /// The equation of `output` with a term on each of `signals`; `inputs` says which signals of the records are inputs.
+    /// Build the equation of `output` with a term on each of `signals`. `inputs` marks the signals that are inputs.
     ///
     /// # Errors
-    /// No record, or a signal that they do not have.
+    /// No record, or a signal that the records lack.
     pub fn new(
         records: Vec<Record>,
         output: usize,
@@ -67,14 +69,14 @@ impl Points {
             check_length("signals of a record", first.len(), record.len())?;
         }
         let samples = records.iter().map(Record::m).sum();
-        Ok(Self { records, output, signals, inputs, norm, samples, kept: HashMap::new() })
+        Ok(Self { records, output, signals, inputs, norm, samples, cache: HashMap::new() })
     }
 
-    /// Error of every candidate's free run, summed over the records: Σ|e|, or RMSE.
+    /// Output error of every candidate, summed over the records: Σ|e|, or RMSE.
     ///
-    /// Infinite for orders that make no equation, for one above that of the output, and for a free run that diverges. A
-    /// candidate whose error exceeds `limit` is left as soon as that is sure and is infinite, too. The same bits for any
-    /// number of threads.
+    /// Infinite for orders that form no equation, for an order above that of the output, and for a simulation that
+    /// diverges. Also infinite for an error above `limit`, whose evaluation stops early. The result is bitwise
+    /// identical for any number of threads.
     ///
     /// # Errors
     /// A candidate of another length, coefficients that are not finite, threads that do not start,
@@ -106,17 +108,17 @@ impl Points {
             let structure = Structure { output: self.output, order: point.order, terms };
             let is_input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
             let fits = structure.check(self.records[0].len(), is_input).is_ok();
-            // What holds between samples has no derivative at its jumps, and a candidate is to be judged as it will run.
+            // The kink correction has no derivative at jumps, and a candidate must be ranked as it will be simulated.
             let smooth = structure.terms.iter().all(|term| term.order <= structure.order);
             structures.push((fits && smooth).then_some(structure));
         }
         let pool = pool(threads)?;
-        self.fetch(&structures, &pool);
+        self.fill_cache(&structures, &pool);
         // Raw sums: Σ|e|, or Σe².
         #[allow(clippy::cast_precision_loss)]
         let samples = self.samples as f64;
         let raw_limit = if self.norm == Norm::L1 { limit } else { limit * limit * samples };
-        let marches = PerThread::<March>::new(&pool);
+        let marches = PerThread::<BlockSimulation>::new(&pool);
         let this = &*self;
         let raw: Vec<f64> = pool.install(|| {
             structures
@@ -136,8 +138,8 @@ impl Points {
         Ok(raw.into_iter().map(|raw| self.norm.score(raw, self.samples)).collect())
     }
 
-    /// Computes the regressors that are not kept yet.
-    fn fetch(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
+    /// Compute the regressors that are not in the cache.
+    fn fill_cache(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
         let each = self.samples * std::mem::size_of::<f64>();
         let mut wanted: Vec<(Key, usize, f64)> = Vec::new();
         for structure in structures.iter().flatten() {
@@ -148,10 +150,10 @@ impl Points {
         }
         wanted.sort_unstable_by_key(|a| a.0);
         wanted.dedup_by(|a, b| a.0 == b.0);
-        if (self.kept.len() + wanted.len()) * each > KEPT_BYTES {
-            self.kept.clear();
+        if (self.cache.len() + wanted.len()) * each > MAX_CACHE_BYTES {
+            self.cache.clear();
         }
-        wanted.retain(|(key, _, _)| !self.kept.contains_key(key));
+        wanted.retain(|(key, _, _)| !self.cache.contains_key(key));
         let (records, output) = (&self.records, self.output);
         let made: Vec<Vec<Vec<f64>>> = pool.install(|| {
             wanted
@@ -170,16 +172,16 @@ impl Points {
                 })
                 .collect()
         });
-        self.kept.extend(wanted.into_iter().map(|(key, _, _)| key).zip(made));
+        self.cache.extend(wanted.into_iter().map(|(key, _, _)| key).zip(made));
     }
 
-    /// Raw error of a candidate on all records, or none where it passes the limit or its free run diverges.
+    /// Raw error of a candidate on all records. `None` above the limit, or if the simulation diverges.
     fn error(
         &self,
         structure: &Structure,
         coefficients: &[f64],
         limit: f64,
-        march: &mut March,
+        march: &mut BlockSimulation,
         control: &Control,
     ) -> Option<f64> {
         let mut sum = 0.0;
@@ -187,14 +189,14 @@ impl Points {
             let columns: Vec<(bool, &[f64], f64)> = (0..structure.terms.len())
                 .filter_map(|k| {
                     let signal = structure.terms[k].signal;
-                    let kept = self.kept.get(&Key::integral(signal, structure.integration(k)))?;
+                    let kept = self.cache.get(&Key::integral(signal, structure.integration(k)))?;
                     Some((signal == self.output, &kept[r][..], coefficients[k]))
                 })
                 .collect();
             let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));
             let target = record.signal(self.output);
-            match march.run(target, side(true), side(false), self.norm, sum, limit, control) {
-                // A limit that is not a number is passed by all.
+            match march.accumulate_error(target, side(true), side(false), self.norm, sum, limit, control) {
+                // A NaN limit excludes all.
                 Verdict::Score(raw) if raw <= limit => sum = raw,
                 _ => return None,
             }
@@ -203,10 +205,10 @@ impl Points {
     }
 }
 
-/// Error (45) of one candidate on one record by the naive division: the oracle of [`Points::scores`]. O(m²).
+/// L1 output error of one candidate on one record by naive division: the oracle of [`Points::scores`]. O(m²).
 ///
 /// # Panics
-/// Where the record does not hold a signal.
+/// If the record lacks a signal.
 #[cfg(feature = "oracles")]
 #[must_use]
 pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Point) -> f64 {

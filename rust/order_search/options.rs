@@ -1,11 +1,9 @@
-//! What a search is asked for: which error ranks the candidates, how it is summed, where coefficients come from.
+//! Options of an order search: criterion, norm, estimator, pruning and memory budget.
 //!
-//! What a search will hold at once, counted before any of it is made, and the one limit that it keeps to.
-//!
-//! Counted is what grows with records and lattice: columns, kernels, their products, spectra and test vectors of every
-//! equation and record, rows of the layout of an order law; tables of boxes and vectors made for candidates take of what is
-//! left, or there are none. Not counted are the records themselves, and what each thread needs for one candidate: some
-//! vectors of the record's length.
+//! The budget counts memory that grows with records and order grid: columns, kernels, their products, spectra and
+//! test vectors of every equation and record, and the rows of the layout of an order law. Tables of boxes and
+//! tailored test vectors use the remaining memory, or are not built. The records themselves and the workspace of each
+//! thread, some vectors of the record's length, are not counted.
 
 use crate::equation::Initial;
 use crate::error::{check_finite, Error, Result};
@@ -14,26 +12,26 @@ use crate::estimation::multi_innovation::Innovation;
 use crate::fft::{fast_length, Bin};
 use crate::regressors::{Bank, Index, Record, BANK_LIMIT};
 
-/// Which error ranks the candidates.
+/// Error that ranks the candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Criterion {
-    /// e = y − ŷ, ŷ the free run.
+    /// Output error e = y − ŷ, ŷ the simulated output.
     OutputError,
-    /// ε = y − Σ c I^{α−ν} s, measured signals on the right-hand side.
+    /// Equation error ε = y − Σ c I^{α−ν} s, with measured signals on the right-hand side.
     EquationError,
 }
 
-/// How an error becomes a number.
+/// Norm of an error over all samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Norm {
-    /// Σ|e| (paper (45)).
+    /// Σ|e| (equation (45) of the paper).
     L1,
-    /// √(Σe²/M) (paper (46)).
+    /// √(Σe²/M) (equation (46) of the paper).
     L2,
 }
 
 impl Norm {
-    /// Adds |e| or e² of a block to a raw sum.
+    /// Add |e| or e² of a block to a raw sum.
     #[inline]
     pub(crate) fn add(self, raw: f64, measured: &[f64], response: &[f64]) -> f64 {
         let pairs = measured.iter().zip(response);
@@ -43,7 +41,7 @@ impl Norm {
         }
     }
 
-    /// A raw sum (Σ|e| or Σe²) over so many samples as the number that this norm gives.
+    /// Score of a raw sum (Σ|e| or Σe²) over this many samples.
     ///
     /// ```
     /// # use ftlm::order_search::options::Norm;
@@ -59,39 +57,38 @@ impl Norm {
     }
 }
 
-/// How a candidate gets its coefficients.
+/// Estimator of a candidate's coefficients.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Estimator {
     /// Least squares on the equation error.
     LeastSquares,
     /// Multi-innovation least squares in closed form.
     MultiInnovation(Innovation),
-    /// Refined instrumental variables from the records' clean signals ([`crate::regressors::Record::with_clean`]).
+    /// Instrumental variables, refined from the records' noise-free signals.
     InstrumentalVariables(Settings),
 }
 
-/// The settings of a search.
+/// Options of an order search.
 ///
-/// By default the output error in the norm of (45) ranks, coefficients are least squares', records start at rest, twenty
-/// rows are kept and one thread is used.
+/// Defaults: output error in the L1 norm, least-squares coefficients, zero initial conditions, 20 rows, one thread.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Which error ranks.
+    /// Error that ranks the candidates.
     pub criterion: Criterion,
-    /// How it is summed.
+    /// Norm of the error.
     pub norm: Norm,
-    /// Where coefficients come from.
+    /// Estimator of the coefficients.
     pub estimator: Estimator,
     /// Initial terms of each record.
     pub initial: Initial,
-    /// How many rows to keep, at least one.
-    pub keep: usize,
-    /// Threads, 1 to [`crate::parallel::MAX_THREADS`]; any number gives the same bits.
+    /// Number of rows in the table, at least one.
+    pub top: usize,
+    /// Number of threads, 1 to `MAX_THREADS`. The result is bitwise identical for any number.
     pub threads: usize,
-    /// Whether to leave a candidate as soon as it cannot be kept, by bound or partial sum; `false` is brute force, the
-    /// oracle.
-    pub early_stopping: bool,
-    /// Bytes that regressors, their products, test vectors and the layout of an order law may take together.
+    /// Whether to stop evaluating a candidate once its bound or partial sum excludes it. `false` evaluates all
+    /// candidates completely and serves as oracle.
+    pub pruning: bool,
+    /// Memory of regressors, their products, test vectors and the layout of an order law \[bytes\].
     pub memory: u64,
 }
 
@@ -102,28 +99,28 @@ impl Default for Options {
             norm: Norm::L1,
             estimator: Estimator::LeastSquares,
             initial: Initial::Rest,
-            keep: 20,
+            top: 20,
             threads: 1,
-            early_stopping: true,
+            pruning: true,
             memory: BANK_LIMIT,
         }
     }
 }
 
 impl Options {
-    /// Refuses settings with which no search can begin.
+    /// Raise an error if no search is possible with these options.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for no row to keep, for an estimator's settings and for an exponent of an initial term;
-    /// [`Error::NotFinite`] for exponents that are no numbers.
+    /// [`Error::OutOfRange`] for an empty table, an estimator's settings or the exponent of an initial term.
+    /// [`Error::NotFinite`] for exponents that are not finite.
     ///
     /// ```
     /// # use ftlm::order_search::options::Options;
     /// assert!(Options::default().check().is_ok());
-    /// assert!(Options { keep: 0, ..Options::default() }.check().is_err());
+    /// assert!(Options { top: 0, ..Options::default() }.check().is_err());
     /// ```
     pub fn check(&self) -> Result<()> {
-        if self.keep == 0 {
+        if self.top == 0 {
             return Err(out_of_range("keep", 0.0, "[1, ∞)", "keep at least one row"));
         }
         match self.estimator {
@@ -147,12 +144,12 @@ impl Options {
         Ok(())
     }
 
-    /// Whether coefficients are refined, one candidate at a time, after a first estimate.
+    /// Whether coefficients are refined individually after an initial estimate.
     pub(crate) fn refines(&self) -> bool {
         matches!(self.estimator, Estimator::InstrumentalVariables(_))
     }
 
-    /// How many times another a row may weigh in the equations that give the coefficients.
+    /// Largest relative weight of a row in the normal equations of the coefficients.
     pub(crate) fn weights(&self) -> usize {
         match self.estimator {
             Estimator::MultiInnovation(innovation) => innovation.length,
@@ -160,17 +157,18 @@ impl Options {
         }
     }
 
-    /// Whether candidates are ranked by free runs at rest with coefficients by least squares.
-    pub(crate) fn scored_by_free_runs(&self) -> bool {
-        self.early_stopping
+    /// Whether candidates are ranked by simulation with zero initial conditions and least-squares coefficients.
+    pub(crate) fn ranks_by_simulation(&self) -> bool {
+        self.pruning
             && self.estimator == Estimator::LeastSquares
             && self.criterion == Criterion::OutputError
             && self.initial == Initial::Rest
     }
 
-    /// Whether a candidate's score follows from the Gram matrix alone: the squared equation error at rest.
-    pub(crate) fn scored_by_products(&self) -> bool {
-        self.early_stopping
+    /// Whether a candidate's score follows from the Gram matrix alone. This is the squared equation error with zero
+    /// initial conditions.
+    pub(crate) fn ranks_by_gram_matrix(&self) -> bool {
+        self.pruning
             && !self.refines()
             && self.criterion == Criterion::EquationError
             && self.norm == Norm::L2
@@ -182,9 +180,9 @@ fn out_of_range(name: &str, value: f64, range: &str, remedy: &str) -> Error {
     Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() }
 }
 
-const VALUE: u128 = size_of::<f64>() as u128;
+const BYTES_PER_VALUE: u128 = size_of::<f64>() as u128;
 
-/// What was asked for, summed up.
+/// Sum of the memory needed.
 #[derive(Debug, Default)]
 pub(crate) struct Budget {
     bytes: u128,
@@ -193,53 +191,54 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// Rows of a layout, in bytes.
+    /// Add the rows of a layout [bytes].
     pub(crate) fn add_layout(&mut self, bytes: u128) {
         self.layout += bytes;
         self.bytes += bytes;
     }
 
-    /// What the candidates of one equation share; `vectors` test vectors at most.
+    /// Add the data shared by the candidates of one equation, with at most `vectors` test vectors.
     pub(crate) fn add(&mut self, records: &[Record], output: usize, index: &Index, options: &Options, vectors: usize) {
         let width = index.keys().len() as u128;
         let own = Bank::own(index, output) as u128;
         let refined = options.refines();
-        let bounded = options.early_stopping && !options.scored_by_products() && vectors > 0;
+        let bounded = options.pruning && !options.ranks_by_gram_matrix() && vectors > 0;
         let mut largest = 0;
         for record in records {
             let m = record.m();
-            let bank = VALUE * m as u128 * (width + own);
+            let bank = BYTES_PER_VALUE * m as u128 * (width + own);
             largest = bank.max(largest);
-            // The target beside it.
-            self.bytes += bank + VALUE * m as u128;
+            // Add the target.
+            self.bytes += bank + BYTES_PER_VALUE * m as u128;
             if refined {
                 let spectrum = (size_of::<Bin>() * (fast_length(2 * m) / 2 + 1)) as u128;
                 self.bytes += spectrum * (width + own + 1);
-                // D e = w holds for integrals of the output as it was measured: another bank.
+                // D e = w holds for integrals of the measured output, which need another bank.
                 if bounded && options.criterion == Criterion::OutputError {
                     self.bytes += bank;
                 }
             }
             if bounded {
-                // Real and imaginary part with every column and the target, once as they come and once as they are kept;
-                // four numbers an own column; the vectors.
+                // Real and imaginary parts with every column and the target, before and after regrouping, four numbers
+                // per own column, and the vectors.
                 let vectors = vectors as u128;
-                self.bytes += VALUE * vectors * (4 * (width + 1) + 4 * own + 2 * m as u128);
+                self.bytes += BYTES_PER_VALUE * vectors * (4 * (width + 1) + 4 * own + 2 * m as u128);
             }
         }
-        // Products of all columns and the target: of each record at rest apart, of all, as they are summed.
-        let products = VALUE * (3 + records.len() as u128) * (width + 1).pow(2);
-        // Of the banks behind which the first coefficients are estimated there is one at a time.
+        // Products of all columns and the target: per record for the initial terms, summed over records, and
+        // temporaries.
+        let products = BYTES_PER_VALUE * (3 + records.len() as u128) * (width + 1).pow(2);
+        // Only one bank for initial coefficients exists at a time.
         self.bytes += products + if refined { largest } else { 0 };
         self.columns += index.keys().len();
     }
 
-    /// Bytes that are left of a limit.
-    pub(crate) fn left(&self, limit: u64) -> u64 {
+    /// Memory that remains of a limit [bytes].
+    pub(crate) fn remaining_bytes(&self, limit: u64) -> u64 {
         u128::from(limit).saturating_sub(self.bytes).try_into().unwrap_or(u64::MAX)
     }
 
-    /// Refuses what does not fit.
+    /// Raise an error if the memory exceeds the limit.
     ///
     /// # Errors
     /// [`Error::Memory`].
@@ -261,10 +260,10 @@ mod tests {
     #[test]
     fn what_is_left_of_a_limit_is_never_below_nothing() {
         let mut budget = Budget::default();
-        assert_eq!(budget.left(u64::MAX), u64::MAX);
+        assert_eq!(budget.remaining_bytes(u64::MAX), u64::MAX);
         budget.add_layout(1000);
-        assert_eq!([999, 1000, 1500].map(|limit| budget.left(limit)), [0, 0, 500]);
+        assert_eq!([999, 1000, 1500].map(|limit| budget.remaining_bytes(limit)), [0, 0, 500]);
         budget.add_layout(u128::from(u64::MAX));
-        assert_eq!(budget.left(u64::MAX), 0);
+        assert_eq!(budget.remaining_bytes(u64::MAX), 0);
     }
 }

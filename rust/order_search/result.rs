@@ -1,90 +1,91 @@
-//! What candidates come to: verdicts, kept rows, counts of what became of all, and the table that they make.
+//! Verdicts of candidates, rows of the result table, and counts of candidates by outcome.
 
 use crate::order_search::options::Norm;
 
-/// Failures listed one by one; the rest are only counted.
-pub(crate) const LISTED: usize = 100;
+/// Maximum failures listed individually. The others are only counted.
+pub(crate) const MAX_LISTED_FAILURES: usize = 100;
 
-/// Why a candidate has no score.
+/// Reason why a candidate has no score.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Failure {
     /// Its regressors are linearly dependent to working precision.
     Singular,
-    /// Its free run left the range of floating point.
+    /// Its simulated output overflows.
     Diverged,
 }
 
-/// What one candidate came to, in raw sums (Σ|e| or Σe²).
+/// Outcome of one candidate, in raw sums (Σ|e| or Σe²).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Verdict {
-    /// Run to the end.
+    /// Score of a complete evaluation.
     Score(f64),
-    /// Not run: this lower bound is above the limit.
+    /// Lower bound above the limit, without simulation.
     Bounded(f64),
-    /// Left at this partial sum, above the limit.
+    /// Early stop at this partial sum, above the limit.
     Stopped(f64),
-    /// It has no score.
+    /// No score.
     Failed(Failure),
 }
 
-/// One kept candidate.
+/// Row of the result table.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Row {
-    /// Index in the lattice.
+    /// Index in the order grid.
     pub index: u64,
-    /// Score in the norm asked for, summed over records.
+    /// Score in the selected norm, summed over records.
     pub score: f64,
-    /// One coefficient a term.
+    /// One coefficient per term.
     pub coefficients: Vec<f64>,
     /// Coefficients of the initial terms, per record, in the order of the structure's exponents.
     pub initial: Vec<Vec<f64>>,
 }
 
-/// What became of the candidates: `kept + beaten + bounded + stopped + singular + diverged = candidates`.
+/// Number of candidates by outcome. The outcomes add up to `candidates`; `excluded_by_box` is part of
+/// `excluded_by_bound`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counts {
-    /// All.
+    /// Total number of candidates.
     pub candidates: u64,
-    /// In the table.
+    /// Number of candidates in the table.
     pub kept: u64,
-    /// Evaluated to the end and not kept.
+    /// Number of complete evaluations that did not enter the table.
     pub beaten: u64,
-    /// Excluded by a lower bound of their score, without a run.
-    pub bounded: u64,
-    /// Of these, those that no bound of their own was asked for: their whole box was excluded.
-    pub boxed: u64,
-    /// Left before the end because their partial sum could no longer be kept.
+    /// Number of candidates excluded by a lower bound, without simulation.
+    pub excluded_by_bound: u64,
+    /// Number of candidates excluded together with their whole box, without a bound of their own.
+    pub excluded_by_box: u64,
+    /// Number of evaluations stopped early because their partial sum exceeded the limit.
     pub stopped: u64,
-    /// Without coefficients.
+    /// Number of candidates with linearly dependent regressors.
     pub singular: u64,
-    /// Without a finite response.
+    /// Number of candidates without a finite simulated output.
     pub diverged: u64,
 }
 
 /// The result of a search.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
-    /// Kept rows, best first, ties by index.
+    /// Best rows in ascending order of the score, ties by index.
     pub rows: Vec<Row>,
-    /// What became of all.
+    /// Number of candidates by outcome.
     pub counts: Counts,
-    /// The first failures by index, at most 100.
+    /// First failures by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
 }
 
-/// What some rounds came to.
+/// Partial result of some batches.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Part {
-    /// Their best rows, as many as are kept; scores are raw sums (Σ|e| or Σe²).
+    /// Best rows of the batches, at most as many as the table holds. Scores are raw sums (Σ|e| or Σe²).
     pub rows: Vec<Row>,
-    /// What became of their candidates. None is kept yet: the rows count as beaten.
+    /// Number of candidates by outcome. Rows count as `beaten` until the search is complete.
     pub counts: Counts,
-    /// Their first failures by index, at most 100.
+    /// First failures by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
 }
 
 impl Part {
-    /// Takes in what other rounds came to; of all rows the best `keep` stay.
+    /// Merge the result of other batches. The best `keep` rows of all remain.
     ///
     /// ```
     /// # use ftlm::order_search::options::Norm;
@@ -104,16 +105,16 @@ impl Part {
         self.counts.add(&other.counts);
         self.failures.extend(other.failures);
         self.failures.sort_unstable();
-        self.failures.truncate(LISTED);
+        self.failures.truncate(MAX_LISTED_FAILURES);
     }
 
-    /// Index and raw score of each row: what later rounds need to know.
+    /// Index and raw score of each row, as later batches need them.
     #[must_use]
     pub fn seed(&self) -> Vec<(u64, f64)> {
         self.rows.iter().map(|row| (row.index, row.score)).collect()
     }
 
-    /// The result of a search, from all of its rounds over records of so many samples: raw sums become scores.
+    /// Result of a search from all of its batches over records with this many samples. Raw sums become scores.
     #[must_use]
     pub fn outcome(mut self, norm: Norm, samples: usize) -> Outcome {
         self.counts.kept = self.rows.len() as u64;
@@ -131,8 +132,8 @@ impl Counts {
             (&mut self.candidates, other.candidates),
             (&mut self.kept, other.kept),
             (&mut self.beaten, other.beaten),
-            (&mut self.bounded, other.bounded),
-            (&mut self.boxed, other.boxed),
+            (&mut self.excluded_by_bound, other.excluded_by_bound),
+            (&mut self.excluded_by_box, other.excluded_by_box),
             (&mut self.stopped, other.stopped),
             (&mut self.singular, other.singular),
             (&mut self.diverged, other.diverged),
@@ -141,10 +142,10 @@ impl Counts {
         }
     }
 
-    /// Candidates dealt with; at the end of a search all.
+    /// Number of candidates with an outcome. At the end of a search it is the total number.
     #[must_use]
-    pub fn done(&self) -> u64 {
-        [self.kept, self.beaten, self.bounded, self.stopped, self.singular, self.diverged]
+    pub fn processed_count(&self) -> u64 {
+        [self.kept, self.beaten, self.excluded_by_bound, self.stopped, self.singular, self.diverged]
             .iter()
             .fold(0, |sum, n| sum.saturating_add(*n))
     }
@@ -156,33 +157,33 @@ fn trim(rows: &mut Vec<Row>, keep: usize) {
     rows.truncate(keep);
 }
 
-/// The kept rows so far.
-pub(crate) struct Kept {
+/// Best rows so far, and the limit they imply.
+pub(crate) struct TopRows {
     pub(crate) rows: Vec<Row>,
     keep: usize,
-    /// No candidate above this raw score can be kept.
+    /// Raw score above which no candidate can enter the table.
     pub(crate) limit: f64,
 }
 
-impl Kept {
+impl TopRows {
     pub(crate) fn new(keep: usize, limit: f64) -> Self {
         Self { rows: Vec::new(), keep, limit }
     }
 
-    /// Takes rows in.
-    pub(crate) fn take(&mut self, rows: impl Iterator<Item = Row>) {
+    /// Insert rows and drop those beyond the best.
+    pub(crate) fn insert_rows(&mut self, rows: impl Iterator<Item = Row>) {
         self.rows.extend(rows);
         trim(&mut self.rows, self.keep);
     }
 
-    /// Whether this row is among them.
-    pub(crate) fn holds(&self, row: &Row) -> bool {
+    /// Whether this row is in the table.
+    pub(crate) fn contains(&self, row: &Row) -> bool {
         let place = self.rows.partition_point(|r| r.score.total_cmp(&row.score).then(r.index.cmp(&row.index)).is_lt());
         self.rows.get(place).is_some_and(|r| r.index == row.index)
     }
 
-    /// Lowers the limit to the worst row where `stopping` allows it.
-    pub(crate) fn lower(&mut self, stopping: bool) {
+    /// Lower the limit to the score of the worst row if `stopping` is set and the table is full.
+    pub(crate) fn lower_limit(&mut self, stopping: bool) {
         if stopping && self.rows.len() == self.keep {
             self.limit = self.limit.min(self.rows[self.keep - 1].score);
         }

@@ -1,45 +1,45 @@
-//! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
+//! Screening of candidates in batches: coefficients in parallel lanes, then exclusion by lower bounds.
 
 use crate::order_search::candidate::columns::{part_of, Columns};
-use crate::order_search::candidate::normal_equations::{Solve, Squares};
+use crate::order_search::candidate::normal_equations::{ResidualSumOfSquares, Solve};
 use crate::order_search::candidate::problem::Problem;
-use crate::order_search::candidate::row_bound::Shared;
-use crate::order_search::candidate_index::Catalogue;
-use crate::order_search::dual_bound::linearized_vectors::Held;
-use crate::order_search::dual_bound::tailored_vectors::Memory;
-use crate::order_search::grid::traversal::{spread, Cursor, Slab};
-use crate::simd::{self, WIDTH};
+use crate::order_search::candidate::row_bound::CommonFactor;
+use crate::order_search::candidate_index::CandidateIndex;
+use crate::order_search::dual_bound::linearized_vectors::VectorLookup;
+use crate::order_search::dual_bound::tailored_vectors::NormCache;
+use crate::order_search::grid::traversal::{low_discrepancy_position, Cursor, GridSlice};
+use crate::simd::{self, LANE_COUNT};
 
-/// A candidate that its bound has not excluded.
+/// Candidate that no bound has excluded.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Open {
+pub(crate) struct OpenCandidate {
     pub(crate) index: u64,
     pub(crate) bound: f64,
-    /// A guess at its score, by which visits are ordered.
+    /// Score estimate that orders the evaluation.
     pub(crate) guess: f64,
 }
 
-/// Sorts by guess, ties by index; what has no order comes last.
-pub(crate) fn by_guess(open: &mut [Open]) {
+/// Sort by estimate, ties by index, NaN last.
+pub(crate) fn sort_by_guess(open: &mut [OpenCandidate]) {
     open.sort_unstable_by(|a, b| a.guess.total_cmp(&b.guess).then(a.index.cmp(&b.index)));
 }
 
-/// Screens candidates `lo … hi − 1` against a limit: the open ones, and the singular ones; compiled for the widest
-/// vectors at hand.
-pub(crate) fn screen(catalogue: &Catalogue<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<Open>, Vec<u64>) {
-    simd::widest(Screening { catalogue, lo, hi, limit })
+/// Screen candidates `lo … hi − 1` against a limit. Return the open and the singular ones. Compiled for the widest
+/// vector instructions available.
+pub(crate) fn screen(catalogue: &CandidateIndex<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<OpenCandidate>, Vec<u64>) {
+    simd::dispatch_simd(Screening { catalogue, lo, hi, limit })
 }
 
-/// [`screen`] as a kernel.
+/// Kernel form of [`screen`].
 struct Screening<'a> {
-    catalogue: &'a Catalogue<'a>,
+    catalogue: &'a CandidateIndex<'a>,
     lo: u64,
     hi: u64,
     limit: f64,
 }
 
 impl simd::Kernel for Screening<'_> {
-    type Output = (Vec<Open>, Vec<u64>);
+    type Output = (Vec<OpenCandidate>, Vec<u64>);
 
     #[inline(always)]
     fn run(self) -> Self::Output {
@@ -50,18 +50,18 @@ impl simd::Kernel for Screening<'_> {
         let width = catalogue.lattice.width();
         // Candidates differ in their Caputo terms and in the power of an offset, so they cannot share a layout.
         if !catalogue.options.initial.follows_orders() {
-            let mut screen = Screen::<WIDTH>::new(width);
+            let mut screen = Screen::<LANE_COUNT>::new(width);
             catalogue.positions(&cursor, &mut screen.terms);
-            let sharing = Sharing::of(catalogue, limit);
+            let sharing = RowBoundContext::of(catalogue, limit);
             while index < hi {
                 let shared = sharing
                     .as_ref()
-                    .and_then(|sharing| screen.stretch(catalogue, sharing, &mut cursor, (index, hi), &mut found));
+                    .and_then(|sharing| screen.screen_row(catalogue, sharing, &mut cursor, (index, hi), &mut found));
                 if let Some(candidates) = shared {
                     index += candidates;
-                } else if index + WIDTH as u64 <= hi {
-                    screen.some(catalogue, &mut cursor, index, limit, &mut found);
-                    index += WIDTH as u64;
+                } else if index + LANE_COUNT as u64 <= hi {
+                    screen.screen_next(catalogue, &mut cursor, index, limit, &mut found);
+                    index += LANE_COUNT as u64;
                 } else {
                     break;
                 }
@@ -70,45 +70,46 @@ impl simd::Kernel for Screening<'_> {
         let mut screen = Screen::<1>::new(width);
         catalogue.positions(&cursor, &mut screen.terms);
         while index < hi {
-            screen.some(catalogue, &mut cursor, index, limit, &mut found);
+            screen.screen_next(catalogue, &mut cursor, index, limit, &mut found);
             index += 1;
         }
         found
     }
 }
 
-/// What stretches of candidates are judged by first, where squared equation errors rank.
-struct Sharing<'a> {
-    squares: &'a Squares,
+/// Context of the row bound, which precedes other bounds if the squared equation error ranks.
+struct RowBoundContext<'a> {
+    squares: &'a ResidualSumOfSquares,
     limit: f64,
 }
 
-impl<'a> Sharing<'a> {
-    /// None where nothing would be excluded, or where coefficients are known.
-    fn of(catalogue: &'a Catalogue<'_>, limit: f64) -> Option<Self> {
-        let Problem { squares, equations, .. } = &catalogue.problem;
-        let squares = squares.as_ref().filter(|_| limit < f64::INFINITY && equations.whole().is_some())?;
+impl<'a> RowBoundContext<'a> {
+    /// `None` if nothing would be excluded, or if coefficients are fixed.
+    fn of(catalogue: &'a CandidateIndex<'_>, limit: f64) -> Option<Self> {
+        let Problem { residual_sums: squares, equations, .. } = &catalogue.problem;
+        let squares =
+            squares.as_ref().filter(|_| limit < f64::INFINITY && equations.unconstrained_equations().is_some())?;
         Some(Self { squares, limit })
     }
 }
 
-/// Memory of a screening of L candidates side by side.
+/// Workspace for screening L candidates in parallel lanes.
 pub(crate) struct Screen<const L: usize> {
     solve: Solve<L>,
     positions: Vec<Columns<L>>,
     initial: Vec<usize>,
-    /// Columns of the candidate that comes next.
+    /// Columns of the next candidate.
     terms: Vec<usize>,
-    /// One candidate's columns, coefficients and initial terms.
+    /// Columns, coefficients and initial terms of one candidate.
     columns: Vec<usize>,
     coefficients: Vec<f64>,
     weights: Vec<f64>,
-    /// What is remembered of the test vectors made for candidates.
-    memory: Memory,
-    /// What is left of a stretch.
-    left: Vec<usize>,
-    /// What is remembered of the test vectors that follow coefficients, and the path that excluded one last.
-    held: Held,
+    /// Norm cache of the tailored test vectors.
+    norm_cache: NormCache,
+    /// Open positions of a row.
+    open_positions: Vec<usize>,
+    /// Lookup state of the linearized test vectors, and the path that excluded the previous candidate.
+    lookup: VectorLookup,
     path: usize,
 }
 
@@ -122,34 +123,34 @@ impl<const L: usize> Screen<L> {
             columns: vec![0; width],
             coefficients: vec![0.0; width],
             weights: Vec::new(),
-            memory: Memory::of_neighbours(),
-            left: Vec::new(),
-            held: Held::default(),
+            norm_cache: NormCache::for_adjacent_candidates(),
+            open_positions: Vec::new(),
+            lookup: VectorLookup::default(),
             path: 0,
         }
     }
 
-    /// Screens the next candidates as far as they differ in one term alone: how many; none where they are few, or where
-    /// nothing is proved of them together.
+    /// Screen the next candidates while only one term changes, by their common row bound. Return their number. `None`
+    /// if they are too few, or if nothing is proved of them together.
     #[inline(always)]
-    fn stretch(
+    fn screen_row(
         &mut self,
-        catalogue: &Catalogue<'_>,
-        &Sharing { squares, limit }: &Sharing<'_>,
+        catalogue: &CandidateIndex<'_>,
+        &RowBoundContext { squares, limit }: &RowBoundContext<'_>,
         cursor: &mut Cursor<'_>,
         (index, hi): (u64, u64),
-        found: &mut (Vec<Open>, Vec<u64>),
+        found: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) -> Option<u64> {
-        let (term, digit, len) = cursor.run()?;
+        let (term, digit, len) = cursor.adjacent_run()?;
         let len = usize::try_from(hi - index).map_or(len, |all| len.min(all));
         if len < L {
             return None;
         }
-        let columns = &catalogue.of_term(cursor, term)[digit..digit + len];
-        let shared = Shared::new(squares, &self.terms, term)?;
-        let mut left = std::mem::take(&mut self.left);
+        let columns = &catalogue.term_columns(cursor, term)[digit..digit + len];
+        let shared = CommonFactor::new(squares, &self.terms, term)?;
+        let mut left = std::mem::take(&mut self.open_positions);
         left.clear();
-        shared.open::<L>(columns, limit, &mut left);
+        shared.append_open::<L>(columns, limit, &mut left);
         for part in left.chunks(L) {
             for (positions, &column) in self.positions.iter_mut().zip(&self.terms) {
                 *positions = Columns::one(column);
@@ -159,9 +160,9 @@ impl<const L: usize> Screen<L> {
             let indices = at.map(|n| index + n as u64);
             self.positions[term] = Columns::new(at.map(|n| columns[n]));
             self.positions[term].compare();
-            self.judge(catalogue, indices, part.len(), limit, found);
+            self.screen_positions(catalogue, indices, part.len(), limit, found);
         }
-        self.left = left;
+        self.open_positions = left;
         cursor.skip(len - 1);
         catalogue.next(cursor, &mut self.terms);
         Some(len as u64)
@@ -169,21 +170,21 @@ impl<const L: usize> Screen<L> {
 
     /// Screens the next L candidates.
     #[inline(always)]
-    fn some(
+    fn screen_next(
         &mut self,
-        catalogue: &Catalogue<'_>,
+        catalogue: &CandidateIndex<'_>,
         cursor: &mut Cursor<'_>,
         index: u64,
         limit: f64,
-        found: &mut (Vec<Open>, Vec<u64>),
+        found: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         let Self { positions, initial, terms, .. } = self;
         catalogue.initial(cursor, initial);
-        if let Some((term, digit)) = cursor.stretch(L) {
+        if let Some((term, digit)) = cursor.adjacent_block(L) {
             for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
                 *columns = Columns::one(column);
             }
-            positions[term].at = part_of(&catalogue.of_term(cursor, term)[digit..]);
+            positions[term].at = part_of(&catalogue.term_columns(cursor, term)[digit..]);
             positions[term].compare();
             cursor.skip(L - 1);
             catalogue.next(cursor, terms);
@@ -196,23 +197,34 @@ impl<const L: usize> Screen<L> {
             }
             positions.iter_mut().for_each(Columns::compare);
         }
-        self.judge(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, found);
+        self.screen_positions(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, found);
     }
 
-    /// Screens the candidates whose columns have been laid out.
+    /// Screen the candidates whose columns have been set.
     #[inline(always)]
-    fn judge(
+    fn screen_positions(
         &mut self,
-        catalogue: &Catalogue<'_>,
+        catalogue: &CandidateIndex<'_>,
         indices: [u64; L],
         count: usize,
         limit: f64,
-        (open, singular): &mut (Vec<Open>, Vec<u64>),
+        (open, singular): &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
-        let Self { solve, positions, initial, columns, coefficients, weights, memory, held, path, .. } = self;
+        let Self {
+            solve,
+            positions,
+            initial,
+            columns,
+            coefficients,
+            weights,
+            norm_cache: memory,
+            lookup: held,
+            path,
+            ..
+        } = self;
         let failed = catalogue.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
-        let squares = match &catalogue.problem.squares {
+        let squares = match &catalogue.problem.residual_sums {
             Some(squares) => Some(squares.error(positions, &solve.coefficients)),
             None => None,
         };
@@ -224,7 +236,7 @@ impl<const L: usize> Screen<L> {
             let (bound, guess) = match (&squares, &catalogue.problem.bound) {
                 (Some((least, guess)), _) => (least[n], guess[n]),
                 (None, Some(bound)) => {
-                    // Coefficients that are yet to be refined give an order of visiting and prove nothing.
+                    // Unrefined coefficients order the evaluation but prove nothing.
                     let refined = catalogue.problem.refines();
                     let limit = if refined { f64::INFINITY } else { limit };
                     columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
@@ -237,42 +249,42 @@ impl<const L: usize> Screen<L> {
                     });
                     (if refined { 0.0 } else { least }, guess)
                 }
-                (None, None) => (0.0, spread(index)),
+                (None, None) => (0.0, low_discrepancy_position(index)),
             };
-            // Written so that a bound that is not a number excludes nothing.
+            // This form of the condition lets a NaN bound exclude nothing.
             if bound > limit {
                 continue;
             }
-            if let Some(adapted) = &catalogue.problem.adapted {
-                if adapted.exclude(columns, coefficients, limit, memory) {
+            if let Some(adapted) = &catalogue.problem.tailored_vectors {
+                if adapted.excludes_candidate(columns, coefficients, limit, memory) {
                     continue;
                 }
             }
-            if let (Some(tangents), true) = (&catalogue.problem.tangents, limit < f64::INFINITY) {
-                if tangents.exclude(columns, coefficients, limit, held) {
+            if let (Some(tangents), true) = (&catalogue.problem.linearized_vectors, limit < f64::INFINITY) {
+                if tangents.excludes_candidate(columns, coefficients, limit, held) {
                     continue;
                 }
             }
-            if let (Some(roots), true) = (&catalogue.problem.roots, limit < f64::INFINITY) {
-                if roots.exclude(columns, coefficients, limit, path) {
+            if let (Some(roots), true) = (&catalogue.problem.unstable_zeros, limit < f64::INFINITY) {
+                if roots.excludes_candidate(columns, coefficients, limit, path) {
                     continue;
                 }
             }
-            open.push(Open { index, bound, guess });
+            open.push(OpenCandidate { index, bound, guess });
         }
     }
 
-    /// Screens these candidates, at most L, at rest: index, and columns of the two terms that vary in a slab with these
-    /// columns.
+    /// Screen at most L candidates of a slice, with zero initial conditions. `candidates` holds index and the columns
+    /// of the two varying terms. `columns` holds all others.
     #[inline(always)]
-    pub(crate) fn these(
+    pub(crate) fn screen_slice_candidates(
         &mut self,
-        catalogue: &Catalogue<'_>,
-        slab: &Slab,
+        catalogue: &CandidateIndex<'_>,
+        slab: &GridSlice,
         columns: &[usize],
         candidates: &[(u64, usize, usize)],
         limit: f64,
-        found: &mut (Vec<Open>, Vec<u64>),
+        found: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         for (positions, &column) in self.positions.iter_mut().zip(columns) {
             *positions = Columns::one(column);
@@ -285,6 +297,6 @@ impl<const L: usize> Screen<L> {
             self.positions[term].at = at;
             self.positions[term].compare();
         }
-        self.judge(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, found);
+        self.screen_positions(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, found);
     }
 }

@@ -1,6 +1,4 @@
-//! Arrays and tuples from Python become records, structures and equations; results become arrays.
-//!
-//! Lists from Python whose told length is not believed: a range, or an object of one's own, may claim more than memory.
+//! Conversion from and to Python: arrays, lists, records, structures and equations.
 
 use std::ops::Deref;
 
@@ -14,15 +12,15 @@ use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_finite, check_points, Error};
 use crate::regressors::Record;
 
-/// Values of a two-dimensional array, at most: eight gigabytes.
+/// Most values of a two-dimensional array: eight gigabytes.
 const MOST_VALUES: usize = 1 << 30;
 
 /// (step, signals as rows, series of the sensor filter or None).
 #[derive(FromPyObject)]
 pub enum RecordArg<'py> {
-    /// With which signals' sensors may still have held something, the level at which each signal began, and answers of
-    /// the filter to an impulse and to derivatives of one as rows.
-    Begun(
+    /// With nonzero initial conditions: flags of sensor filter transients, initial levels of the signals, and filter
+    /// responses to an impulse and its derivatives as rows.
+    WithInitialState(
         f64,
         PyReadonlyArray2<'py, f64>,
         Option<PyReadonlyArray1<'py, f64>>,
@@ -37,27 +35,27 @@ pub type EquationArg = (StructureArg, List<f64>);
 /// (whether Caputo's powers, else these exponents).
 #[derive(FromPyObject)]
 pub enum InitialArg {
-    /// With offset and the number of impulses that a filter holds.
+    /// With offset and the number of impulses of a filter transient.
     Filtered(bool, List<f64>, u8, u8),
     /// With offset: 0 none, 1 a constant, 2 a constant and a ramp.
     Offset(bool, List<f64>, u8),
     Plain(bool, List<f64>),
 }
 
-/// A one-dimensional array as a vector, refused if it holds a value that is not finite.
+/// One-dimensional array as a vector. Return an error for a value that is not finite.
 pub fn vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
-    let values = copied(name, array)?;
+    let values = copy_vector(name, array)?;
     check_finite(name, &values)?;
     Ok(values)
 }
 
-/// A one-dimensional array as a vector, whatever it holds.
-pub fn copied(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
+/// One-dimensional array as a vector, without a check of its values.
+pub fn copy_vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
     check_points(&format!("length of {name}"), array.len())?;
     Ok(array.as_array().iter().copied().collect())
 }
 
-/// Rows of a two-dimensional array. One whose strides are 0 may seem larger than memory.
+/// Rows of a two-dimensional array. An array with zero strides may seem larger than memory.
 pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
     let [rows, columns] = [array.shape()[0], array.shape()[1]];
     check_points("rows of an array", rows)?;
@@ -71,7 +69,7 @@ pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
 
 pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     let (step, signals, filter, begun) = match argument {
-        RecordArg::Begun(step, signals, filter, begun) => (step, signals, filter, Some(begun)),
+        RecordArg::WithInitialState(step, signals, filter, begun) => (step, signals, filter, Some(begun)),
         RecordArg::Plain(step, signals, filter) => (step, signals, filter, None),
     };
     let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
@@ -79,7 +77,7 @@ pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     Ok(match begun {
         Some((held, levels, answers)) => {
             let answers = answers.as_ref().map(rows).transpose()?.unwrap_or_default();
-            record.begun(held.to_vec(), levels, answers)?
+            record.with_initial_state(held.to_vec(), levels, answers)?
         }
         None => record,
     })
@@ -89,7 +87,7 @@ pub fn records(arguments: &[RecordArg<'_>]) -> PyResult<Vec<Record>> {
     arguments.iter().map(record).collect()
 }
 
-/// A structure that the records can carry; inputs are all signals that `is_input` says.
+/// Structure for a record of so many signals. `inputs` marks the inputs among them.
 pub fn structure(argument: StructureArg, signals: usize, inputs: &[bool]) -> PyResult<Structure> {
     let structure = Structure {
         output: argument.0,
@@ -104,7 +102,8 @@ pub fn equations(arguments: List<EquationArg>, signals: usize, inputs: &[bool]) 
     arguments
         .into_iter()
         .map(|(s, coefficients)| {
-            // A model that was estimated under an order law may have an order a little below 0; it is simulated as it is.
+            // A model estimated with an order law may have an order slightly below 0. It is simulated without
+            // correction.
             let structure = structure(s, signals, &vec![true; inputs.len()])?;
             Ok(Equation::new(structure, coefficients.into())?)
         })
@@ -127,14 +126,14 @@ pub fn initial(argument: InitialArg) -> PyResult<Initial> {
     Ok(under.with_offset(offset)?.with_states(states))
 }
 
-/// A row-major matrix as an array.
+/// Row-major matrix as an array.
 pub fn matrix<'py>(py: Python<'py>, values: Vec<f64>, rows: usize) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let columns = values.len().checked_div(rows).unwrap_or(0);
     PyArray1::from_vec(py, values).reshape([rows, columns])
 }
 
 /// Vectors of equal length as the rows of an array.
-pub fn stacked<'py>(py: Python<'py>, vectors: &[Vec<f64>]) -> PyResult<Bound<'py, PyArray2<f64>>> {
+pub fn stack_rows<'py>(py: Python<'py>, vectors: &[Vec<f64>]) -> PyResult<Bound<'py, PyArray2<f64>>> {
     matrix(py, vectors.concat(), vectors.len())
 }
 
@@ -143,10 +142,10 @@ pub fn columns(array: &PyReadonlyArray2<'_, f64>) -> usize {
     array.shape()[1]
 }
 
-/// Items of a sequence that is neither list nor tuple, at most: those two hold what they tell of already.
+/// Most items of a sequence that is neither list nor tuple. Those two already occupy their memory.
 const MOST_ITEMS: usize = 1 << 24;
 
-/// A vector from any sequence of Python.
+/// Vector from any Python sequence.
 #[derive(IntoPyObject)]
 #[pyo3(transparent)]
 pub struct List<T>(Vec<T>);
@@ -219,11 +218,11 @@ impl<T> IntoIterator for List<T> {
 }
 
 /// Lists of lists as vectors of vectors.
-pub fn nested<T>(lists: List<List<T>>) -> Vec<Vec<T>> {
+pub fn to_vectors<T>(lists: List<List<T>>) -> Vec<Vec<T>> {
     lists.into_iter().map(Vec::from).collect()
 }
 
 /// Vectors of vectors as lists of lists.
-pub fn lists<T>(vectors: Vec<Vec<T>>) -> List<List<T>> {
+pub fn to_lists<T>(vectors: Vec<Vec<T>>) -> List<List<T>> {
     vectors.into_iter().map(List::from).collect()
 }

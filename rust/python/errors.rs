@@ -1,4 +1,4 @@
-//! One Python exception class for each family of errors, and panics turned into InternalError.
+//! Python exceptions: one class for each category of errors, and panics as InternalError.
 
 use std::panic::{catch_unwind, AssertUnwindSafe};
 
@@ -31,22 +31,23 @@ fn raise(class: &str, message: String) -> PyErr {
     })
 }
 
-/// The one way into the core for what computes: runs detached from Python; a panic becomes InternalError.
+/// Entry to the core for computations: runs detached from Python. A panic becomes InternalError.
 ///
-/// Every `#[pyfunction]` and every method converts its arguments and then makes a single call of this or of [`attached`];
-/// `tests/rust/bindings.rs` sees to it.
-pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Error> + Send) -> PyResult<T> {
-    Ok(py.detach(|| caught(work))?)
+/// Every `#[pyfunction]` and every method converts its arguments and then makes one call of this or of
+/// [`run_attached`]. `tests/rust/bindings.rs` checks that.
+pub fn run_detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Error> + Send) -> PyResult<T> {
+    Ok(py.detach(|| catch_panic(work))?)
 }
 
-/// The one way in for what takes microseconds, between two samples of a rig say, where letting go of Python would cost
-/// more than the work: runs attached; a panic becomes InternalError.
-pub fn attached<T>(work: impl FnOnce() -> Result<T, Error>) -> PyResult<T> {
-    Ok(caught(work)?)
+/// Entry to the core for work of microseconds, where detaching would cost more: runs attached to Python.
+///
+/// A panic becomes InternalError.
+pub fn run_attached<T>(work: impl FnOnce() -> Result<T, Error>) -> PyResult<T> {
+    Ok(catch_panic(work)?)
 }
 
-/// Runs; a panic becomes [`Error::Internal`].
-pub fn caught<T>(work: impl FnOnce() -> Result<T, Error>) -> Result<T, Error> {
+/// Run `work` and convert a panic to [`Error::Internal`].
+pub fn catch_panic<T>(work: impl FnOnce() -> Result<T, Error>) -> Result<T, Error> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
         let what = panic
             .downcast_ref::<&str>()

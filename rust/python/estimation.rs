@@ -1,35 +1,36 @@
-//! Least squares and multi-innovation least squares at given orders; joint output error.
+//! Bindings of least squares, multi-innovation least squares, instrumental variables and the joint output-error fit.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::convert::{
-    initial, nested, record, records, rows, stacked, structure, vector, InitialArg, List, RecordArg, StructureArg,
+    initial, record, records, rows, stack_rows, structure, to_vectors, vector, InitialArg, List, RecordArg,
+    StructureArg,
 };
-use super::errors::{attached, detached};
+use super::errors::{run_attached, run_detached};
 use crate::equation::{AffineOrder, Initial};
 use crate::error::{check_finite, check_length, Error};
 use crate::estimation::instrumental_variables as instruments;
 use crate::estimation::least_squares::{self as batch, Estimate};
-use crate::estimation::multi_innovation::{self as stepwise, Innovation, Rows};
+use crate::estimation::multi_innovation::{self as stepwise, Innovation, RowBasis};
 use crate::estimation::output_error as joint;
 use crate::estimation::resonance_scan;
 use crate::estimation::streaming::Streaming as StreamingFit;
-use crate::python::order_search::watch::{leavable, Stop};
+use crate::python::order_search::watch::{run_interruptible, Stop};
 use crate::regressors::Record;
-use crate::signal::block_pulse::{Jumps, Readings};
+use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 
-/// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
+/// Tuple of (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
 
-/// Pulses of all records together.
+/// Total number of pulses of all records.
 pub fn pulses(records: &[Record]) -> usize {
     records.iter().map(Record::m).sum()
 }
 
-/// Pulses of all experiments together, each as often as it is evaluated at most.
-pub fn evaluated(experiments: &[joint::Experiment], evaluations: usize) -> usize {
+/// Total number of pulses of all experiments times the largest number of evaluations.
+pub fn count_evaluated_pulses(experiments: &[joint::Experiment], evaluations: usize) -> usize {
     experiments.iter().map(|e| e.record.m()).sum::<usize>().saturating_mul(evaluations)
 }
 
@@ -51,10 +52,10 @@ pub fn least_squares(
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
     let points = pulses(&records);
-    Ok(tuple(leavable(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
+    Ok(tuple(run_interruptible(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
 }
 
-/// Output error and coefficients of each point; none where it is no number.
+/// Output error and coefficients of each point. None if they are not finite.
 type PointTuple = Option<(f64, Vec<f64>)>;
 
 #[pyfunction]
@@ -74,8 +75,8 @@ pub fn projected_errors(
     let initial = initial(terms)?;
     let points: Vec<Vec<f64>> = points.iter().map(|point| point.to_vec()).collect();
     let work = pulses(&records).saturating_mul(points.len());
-    let found = leavable(py, work, None, move |_| {
-        resonance_scan::projected(&records, &structure, &fixed, &initial, &own, &points)
+    let found = run_interruptible(py, work, None, move |_| {
+        resonance_scan::fit_with_fixed_poles(&records, &structure, &fixed, &initial, &own, &points)
     })?;
     Ok(found.into_iter().map(|at| at.map(|p| (p.error, p.coefficients))).collect())
 }
@@ -98,20 +99,21 @@ pub fn multi_innovation<'py>(
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
     let points = pulses(&records);
-    let innovation = Innovation { length, prior_covariance, rows: if haar { Rows::Haar } else { Rows::Time } };
+    let innovation =
+        Innovation { length, prior_covariance, row_basis: if haar { RowBasis::Haar } else { RowBasis::Time } };
     if recursion {
-        let (estimate, trace) = leavable(py, points, None, move |_| {
+        let (estimate, trace) = run_interruptible(py, points, None, move |_| {
             stepwise::recursion(&records, &structure, &fixed, &initial, &innovation)
         })?;
-        return Ok((tuple(estimate), Some(stacked(py, &trace)?)));
+        return Ok((tuple(estimate), Some(stack_rows(py, &trace)?)));
     }
-    let estimate = leavable(py, points, None, move |_| {
+    let estimate = run_interruptible(py, points, None, move |_| {
         stepwise::closed_form(&records, &structure, &fixed, &initial, &innovation)
     })?;
     Ok((tuple(estimate), None))
 }
 
-/// Refined instrumental variables: (estimates, covariances, iterations, converged, damped).
+/// Tuple of refined instrumental variables: (estimates, covariances, iterations, converged, instruments damped).
 type InstrumentTuple = (Vec<EstimateTuple>, Vec<Vec<f64>>, usize, bool, bool);
 
 #[pyfunction]
@@ -129,10 +131,10 @@ pub fn instrumental_variables(
     let measured = records(&runs)?;
     let structures =
         equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
-    let (initial, fixed) = (initial(terms)?, nested(fixed));
+    let (initial, fixed) = (initial(terms)?, to_vectors(fixed));
     let settings = instruments::Settings { iterations, tolerance };
     let points = pulses(&measured).saturating_mul(iterations.max(1));
-    let fit = leavable(py, points, None, move |stop| {
+    let fit = run_interruptible(py, points, None, move |stop| {
         let at_rest = initial == Initial::Rest;
         let measured = measured
             .into_iter()
@@ -148,18 +150,18 @@ pub fn instrumental_variables(
     Ok((estimates, covariances, fit.iterations, fit.converged, fit.damped))
 }
 
-/// (constant, weight of each free order).
+/// Affine order: (constant, weight of each free order).
 pub type AffineArg = (f64, List<f64>);
-/// (known factor, (coefficient, power) pairs).
+/// Monomial of coefficients: (factor, (coefficient, power) pairs).
 pub type MonomialArg = (f64, List<(usize, i32)>);
-/// (output, alpha, [(signal, order, coefficient), …]).
+/// Equation with free parameters: (output, alpha, [(signal, order, coefficient), …]).
 pub type FreeEquationArg = (usize, AffineArg, List<(usize, AffineArg, MonomialArg)>);
-/// (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between).
+/// Nonuniform samples: (sample positions in pulses, positions and sizes of the jumps of each held signal).
 pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
-/// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output,
-/// (values at the samples, whether it holds) of each signal, shares of the compared samples of each output, times of
-/// their own).
+/// Experiment: (record, pulses per sampling interval, samples of each output, filter of simulated outputs, weight of
+/// each output, (values at the samples, whether held) of each signal, robust weights of the samples of each output,
+/// nonuniform sample times).
 pub type ExperimentArg<'py> = (
     RecordArg<'py>,
     usize,
@@ -175,9 +177,9 @@ fn affine((constant, weights): AffineArg) -> AffineOrder {
     AffineOrder { constant, weights: weights.into() }
 }
 
-/// The jumps of a held signal near the readings.
+/// Jumps of a held signal near the sample times.
 pub fn jumps_near(
-    readings: &Readings,
+    readings: &SampleInterpolation,
     places: &PyReadonlyArray1<'_, f64>,
     sizes: &PyReadonlyArray1<'_, f64>,
 ) -> PyResult<Jumps> {
@@ -195,34 +197,39 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     let experiment = match &argument.7 {
         None => joint::Experiment::new(record, argument.1, samples, weights)?,
         Some((places, jumps)) => {
-            let readings = Readings::new(vector("times of readings", places)?, record.m())?;
+            let readings = SampleInterpolation::new(vector("times of readings", places)?, record.m())?;
             let jumps = (jumps.iter())
                 .map(|near| {
                     let Some((places, sizes)) = near else { return Ok(None) };
                     Ok(Some(jumps_near(&readings, places, sizes)?))
                 })
                 .collect::<PyResult<Vec<_>>>()?;
-            joint::Experiment::with_own_times(record, samples, weights, joint::OwnTimes { readings, jumps })?
+            joint::Experiment::with_nonuniform_samples(
+                record,
+                samples,
+                weights,
+                joint::NonuniformSamples { readings, jumps },
+            )?
         }
     };
     let experiment = match &argument.6 {
         None => experiment,
-        Some(shares) => experiment.with_shares(rows(shares)?)?,
+        Some(shares) => experiment.with_sample_weights(rows(shares)?)?,
     };
     let instants = (argument.5.iter())
         .map(|(values, held)| {
             let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;
-            Ok(joint::Instant { values, held: *held })
+            Ok(joint::PointValues { values, is_zero_order_hold: *held })
         })
         .collect::<PyResult<Vec<_>>>()?;
-    let experiment = experiment.with_instants(instants)?;
+    let experiment = experiment.with_point_values(instants)?;
     Ok(match &argument.3 {
         None => experiment,
         Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.to_vec())?,
     })
 }
 
-/// One equation whose orders and coefficients are free.
+/// Equation with free orders and coefficients.
 pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEquation {
     joint::FreeEquation {
         output,
@@ -236,13 +243,13 @@ pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEqua
     }
 }
 
-/// Coordinates by name.
+/// Coordinates of the parameters by name.
 pub fn coordinates(names: &[String]) -> PyResult<Vec<joint::Coordinate>> {
     let known = |name: &String| match name.as_str() {
         "plain" => Ok(joint::Coordinate::Plain),
         "logarithm" => Ok(joint::Coordinate::Logarithm),
         "excess" => Ok(joint::Coordinate::ExcessLogarithm),
-        "held" => Ok(joint::Coordinate::Held),
+        "held" => Ok(joint::Coordinate::Fixed),
         other => Err(Error::Structure {
             what: format!("coordinate '{other}' is not known"),
             remedy: "use plain, logarithm, excess or held".into(),
@@ -251,17 +258,17 @@ pub fn coordinates(names: &[String]) -> PyResult<Vec<joint::Coordinate>> {
     Ok(names.iter().map(known).collect::<Result<Vec<_>, _>>()?)
 }
 
-/// How a search ended, as Python has it.
+/// Termination status of an optimization as text.
 pub fn status(status: joint::Status) -> &'static str {
     match status {
         joint::Status::Converged => "converged",
         joint::Status::Exhausted => "exhausted",
         joint::Status::Stalled => "stalled",
-        joint::Status::Wall => "wall",
+        joint::Status::DomainLimit => "wall",
     }
 }
 
-/// What is free of inputs: signal, law, bounds, value at the start.
+/// Free parameter of an input: signal, law, bounds, initial guess.
 pub(super) type FreeInputArg = (usize, String, (f64, f64), f64);
 
 pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeInput>> {
@@ -315,16 +322,17 @@ pub fn output_error<'py>(
     let model =
         joint::FreeModel { equations, order_bounds, coordinates, inputs: free, coupled, initial: initial(terms)? };
     let settings = joint::Settings { evaluations, tolerance };
-    let points = evaluated(&experiments, evaluations);
-    let fit =
-        leavable(py, points, stop, move |stop| joint::fit_until(&model, &experiments, &start, settings, steady, stop))?;
+    let points = count_evaluated_pulses(&experiments, evaluations);
+    let fit = run_interruptible(py, points, stop, move |stop| {
+        joint::fit_until(&model, &experiments, &start, settings, steady, stop)
+    })?;
     let dict = PyDict::new(py);
     dict.set_item("orders", fit.point.orders)?;
     dict.set_item("coefficients", fit.point.coefficients)?;
     dict.set_item("inputs", fit.point.inputs)?;
     dict.set_item("cost", fit.cost)?;
     dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
-    dict.set_item("jacobian", if fit.jacobian.is_empty() { None } else { Some(stacked(py, &fit.jacobian)?) })?;
+    dict.set_item("jacobian", if fit.jacobian.is_empty() { None } else { Some(stack_rows(py, &fit.jacobian)?) })?;
     dict.set_item("initial", fit.initial)?;
     dict.set_item("exponents", fit.exponents)?;
     dict.set_item("evaluations", fit.evaluations)?;
@@ -332,18 +340,18 @@ pub fn output_error<'py>(
     Ok(dict)
 }
 
-/// Whether s^alpha less the own terms (coefficient, order) has a zero to the right of the imaginary axis, or on it.
+/// Whether s^alpha minus the own terms (coefficient, order) has a zero in the closed right half-plane.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn grows(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResult<bool> {
-    detached(py, || {
+pub fn has_unstable_pole(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResult<bool> {
+    run_detached(py, || {
         check_finite("alpha", &[alpha])?;
         own_terms.iter().try_for_each(|&(c, order)| check_finite("own terms", &[c, order]))?;
-        Ok(joint::stability::grows(alpha, &own_terms))
+        Ok(joint::stability::is_unstable(alpha, &own_terms))
     })
 }
 
-/// Recursion (44) on a stream of samples; see the module `estimate::streaming` of the core.
+/// Recursion (44) on a stream of samples, see module `estimate::streaming` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct Streaming {
     inner: StreamingFit,
@@ -366,25 +374,26 @@ impl Streaming {
             .into_iter()
             .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed.into())))
             .collect::<PyResult<Vec<_>>>()?;
-        let inner = detached(py, || StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance))?;
+        let inner =
+            run_detached(py, || StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance))?;
         Ok(Self { inner })
     }
 
-    /// Takes samples, shape (n, signals).
+    /// Append samples, shape (n, signals).
     #[allow(clippy::needless_pass_by_value)]
     fn push(&mut self, py: Python<'_>, samples: PyReadonlyArray2<'_, f64>) -> PyResult<()> {
         let samples = rows(&samples)?;
         let inner = &mut self.inner;
-        detached(py, || samples.iter().try_for_each(|sample| inner.push(sample)))
+        run_detached(py, || samples.iter().try_for_each(|sample| inner.push(sample)))
     }
 
     #[getter]
     fn coefficients(&self) -> PyResult<Vec<Vec<f64>>> {
-        attached(|| Ok(self.inner.coefficients()))
+        run_attached(|| Ok(self.inner.coefficients()))
     }
 
     #[getter]
     fn pulses(&self) -> PyResult<usize> {
-        attached(|| Ok(self.inner.pulses()))
+        run_attached(|| Ok(self.inner.pulses()))
     }
 }

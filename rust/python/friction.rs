@@ -1,20 +1,20 @@
-//! Free runs of bodies with friction, and their output error.
+//! Bindings of simulation and output-error fit with friction.
 
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use super::convert::{initial, nested, record, stacked, structure, InitialArg, List, RecordArg, StructureArg};
+use super::convert::{initial, record, stack_rows, structure, to_vectors, InitialArg, List, RecordArg, StructureArg};
 use super::estimation::{
-    coordinates, evaluated, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg,
-    FreeInputArg, MonomialArg,
+    coordinates, count_evaluated_pulses, experiment, free_equation, free_inputs, status, ExperimentArg,
+    FreeEquationArg, FreeInputArg, MonomialArg,
 };
 use crate::equation::Equation;
 use crate::estimation::output_error as joint;
 use crate::friction::contact::Trace;
 use crate::friction::law::Phase;
-use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
-use crate::python::order_search::watch::{leavable, Stop};
+use crate::friction::{self, Body, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
+use crate::python::order_search::watch::{run_interruptible, Stop};
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
@@ -29,7 +29,7 @@ pub fn friction_respond<'py>(
     let inputs = vec![true; record.len()];
     let frictions = frictions
         .into_iter()
-        .map(|(place, (coulomb, stribeck, speed))| (place, Law { coulomb, stribeck, speed }))
+        .map(|(place, (coulomb, stribeck, speed))| (place, FrictionLaw { coulomb, stribeck, speed }))
         .collect();
     let equations = equations
         .into_iter()
@@ -39,27 +39,27 @@ pub fn friction_respond<'py>(
         })
         .collect::<PyResult<_>>()?;
     let body = Body { equations, frictions };
-    let motion = leavable(py, record.m(), None, move |_| body.run(&record, &nested(terms)))?;
+    let motion = run_interruptible(py, record.m(), None, move |_| body.run(&record, &to_vectors(terms)))?;
     let dict = PyDict::new(py);
-    dict.set_item("outputs", stacked(py, &motion.outputs)?)?;
+    dict.set_item("outputs", stack_rows(py, &motion.outputs)?)?;
     let rows = |of: fn(&Trace) -> &Vec<f64>| motion.bodies.iter().map(|body| of(body).clone()).collect::<Vec<_>>();
-    dict.set_item("velocity", stacked(py, &rows(|body| &body.edges))?)?;
-    dict.set_item("force", stacked(py, &rows(|body| &body.force))?)?;
+    dict.set_item("velocity", stack_rows(py, &rows(|body| &body.edges))?)?;
+    dict.set_item("force", stack_rows(py, &rows(|body| &body.force))?)?;
     let stuck: Vec<Vec<bool>> =
         (motion.bodies.iter()).map(|body| body.phases.iter().map(|phase| *phase == Phase::Stick).collect()).collect();
     dict.set_item("stuck", PyArray2::from_vec2(py, &stuck)?)?;
     Ok(dict)
 }
 
-/// (place of the body's equation, fc, fs and vs).
+/// Friction of one equation: (equation, fc, fs and vs).
 pub type FrictionArg = (usize, [MonomialArg; 3]);
 
-/// Friction whose numbers may be free.
-pub fn free_laws(frictions: List<FrictionArg>) -> Vec<(usize, FreeLaw)> {
+/// Friction laws with free parameters.
+pub fn free_laws(frictions: List<FrictionArg>) -> Vec<(usize, FreeFrictionLaw)> {
     let law = |(place, numbers): FrictionArg| {
         let [coulomb, stribeck, speed] =
             numbers.map(|(factor, powers)| joint::Monomial { factor, powers: powers.into() });
-        (place, FreeLaw { coulomb, stribeck, speed })
+        (place, FreeFrictionLaw { coulomb, stribeck, speed })
     };
     frictions.into_iter().map(law).collect()
 }
@@ -94,18 +94,19 @@ pub fn friction_error<'py>(
         order_bounds: order_bounds.into(),
         coordinates: coordinates(&names)?,
         initial: initial(terms)?,
-        filtered: friction::passing(&experiments),
+        filtered: friction::filtered_outputs(&experiments),
     };
     let start = Start {
         orders: orders.into(),
         coefficients: coefficients.into(),
         inputs: inputs.iter().map(|input| input.3).collect(),
-        states: nested(states),
+        states: to_vectors(states),
     };
     let settings = joint::Settings { evaluations, tolerance };
-    let points = evaluated(&experiments, evaluations);
-    let fit =
-        leavable(py, points, stop, move |stop| friction::fit_until(&model, &experiments, &start, settings, stop))?;
+    let points = count_evaluated_pulses(&experiments, evaluations);
+    let fit = run_interruptible(py, points, stop, move |stop| {
+        friction::fit_until(&model, &experiments, &start, settings, stop)
+    })?;
     let dict = PyDict::new(py);
     dict.set_item("orders", fit.orders)?;
     dict.set_item("coefficients", fit.coefficients)?;
@@ -117,7 +118,7 @@ pub fn friction_error<'py>(
     dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
     let samples = fit.jacobian.first().map_or(0, Vec::len);
     let none = fit.jacobian.is_empty() || samples == 0;
-    dict.set_item("jacobian", if none { None } else { Some(stacked(py, &fit.jacobian)?) })?;
+    dict.set_item("jacobian", if none { None } else { Some(stack_rows(py, &fit.jacobian)?) })?;
     dict.set_item("evaluations", fit.evaluations)?;
     dict.set_item("status", status(fit.status))?;
     Ok(dict)

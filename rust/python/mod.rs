@@ -1,5 +1,6 @@
-//! Bindings: the only users of pyo3 and numpy. Arrays are checked here once, then trusted; Python is detached in every
-//! call that computes.
+//! Python bindings, the only users of pyo3 and numpy.
+//!
+//! Arrays are checked here once. Python is detached during every call that computes.
 
 mod convert;
 mod errors;
@@ -13,24 +14,25 @@ mod virtual_arm;
 
 use pyo3::prelude::*;
 
-/// The compiled core of ftlm.
+/// Core of ftlm, compiled.
 #[pymodule]
 mod _core {
     use super::*;
 
     #[pymodule_export]
     use crate::python::operators::{
-        block_pulse_kernel, block_pulse_matrix, delayed, filter_series, fractional_derivative, fractional_integral,
-        grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix, point_samples,
-        pulse_means, series_divide, series_multiply,
+        block_pulse_kernel, block_pulse_matrix, delay_samples, filter_series, fractional_derivative,
+        fractional_integral, grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix,
+        point_samples, pulse_means, series_divide, series_multiply,
     };
 
     #[pymodule_export]
-    use crate::python::operators::{singular, triangle};
+    use crate::python::operators::{singular_values, triangular_factor};
 
     #[pymodule_export]
     use crate::python::estimation::{
-        grows, instrumental_variables, least_squares, multi_innovation, output_error, projected_errors, Streaming,
+        has_unstable_pole, instrumental_variables, least_squares, multi_innovation, output_error, projected_errors,
+        Streaming,
     };
 
     #[pymodule_export]
@@ -38,20 +40,21 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::joint_fit::{
-        autocovariances, chi_squared, colour_covariances, coloured, covariance_of, fit_covariance, is_white, joint_fit,
-        joint_grids, joint_race, long_run, JointClock, JointProblem, JointRace,
+        autocovariances, chi_squared, covariance_of, filter_autocovariances, fit_covariance, is_white, joint_fit,
+        joint_multistart, long_run_covariance, refine_candidates, whitening_filter, JointMultistart, JointProblem,
+        JointTimeScaling,
     };
 
     #[pymodule_export]
     use crate::python::simulation::{
-        corners, correlation, equation_error, explicit_euler, metrics, nyquist_margin, read_at, respond,
-        respond_and_units, respond_with_initial, trace_errors,
+        correlation, equation_error, explicit_euler, interpolate_samples, kink_correction, metrics, nyquist_margin,
+        respond, respond_and_units, respond_with_initial, trace_errors,
     };
 
     #[pymodule_export]
     use crate::python::order_search::{
-        certify, lattice_size, panic_on_purpose, portable, search, search_join, search_plan, search_stage, OrderSearch,
-        Points, StageSearch,
+        certify, force_portable, order_grid_size, panic_on_purpose, search, search_join, search_plan, search_stage,
+        OrderSearch, Points, StageSearch,
     };
 
     #[pymodule_export]
@@ -62,10 +65,9 @@ mod _core {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        // NumPy's interface and the one that counts borrows are found when they are first used, and would panic where a
-        // Ctrl-C arrives just then.
+        // NumPy's C API and its borrow checker are imported on first use, and would panic on a Ctrl-C at that moment.
         module.py().import("numpy")?;
-        crate::python::errors::attached(|| {
+        crate::python::errors::run_attached(|| {
             drop(numpy::PyArrayMethods::readonly(&numpy::PyArray1::<f64>::zeros(module.py(), 0, false)));
             Ok(())
         })?;
@@ -73,7 +75,7 @@ mod _core {
         module.add("SIMD", simd())
     }
 
-    /// The widest vector unit that this processor offers.
+    /// Widest vector unit of this processor.
     fn simd() -> &'static str {
         #[cfg(target_arch = "x86_64")]
         {

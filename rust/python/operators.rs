@@ -1,19 +1,17 @@
-//! Kernels, transforms, matrices, fractional integrals and derivatives, pulse means.
-//!
-//! Factors of tall matrices, given by their columns as rows of an array.
+//! Bindings of operators: kernels, transforms, operational matrices, fractional integrals, means, dense factors.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::convert::{columns, copied, matrix, rows, stacked, vector, List};
-use super::errors::detached;
+use super::convert::{columns, copy_vector, matrix, rows, stack_rows, vector, List};
+use super::errors::run_detached;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
 use crate::fractional::integral::{self, Derivative, IntegralRule};
 use crate::fractional::kernels;
 use crate::fractional::operational_matrices;
 use crate::linalg::dense;
-use crate::python::order_search::watch::leavable;
+use crate::python::order_search::watch::run_interruptible;
 use crate::series;
 use crate::signal::block_pulse::{self, Intersample};
 
@@ -27,7 +25,7 @@ fn choice(name: &str, given: &str, known: &str) -> Error {
 #[pyfunction]
 #[pyo3(signature = (order, m, step, *, derivative = false))]
 pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, derivative: bool) -> PyResult<Array<'_>> {
-    let kernel = detached(py, || {
+    let kernel = run_detached(py, || {
         check_points("m", m)?;
         kernels::check_order("order", order)?;
         check_step(step)?;
@@ -42,7 +40,7 @@ pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, deriv
 
 #[pyfunction]
 pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResult<Array<'_>> {
-    let weights = detached(py, || {
+    let weights = run_detached(py, || {
         check_points("m", m)?;
         Ok(kernels::grunwald_letnikov_weights(order, m))
     })?;
@@ -51,42 +49,42 @@ pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResu
 
 #[pyfunction]
 pub fn haar_transform<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    transformed(py, &x, operational_matrices::transform)
+    map_rows(py, &x, operational_matrices::haar_transform)
 }
 
 #[pyfunction]
 pub fn haar_inverse<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    transformed(py, &x, operational_matrices::inverse)
+    map_rows(py, &x, operational_matrices::haar_inverse)
 }
 
-fn transformed<'py>(
+fn map_rows<'py>(
     py: Python<'py>,
     x: &PyReadonlyArray2<'py, f64>,
     work: fn(&mut [f64]) -> crate::error::Result<()>,
 ) -> PyResult<Matrix<'py>> {
     let mut all = rows(x)?;
-    let all = detached(py, || {
+    let all = run_detached(py, || {
         for row in &mut all {
             check_finite("x", row)?;
             work(row)?;
         }
         Ok(all)
     })?;
-    stacked(py, &all)
+    stack_rows(py, &all)
 }
 
 #[pyfunction]
 pub fn haar_matrix(py: Python<'_>, m: usize) -> PyResult<Matrix<'_>> {
-    let values = detached(py, || {
+    let values = run_detached(py, || {
         check_dense(m)?;
-        operational_matrices::matrix(m)
+        operational_matrices::haar_matrix(m)
     })?;
     matrix(py, values, m)
 }
 
 #[pyfunction]
 pub fn block_pulse_matrix(py: Python<'_>, order: f64, m: usize, step: f64) -> PyResult<Matrix<'_>> {
-    let values = detached(py, || {
+    let values = run_detached(py, || {
         check_dense(m)?;
         operational_matrices::block_pulse_matrix(order, m, step)
     })?;
@@ -96,7 +94,7 @@ pub fn block_pulse_matrix(py: Python<'_>, order: f64, m: usize, step: f64) -> Py
 #[pyfunction]
 #[pyo3(signature = (order, m, step, *, dense = false))]
 pub fn operational_matrix(py: Python<'_>, order: f64, m: usize, step: f64, dense: bool) -> PyResult<Matrix<'_>> {
-    let values = detached(py, || {
+    let values = run_detached(py, || {
         check_dense(m)?;
         if dense {
             operational_matrices::operational_matrix_dense(order, m, step)
@@ -118,7 +116,7 @@ pub fn series_multiply<'py>(
 ) -> PyResult<Array<'py>> {
     let (a, b) = (vector("a", &a)?, vector("b", &b)?);
     check_points("m", m)?;
-    let product = leavable(py, m, None, move |_| {
+    let product = run_interruptible(py, m, None, move |_| {
         Ok(if naive { series::multiply_naive(&a, &b, m) } else { series::multiply(&a, &b, m) })
     })?;
     Ok(PyArray1::from_vec(py, product))
@@ -133,7 +131,7 @@ pub fn series_divide<'py>(
     naive: bool,
 ) -> PyResult<Array<'py>> {
     let (n, d) = (vector("numerator", &numerator)?, vector("divisor", &divisor)?);
-    let quotient = leavable(py, n.len(), None, move |_| {
+    let quotient = run_interruptible(py, n.len(), None, move |_| {
         check_length("divisor", n.len(), d.len())?;
         if naive {
             series::divide_naive(&n, &d)
@@ -160,14 +158,14 @@ pub fn fractional_integral<'py>(
     };
     let all = rows(&x)?;
     let points = all.iter().map(Vec::len).sum();
-    let out = leavable(py, points, None, move |stop| {
+    let out = run_interruptible(py, points, None, move |stop| {
         let integral = |row: &Vec<f64>| {
             stop.check()?;
             integral::fractional_integral(row, order, step, rule)
         };
         all.iter().map(integral).collect()
     })?;
-    reshaped(py, out, columns(&x))
+    join_rows(py, out, columns(&x))
 }
 
 #[pyfunction]
@@ -187,7 +185,7 @@ pub fn fractional_derivative<'py>(
     };
     let (all, starts) = (rows(&x)?, rows(&initial)?);
     let points = all.iter().map(Vec::len).sum();
-    let out = leavable(py, points, None, move |stop| {
+    let out = run_interruptible(py, points, None, move |stop| {
         check_length("initial", all.len(), starts.len())?;
         let derivative = |(row, start): (&Vec<f64>, &Vec<f64>)| {
             stop.check()?;
@@ -195,10 +193,10 @@ pub fn fractional_derivative<'py>(
         };
         all.iter().zip(&starts).map(derivative).collect()
     })?;
-    reshaped(py, out, columns(&x))
+    join_rows(py, out, columns(&x))
 }
 
-fn reshaped(py: Python<'_>, all: Vec<Vec<f64>>, width: usize) -> PyResult<Matrix<'_>> {
+fn join_rows(py: Python<'_>, all: Vec<Vec<f64>>, width: usize) -> PyResult<Matrix<'_>> {
     use numpy::PyArrayMethods;
     PyArray1::from_vec(py, all.concat()).reshape([all.len(), width])
 }
@@ -212,24 +210,24 @@ pub fn pulse_means<'py>(
 ) -> PyResult<Array<'py>> {
     let samples = vector("samples", &samples)?;
     let between = if hold { Intersample::Hold } else { Intersample::Linear };
-    Ok(PyArray1::from_vec(py, detached(py, || block_pulse::pulse_means(&samples, m, between))?))
+    Ok(PyArray1::from_vec(py, run_detached(py, || block_pulse::pulse_means(&samples, m, between))?))
 }
 
 #[pyfunction]
 pub fn point_samples<'py>(py: Python<'py>, means: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
-    let values = copied("means", &means)?;
-    Ok(PyArray1::from_vec(py, detached(py, || Ok(block_pulse::point_samples(&values)))?))
+    let values = copy_vector("means", &means)?;
+    Ok(PyArray1::from_vec(py, run_detached(py, || Ok(block_pulse::point_samples(&values)))?))
 }
 
 #[pyfunction]
-pub fn delayed<'py>(
+pub fn delay_samples<'py>(
     py: Python<'py>,
     samples: PyReadonlyArray1<'py, f64>,
     delay: f64,
     before: f64,
 ) -> PyResult<Array<'py>> {
     let samples = vector("samples", &samples)?;
-    Ok(PyArray1::from_vec(py, detached(py, || block_pulse::delayed(&samples, delay, before))?))
+    Ok(PyArray1::from_vec(py, run_detached(py, || block_pulse::delay_samples(&samples, delay, before))?))
 }
 
 #[pyfunction]
@@ -241,7 +239,7 @@ pub fn filter_series(
     step: f64,
 ) -> PyResult<Array<'_>> {
     let filter = Filter { numerator: numerator.into(), denominator: denominator.into() };
-    Ok(PyArray1::from_vec(py, detached(py, || filter.series(m, step))?))
+    Ok(PyArray1::from_vec(py, run_detached(py, || filter.series(m, step))?))
 }
 
 fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
@@ -253,25 +251,25 @@ fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
 }
 
 #[pyfunction]
-pub fn triangle<'py>(py: Python<'py>, given: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
+pub fn triangular_factor<'py>(py: Python<'py>, given: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
     let tall = finite(&given)?;
     let count = tall.len();
-    let factor = leavable(py, columns(&given), None, move |_| Ok(dense::triangular_factor(&tall)))?;
+    let factor = run_interruptible(py, columns(&given), None, move |_| Ok(dense::triangular_factor(&tall)))?;
     matrix(py, factor, count)
 }
 
 #[pyfunction]
 #[allow(clippy::type_complexity)]
-pub fn singular<'py>(
+pub fn singular_values<'py>(
     py: Python<'py>,
     given: PyReadonlyArray2<'py, f64>,
 ) -> PyResult<(Matrix<'py>, Bound<'py, PyArray1<f64>>, Matrix<'py>)> {
     let tall = finite(&given)?;
-    let found = leavable(py, columns(&given), None, move |_| {
-        dense::singular(&tall).ok_or_else(|| Error::Structure {
+    let found = run_interruptible(py, columns(&given), None, move |_| {
+        dense::singular_values(&tall).ok_or_else(|| Error::Structure {
             what: "singular values are not found".into(),
             remedy: "scale the columns".into(),
         })
     })?;
-    Ok((stacked(py, &found.left)?, PyArray1::from_vec(py, found.sizes), stacked(py, &found.right)?))
+    Ok((stack_rows(py, &found.left)?, PyArray1::from_vec(py, found.values), stack_rows(py, &found.right)?))
 }

@@ -1,16 +1,16 @@
-//! Free runs, the two errors, explicit Euler, the four figures and the correlations of residuals.
+//! Bindings of simulation, output and equation error, explicit Euler, metrics and correlations.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use super::convert::{
-    copied, equations, initial, nested, record, rows, stacked, structure, vector, EquationArg, InitialArg, List,
-    RecordArg, StructureArg,
+    copy_vector, equations, initial, record, rows, stack_rows, structure, to_vectors, vector, EquationArg, InitialArg,
+    List, RecordArg, StructureArg,
 };
-use super::errors::detached;
+use super::errors::run_detached;
 use super::estimation::jumps_near;
-use crate::python::order_search::watch::leavable;
-use crate::signal::block_pulse::Readings;
+use crate::python::order_search::watch::run_interruptible;
+use crate::signal::block_pulse::SampleInterpolation;
 use crate::simulate::{self, OutputFilter};
 
 #[pyfunction]
@@ -24,8 +24,9 @@ pub fn respond<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
-    let outputs = leavable(py, record.m(), None, move |_| simulate::respond(&equations, &record, &nested(terms)))?;
-    stacked(py, &outputs)
+    let outputs =
+        run_interruptible(py, record.m(), None, move |_| simulate::respond(&equations, &record, &to_vectors(terms)))?;
+    stack_rows(py, &outputs)
 }
 
 #[pyfunction]
@@ -41,8 +42,8 @@ pub fn respond_and_units<'py>(
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
     let (driven, units) =
-        leavable(py, record.m(), None, move |_| simulate::respond_and_units(&equations, &record, &units))?;
-    Ok((stacked(py, &driven)?, stacked(py, &units.concat())?))
+        run_interruptible(py, record.m(), None, move |_| simulate::respond_and_units(&equations, &record, &units))?;
+    Ok((stack_rows(py, &driven)?, stack_rows(py, &units.concat())?))
 }
 
 #[pyfunction]
@@ -59,11 +60,11 @@ pub fn respond_with_initial<'py>(
     let equations = equations(model, record.len(), &inputs)?;
     let initial = initial(terms)?;
     let filter = filter.map(|(series, applies)| Ok::<_, PyErr>((vector("filter", &series)?, applies))).transpose()?;
-    let response = leavable(py, record.m(), None, move |_| {
+    let response = run_interruptible(py, record.m(), None, move |_| {
         let filter = filter.as_ref().map(|(series, applies)| OutputFilter { series, applies });
         simulate::respond_with_initial(&equations, &record, &initial, filter)
     })?;
-    Ok((stacked(py, &response.outputs)?, response.exponents, response.initial))
+    Ok((stack_rows(py, &response.outputs)?, response.exponents, response.initial))
 }
 
 #[pyfunction]
@@ -78,7 +79,8 @@ pub fn equation_error<'py>(
     let record = record(&run)?;
     let equations = equations(vec![equation].into(), record.len(), &inputs)?;
     let initial = initial(terms)?;
-    let found = leavable(py, record.m(), None, move |_| simulate::equation_error(&equations[0], &record, &initial))?;
+    let found =
+        run_interruptible(py, record.m(), None, move |_| simulate::equation_error(&equations[0], &record, &initial))?;
     Ok(PyArray1::from_vec(py, found))
 }
 
@@ -93,8 +95,8 @@ pub fn explicit_euler<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let signals = rows(&signals)?;
     let equations = equations(model, signals.len(), &inputs)?;
-    let outputs = detached(py, || simulate::explicit_euler(&equations, &signals, step))?;
-    stacked(py, &outputs)
+    let outputs = run_detached(py, || simulate::explicit_euler(&equations, &signals, step))?;
+    stack_rows(py, &outputs)
 }
 
 #[pyfunction]
@@ -109,14 +111,14 @@ pub fn trace_errors<'py>(
     let record = record(&run)?;
     let structure = structure(equation, record.len(), &inputs)?;
     let rows = rows(&trace)?;
-    let found = leavable(py, record.m(), None, move |_| simulate::trace_errors(&structure, &record, &rows))?;
+    let found = run_interruptible(py, record.m(), None, move |_| simulate::trace_errors(&structure, &record, &rows))?;
     Ok(PyArray1::from_vec(py, found))
 }
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn nyquist_margin(py: Python<'_>, own_terms: List<(f64, f64)>, step: f64) -> PyResult<f64> {
-    detached(py, || Ok(simulate::nyquist_margin(&own_terms, step)))
+    run_detached(py, || Ok(simulate::nyquist_margin(&own_terms, step)))
 }
 
 #[pyfunction]
@@ -127,8 +129,8 @@ pub fn metrics(
     residuals: PyReadonlyArray1<'_, f64>,
 ) -> PyResult<(f64, f64, f64, f64)> {
     let measured = vector("measured", &measured)?;
-    let residuals = copied("residuals", &residuals)?;
-    let found = detached(py, || crate::signal::metrics::metrics(&measured, &residuals))?;
+    let residuals = copy_vector("residuals", &residuals)?;
+    let found = run_detached(py, || crate::signal::metrics::metrics(&measured, &residuals))?;
     Ok((found.error, found.rmse, found.nr, found.fit_percent))
 }
 
@@ -142,29 +144,29 @@ pub fn correlation<'py>(
 ) -> PyResult<(Bound<'py, PyArray1<f64>>, f64, usize)> {
     let x = x.iter().map(|a| vector("x", a)).collect::<PyResult<Vec<_>>>()?;
     let y = y.iter().map(|a| vector("y", a)).collect::<PyResult<Vec<_>>>()?;
-    let found = detached(py, || crate::signal::metrics::correlation(&x, &y, lags))?;
+    let found = run_detached(py, || crate::signal::metrics::correlation(&x, &y, lags))?;
     Ok((PyArray1::from_vec(py, found.values), found.variance, found.window))
 }
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn read_at<'py>(
+pub fn interpolate_samples<'py>(
     py: Python<'py>,
     means: PyReadonlyArray2<'py, f64>,
     places: PyReadonlyArray1<'py, f64>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let (means, places) = (rows(&means)?, vector("times of readings", &places)?);
     let m = means.first().map_or(0, Vec::len);
-    let read = detached(py, || {
-        let readings = Readings::new(places, m)?;
-        Ok(means.iter().map(|row| readings.read(row)).collect::<Vec<_>>())
+    let read = run_detached(py, || {
+        let readings = SampleInterpolation::new(places, m)?;
+        Ok(means.iter().map(|row| readings.interpolate(row)).collect::<Vec<_>>())
     })?;
-    stacked(py, &read)
+    stack_rows(py, &read)
 }
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn corners<'py>(
+pub fn kink_correction<'py>(
     py: Python<'py>,
     m: usize,
     places: PyReadonlyArray1<'py, f64>,
@@ -173,8 +175,8 @@ pub fn corners<'py>(
     step: f64,
 ) -> PyResult<Bound<'py, PyArray1<f64>>> {
     let places = vector("times of readings", &places)?;
-    let readings = Readings::new(places, m)?;
+    let readings = SampleInterpolation::new(places, m)?;
     let jumps = jumps_near(&readings, &jumps.0, &jumps.1)?;
-    let lacking = detached(py, || Ok(readings.corners(&jumps, order, step)))?;
+    let lacking = run_detached(py, || Ok(readings.kink_corrections(&jumps, order, step)))?;
     Ok(PyArray1::from_vec(py, lacking))
 }

@@ -1,18 +1,18 @@
-//! The virtual arm and the guard of both rigs.
+//! Bindings of the virtual arm and of the safety guard.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
-use super::convert::{equations, stacked, vector, EquationArg, List};
-use super::errors::{attached, detached};
+use super::convert::{equations, stack_rows, vector, EquationArg, List};
+use super::errors::{run_attached, run_detached};
 use crate::error::{check_length, Error};
 use crate::fractional::exponential_sum::integral_by_memory;
-use crate::rig::arm_model::{Arm, Parameters, SIGNALS};
+use crate::rig::arm_model::{Arm, Parameters, SIGNAL_COUNT};
 use crate::rig::safety_guard::{self, Fault};
 use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
-/// Columns of a row: written currents, four angles, two measured currents, delay.
-const COLUMNS: usize = 9;
+/// Number of columns of a sample: two written currents, four angles, two measured currents, delay.
+const SAMPLE_COLUMNS: usize = 9;
 
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
@@ -60,7 +60,7 @@ impl From<GuardSettings> for safety_guard::Settings {
     }
 }
 
-/// Limits, conversions and latched faults of one run; see the module `guard` of the core.
+/// Safety guard of one run, see module `rig::guard` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct Guard {
     inner: safety_guard::Guard,
@@ -70,26 +70,26 @@ pub struct Guard {
 impl Guard {
     #[new]
     fn new(settings: GuardSettings) -> PyResult<Self> {
-        attached(|| Ok(Self { inner: safety_guard::Guard::new(settings.into())? }))
+        run_attached(|| Ok(Self { inner: safety_guard::Guard::new(settings.into())? }))
     }
 
     fn rest(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4]) -> PyResult<()> {
-        attached(|| {
+        run_attached(|| {
             self.inner.rest(&Reading { analog, counts, switches });
             Ok(())
         })
     }
 
     fn read(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4], late: f64) -> PyResult<[f64; 6]> {
-        attached(|| Ok(self.inner.read(&Reading { analog, counts, switches }, late)))
+        run_attached(|| Ok(self.inner.read(&Reading { analog, counts, switches }, late)))
     }
 
     fn command(&mut self, current: [f64; 2]) -> PyResult<[f64; 2]> {
-        attached(|| Ok(self.inner.command(current)))
+        run_attached(|| Ok(self.inner.command(current)))
     }
 
     fn fail(&mut self, why: String) -> PyResult<()> {
-        attached(|| {
+        run_attached(|| {
             self.inner.fail(Fault::Rig(why));
             Ok(())
         })
@@ -97,22 +97,22 @@ impl Guard {
 
     #[getter]
     fn fault(&self) -> PyResult<Option<String>> {
-        attached(|| Ok(self.inner.fault().map(ToString::to_string)))
+        run_attached(|| Ok(self.inner.fault().map(ToString::to_string)))
     }
 
     #[getter]
-    fn written(&self) -> PyResult<[f64; 2]> {
-        attached(|| Ok(self.inner.written()))
+    fn last_currents(&self) -> PyResult<[f64; 2]> {
+        run_attached(|| Ok(self.inner.last_currents()))
     }
 
     #[getter]
     fn bias(&self) -> PyResult<[f64; 2]> {
-        attached(|| Ok(self.inner.bias()))
+        run_attached(|| Ok(self.inner.bias()))
     }
 
     #[getter]
-    fn missed(&self) -> PyResult<u64> {
-        attached(|| Ok(self.inner.missed()))
+    fn missed_deadlines(&self) -> PyResult<u64> {
+        run_attached(|| Ok(self.inner.missed_deadlines()))
     }
 }
 
@@ -126,7 +126,7 @@ struct ArmArg {
 impl ArmArg {
     fn parameters(self) -> PyResult<Parameters> {
         let inputs = [false, false, false, false, true, true];
-        Ok(Parameters { equations: equations(self.equations, SIGNALS, &inputs)?, coulomb: self.coulomb })
+        Ok(Parameters { equations: equations(self.equations, SIGNAL_COUNT, &inputs)?, coulomb: self.coulomb })
     }
 }
 
@@ -166,13 +166,13 @@ impl From<SensorsArg> for Sensors {
     }
 }
 
-/// The physical arm behind its converters, stepped and paced; see the module `virtual_arm` of the core.
+/// Virtual arm with sensors and converters, see module `rig::virtual_arm` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct VirtualArm {
     plant: Plant,
     step: f64,
     pace: Option<Pace>,
-    rows: Vec<[f64; COLUMNS]>,
+    rows: Vec<[f64; SAMPLE_COLUMNS]>,
 }
 
 #[pymethods]
@@ -187,25 +187,25 @@ impl VirtualArm {
         horizon: f64,
     ) -> PyResult<Self> {
         let (arm, sensors) = (arm.parameters()?, sensors.into());
-        let plant = detached(py, || Plant::new(Arm::new(&arm, step, longest_substep, horizon)?, sensors))?;
+        let plant = run_detached(py, || Plant::new(Arm::new(&arm, step, longest_substep, horizon)?, sensors))?;
         Ok(Self { plant, step, pace: None, rows: Vec::new() })
     }
 
-    /// Counts deadlines from now on, or steps as fast as possible.
+    /// Start with real-time deadlines from now on, or step as fast as possible.
     fn start(&mut self, paced: bool) -> PyResult<()> {
-        attached(|| {
+        run_attached(|| {
             self.pace = if paced { Some(Pace::new(self.step)?) } else { None };
             Ok(())
         })
     }
 
     fn read(&mut self, noise: [f64; 4]) -> PyResult<([f64; 4], [i32; 2], [i8; 4])> {
-        let reading = attached(|| Ok(self.plant.read(noise)))?;
+        let reading = run_attached(|| Ok(self.plant.read(noise)))?;
         Ok((reading.analog, reading.counts, reading.switches))
     }
 
     fn advance(&mut self, volts: [f64; 2], enabled: bool) -> PyResult<()> {
-        attached(|| {
+        run_attached(|| {
             self.plant.advance(volts, enabled);
             Ok(())
         })
@@ -225,10 +225,10 @@ impl VirtualArm {
                 return Err(Error::Structure { what, remedy: "see ftlm.rig.INJECTIONS".into() }.into());
             }
         };
-        attached(|| self.plant.inject(injection))
+        run_attached(|| self.plant.inject(injection))
     }
 
-    /// Samples at rest: readings go to the guard, 0 V to the output.
+    /// Run samples at rest: readings to the guard, 0 V to the output.
     #[allow(clippy::needless_pass_by_value)]
     fn rest(
         &mut self,
@@ -240,7 +240,7 @@ impl VirtualArm {
         check_length("noise", 4, noise.shape()[1])?;
         for noise in noise.as_array().outer_iter() {
             self.wait(py)?;
-            attached(|| {
+            run_attached(|| {
                 let reading = self.plant.read(std::array::from_fn(|i| noise[i]));
                 guard.inner.rest(&reading);
                 Ok(())
@@ -253,7 +253,7 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Samples under commands, until they end or a fault latches; what was read waits in `take`.
+    /// Run samples under commands, until these end or a fault latches. `take` returns the readings.
     #[allow(clippy::needless_pass_by_value)]
     fn run(
         &mut self,
@@ -274,12 +274,12 @@ impl VirtualArm {
                 self.write(output, [0.0; 2])?;
                 break;
             }
-            let volts = attached(|| {
+            let volts = run_attached(|| {
                 let reading = self.plant.read(std::array::from_fn(|i| noise[i]));
                 let v = guard.inner.read(&reading, late);
                 let volts = guard.inner.command([command[0], command[1]]);
-                let [i1, i2] = guard.inner.written();
-                // A reading that is no number is a fault, which says so, and no measurement.
+                let [i1, i2] = guard.inner.last_currents();
+                // A reading that is not finite raises a fault and is not recorded.
                 if v.iter().all(|x| x.is_finite()) {
                     self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
                 }
@@ -293,50 +293,51 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Rows since the last call, shape (n, 9).
+    /// Samples since the last call, shape (n, 9).
     fn take<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        let rows: Vec<Vec<f64>> = attached(|| Ok(std::mem::take(&mut self.rows).iter().map(|r| r.to_vec()).collect()))?;
+        let rows: Vec<Vec<f64>> =
+            run_attached(|| Ok(std::mem::take(&mut self.rows).iter().map(|r| r.to_vec()).collect()))?;
         if rows.is_empty() {
-            return Ok(PyArray2::zeros(py, [0, COLUMNS], false));
+            return Ok(PyArray2::zeros(py, [0, SAMPLE_COLUMNS], false));
         }
-        stacked(py, &rows)
+        stack_rows(py, &rows)
     }
 
     #[getter]
     fn sample(&self) -> PyResult<u64> {
-        attached(|| Ok(self.plant.sample()))
+        run_attached(|| Ok(self.plant.sample()))
     }
 
     #[getter]
     fn angles(&self) -> PyResult<[f64; 4]> {
-        attached(|| Ok(self.plant.arm.angles()))
+        run_attached(|| Ok(self.plant.arm.angles()))
     }
 
     #[getter]
     fn memory(&self) -> PyResult<usize> {
-        attached(|| Ok(self.plant.arm.memory()))
+        run_attached(|| Ok(self.plant.arm.memory()))
     }
 }
 
 impl VirtualArm {
     fn wait(&mut self, py: Python<'_>) -> PyResult<f64> {
         match &mut self.pace {
-            Some(pace) => detached(py, || Ok(pace.wait())),
+            Some(pace) => run_detached(py, || Ok(pace.wait())),
             None => Ok(0.0),
         }
     }
 
-    /// Hands volts to the output stage and steps the arm under what the stage lets through.
+    /// Pass volts to the output stage and advance the arm under its result.
     fn write(&mut self, output: &Bound<'_, PyAny>, volts: [f64; 2]) -> PyResult<()> {
         let (through, enabled): ([f64; 2], bool) = output.call1((volts[0], volts[1]))?.extract()?;
-        attached(|| {
+        run_attached(|| {
             self.plant.advance(through, enabled);
             Ok(())
         })
     }
 }
 
-/// I^q of a signal that is linear between its samples, online through the sum of exponentials: what the arm computes.
+/// I^q of a signal that is linear between samples, online by the sum of exponentials, as the virtual arm computes it.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fractional_memory<'py>(
@@ -347,6 +348,6 @@ pub fn fractional_memory<'py>(
     tolerance: f64,
 ) -> PyResult<(Bound<'py, PyArray1<f64>>, usize)> {
     let x = vector("samples", &samples)?;
-    let (integral, memory) = detached(py, || integral_by_memory(&x, order, step, tolerance))?;
+    let (integral, memory) = run_detached(py, || integral_by_memory(&x, order, step, tolerance))?;
     Ok((PyArray1::from_vec(py, integral), memory))
 }

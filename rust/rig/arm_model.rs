@@ -1,15 +1,16 @@
-//! The two-link arm stepped in time: four linear equations of fractional order in its angles, and dry friction of its hubs.
+//! Two-link arm stepped in time: four coupled fractional-order equations in its angles, with dry friction at its
+//! joints.
 //!
-//! Which equations is not said here: whoever makes the arm hands them over with orders and coefficients, the same that
-//! identification and free runs read. Each is integrated once. What is differentiated by more than 1, D^ν θ with ν > 1,
-//! then stands on the left as a momentum, D^{ν−1} θ, so that what hangs on the motion of something else hangs on its rate;
-//! everything else is a force. Fractional derivatives of the angles are integrals of their rates, D^ν θ = I^{1−ν} θ′ and
-//! D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep; the past lives in a fixed number of exponentials
-//! ([`crate::fractional::exponential_sum`]). One substep is a trapezoidal step, implicit in all four rates at once.
+//! The caller supplies the equations with orders and coefficients, the same that identification and simulation use.
+//! Each equation is integrated once. Derivatives above order 1, D^ν θ with ν > 1, then appear on the left as momenta
+//! D^{ν−1} θ. All other terms are forces. Fractional derivatives of the angles are integrals of their rates, D^ν θ =
+//! I^{1−ν} θ′ and D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep. The history is stored in a fixed
+//! number of exponentials ([`crate::fractional::exponential_sum`]). One substep is a trapezoidal step, implicit in all
+//! four rates.
 //!
-//! A hub's Coulomb friction is a set-valued torque: it counts as a current that is subtracted from the motor's and may take
-//! any value up to its limit at standstill, by the law of a pulse of [`crate::friction::law`] for each of two hubs that
-//! feel each other.
+//! Coulomb friction of a joint is a set-valued torque. It is expressed as a current that is subtracted from the motor's
+//! and may take any value up to its limit at standstill, by the law of a pulse of [`crate::friction::law`], for two
+//! coupled joints.
 
 use crate::equation::{check_regular, tidy, Equation, ORDER_GRAIN};
 use crate::error::{check_length, check_step, Error, Result};
@@ -17,46 +18,46 @@ use crate::fractional::exponential_sum::{decay, Rates};
 use crate::friction::law::{pulse, Phase};
 use crate::linalg::small;
 
-/// Accuracy of the memory's kernels: far below what the trapezoidal steps leave.
+/// Accuracy of the memory kernels, far below the error of the trapezoidal steps.
 const MEMORY_TOLERANCE: f64 = 1e-10;
-/// Sweeps of the friction solve; two hubs need one where the stages are apart and a few where they are not.
+/// Most sweeps of the friction solve. One is enough for decoupled joints, a few for coupled ones.
 const FRICTION_SWEEPS: usize = 60;
-/// Share of the most that friction takes from a rate which may be rounding.
-const ROUNDING: f64 = 1e-12;
+/// Rounding error relative to the largest rate change by friction.
+const RATE_ROUNDING_RATIO: f64 = 1e-12;
 
-/// Most substeps of a sample: more take seconds each, and a slip of the hand would never end.
+/// Most substeps of a sample. More would take seconds each.
 const MOST_SUBSTEPS: f64 = 1e6;
 
-/// Signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
-pub const SIGNALS: usize = 6;
+/// Number of signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
+pub const SIGNAL_COUNT: usize = 6;
 
-/// What the arm obeys.
+/// Equations and friction of the arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// D^α θ = Σ c D^ν s of the four angles in their order, over [`SIGNALS`]; currents as they are.
+    /// D^α θ = Σ c D^ν s of the four angles in order, over [`SIGNAL_COUNT`] signals with raw currents.
     pub equations: Vec<Equation>,
-    /// Coulomb friction of each hub as a current \[A\].
+    /// Coulomb friction of each joint as a current \[A\].
     pub coulomb: [f64; 2],
 }
 
-/// A derivative of one angle and what it contributes to the four equations.
+/// Derivative of one angle and its contributions to the four equations.
 #[derive(Debug, Clone, Default)]
 struct Operator {
     signal: usize,
     order: f64,
     into: [f64; 4],
-    /// Momenta that it is part of: what stands on the left of the equations, integrated once.
+    /// Contributions to the momenta on the left of the integrated equations.
     momentum: [f64; 4],
-    /// On the states of the past; empty for orders 0 and 1.
+    /// Weights of the history states. Empty for orders 0 and 1.
     weights: Vec<f64>,
-    /// On the rate at the start and at the end of the substep.
+    /// Weights of the rate at the start and at the end of the substep.
     before: f64,
     now: f64,
     /// Its value at the start of the substep.
     value: f64,
 }
 
-/// The arm's state and its substep.
+/// State and discretization of the arm.
 #[derive(Debug, Clone)]
 pub struct Arm {
     substep: f64,
@@ -65,7 +66,7 @@ pub struct Arm {
     /// Accelerations per ampere of both motors.
     input: [[f64; 2]; 4],
     coulomb: [f64; 2],
-    /// (P − h/2·C)⁻¹ with P the momenta and C the forces per rate at the end of the substep.
+    /// (P − h/2·C)⁻¹ with the momenta P and the forces C per rate at the end of the substep.
     solve: [[f64; 4]; 4],
     implicit: [[f64; 4]; 4],
     keep: Vec<f64>,
@@ -79,13 +80,13 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// An arm at rest, stepped `step` s at a time in substeps of at most `longest_substep`, for `horizon` s.
+    /// Arm at rest, stepped `step` s at a time in substeps of at most `longest_substep`, for `horizon` s.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for an order outside [0, 3), a highest order outside (1, 2], a negative friction, a step that
-    /// is not positive, a horizon that is no number, more than a million substeps; [`Error::NotFinite`] for a
-    /// coefficient; [`Error::Structure`] for equations that do not tell the angles apart, a differentiated current, and
-    /// friction of a hub whose motor does not drive it.
+    /// [`Error::OutOfRange`] for an order outside [0, 3), a highest order outside (1, 2], a negative friction, a step
+    /// that is not positive, a horizon that is NaN, more than a million substeps; [`Error::NotFinite`] for a
+    /// coefficient; [`Error::Structure`] for a singular leading matrix, a differentiated current, and friction of a
+    /// joint that its motor does not drive.
     pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
         check_step(step)?;
         check_step(longest_substep)?;
@@ -128,7 +129,7 @@ impl Arm {
         }
         let steps: Vec<(f64, f64, f64)> = rates.rates().iter().map(|s| decay(s * h)).collect();
         let count = steps.len();
-        // What is differentiated by whole orders alone has no past.
+        // Angles that are differentiated by integer orders only have no history.
         let remembered: [bool; 4] =
             std::array::from_fn(|s| operators.iter().any(|o| o.signal == s && !o.weights.is_empty()));
         let arm = Self {
@@ -163,25 +164,25 @@ impl Arm {
         Ok(arm)
     }
 
-    /// θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\].
+    /// Angles θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\].
     #[must_use]
     pub fn angles(&self) -> [f64; 4] {
         self.angle
     }
 
-    /// Their rates \[rad/s\].
+    /// Rates of the angles \[rad/s\].
     #[must_use]
     pub fn rates(&self) -> [f64; 4] {
         self.rate
     }
 
-    /// How many numbers hold the past.
+    /// Number of history states.
     #[must_use]
     pub fn memory(&self) -> usize {
         self.past.iter().map(Vec::len).sum()
     }
 
-    /// One sample under held motor currents \[A\]. Constant time.
+    /// Advance by one sample with held motor currents \[A\]. Constant time.
     pub fn advance(&mut self, current: [f64; 2]) {
         for _ in 0..self.substeps {
             self.substep(current);
@@ -204,7 +205,7 @@ impl Arm {
             for (sum, c) in gained.iter_mut().zip(operator.momentum) {
                 *sum += c * (operator.value - value);
             }
-            // But for what the rate at the end adds.
+            // The contribution of the final rate follows below.
             operator.value = value;
         }
         let mut right = [0.0; 4];
@@ -214,7 +215,7 @@ impl Arm {
         }
         let mut rate = times(&self.solve, &right);
         if self.coulomb != [0.0; 2] {
-            self.rub(&mut rate);
+            self.apply_friction(&mut rate);
         }
         for operator in &mut self.operators {
             operator.value += operator.now * rate[operator.signal];
@@ -237,8 +238,8 @@ impl Arm {
         std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])))
     }
 
-    /// Coulomb friction: what each hub's own law asks for beside the other's, until both agree.
-    fn rub(&mut self, rate: &mut [f64; 4]) {
+    /// Apply Coulomb friction: iterate over the friction laws of the joints until both agree.
+    fn apply_friction(&mut self, rate: &mut [f64; 4]) {
         let columns = self.columns();
         let free = *rate;
         let mut friction = self.friction;
@@ -249,7 +250,7 @@ impl Arm {
                 let (hub, other) = (2 * k, 1 - k);
                 let without = free[hub] - columns[other][hub] * friction[other];
                 let most = columns[k][hub] * self.coulomb[k];
-                let (sign, _, phase) = pulse(self.rate[hub], without, most, ROUNDING * most);
+                let (sign, _, phase) = pulse(self.rate[hub], without, most, RATE_ROUNDING_RATIO * most);
                 let next = self.coulomb[k] * sign;
                 change = change.max((next - friction[k]).abs());
                 friction[k] = next;
@@ -264,7 +265,7 @@ impl Arm {
             rate[i] = free[i] - columns[0][i] * friction[0] - columns[1][i] * friction[1];
         }
         for k in 0..2 {
-            // A hub held by friction stands still exactly, and its encoder with it.
+            // A joint held by friction has a rate of exactly 0, so its encoder does not count.
             if rests[k] {
                 rate[2 * k] = 0.0;
             }
@@ -283,16 +284,17 @@ impl Operator {
         } else if self.order == 1.0 {
             (self.before, self.now) = (0.0, 1.0);
         } else if self.order < 1.0 {
-            // I^q of a rate that is linear over the last substep, exactly; older parts through the exponentials.
+            // I^q of a rate that is linear over the last substep, exactly. The exponentials represent the history
+            // before.
             let q = 1.0 - self.order;
             let scale = libm::pow(h, q) / libm::tgamma(q + 2.0);
             (self.before, self.now) = (q * scale, scale);
-            self.weights = decayed(rates, q, h);
+            self.weights = past_weights(rates, q, h);
         } else {
             let q = 2.0 - self.order;
             let scale = libm::pow(h, q - 1.0) / libm::tgamma(q + 1.0);
             // ∫ e^{−s(t−τ)} θ″ dτ = θ′(t) − s z(t).
-            let weights = decayed(rates, q, h);
+            let weights = past_weights(rates, q, h);
             self.before = weights.iter().sum::<f64>() - scale;
             self.now = scale;
             self.weights = weights.iter().zip(rates.rates()).map(|(w, s)| -w * s).collect();
@@ -301,7 +303,7 @@ impl Operator {
 }
 
 /// Weights of the kernel at lags beyond a substep.
-fn decayed(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
+fn past_weights(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
     rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
 }
 
@@ -312,7 +314,7 @@ fn singular() -> Error {
     }
 }
 
-/// The forces and momenta of the four equations as derivatives of the angles, and their motor currents.
+/// Forces and momenta of the four equations as derivatives of the angles, and their motor currents.
 fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4])> {
     check_length("equations of the arm", 4, parameters.equations.len())?;
     let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
@@ -338,11 +340,11 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
         if !(alpha > 1.0 && alpha <= 2.0) {
             return Err(outside("highest order of the arm", alpha, "(1, 2]"));
         }
-        // What is on the left counts as taken from the right.
+        // Terms on the left count with a negative sign on the right.
         let terms = structure.terms.iter().zip(&equation.coefficients).map(|(t, &c)| (t.signal, t.order, c));
         for (signal, order, c) in std::iter::once((row, alpha, -1.0)).chain(terms) {
-            if signal >= SIGNALS {
-                let what = format!("an equation of the arm names signal {signal}, but it has {SIGNALS}");
+            if signal >= SIGNAL_COUNT {
+                let what = format!("an equation of the arm names signal {signal}, but it has {SIGNAL_COUNT}");
                 return Err(Error::Structure { what, remedy: "number four angles and two currents from 0".into() });
             }
             if signal >= 4 {
@@ -353,7 +355,7 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
                 input[row][signal - 4] += c;
                 continue;
             }
-            // Beyond 3 even the momentum would be differentiated more often than trapezoids follow.
+            // Above 3 even the momentum would have a derivative above order 2, which trapezoidal steps do not support.
             if !(0.0..3.0).contains(&order) {
                 return Err(outside("order of the arm", order, "[0, 3)"));
             }

@@ -1,4 +1,4 @@
-//! What stands on either side of a command: the guard of both rigs, and the simulated arm, stepped and paced.
+//! Rig: safety guard of real and virtual rigs, and the simulated two-link arm with real-time pacing.
 
 pub mod arm_model;
 pub mod safety_guard;

@@ -1,47 +1,46 @@
-//! What stands between a command and a motor, on either rig: limits on every write, and faults that latch with their
-//! cause in words.
+//! Safety guard of real and virtual rigs: limits on every motor command, and latched faults.
 
 use thiserror::Error;
 
 use crate::error::{Error, Result};
 use crate::rig::virtual_arm::Reading;
 
-/// Numbers of the arm that limits and faults are judged by; pairs are stage 1 and stage 2.
+/// Limits and scales of the guard. Pairs are joint 1 and joint 2.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
-    /// Time between samples \[s\].
+    /// Sampling interval \[s\].
     pub step: f64,
-    /// Deflection per volt of strain gauge \[rad/V\]; the deflection is minus the volts less their bias times this.
+    /// Deflection per volt of strain gauge \[rad/V\]. The deflection is minus the volts above bias times this.
     pub strain_scale: [f64; 2],
-    /// Current per volt of the sense \[A/V\]; the current is minus the volts times this.
+    /// Current per volt of the sense input \[A/V\]. The current is minus the volts times this.
     pub sense_scale: f64,
-    /// Current per volt of the command \[A/V\]; the volts are minus the current over this.
+    /// Current per volt of the command \[A/V\]. The volts are minus the current over this.
     pub command_scale: f64,
-    /// Hub angle per count \[rad\].
+    /// Joint angle per encoder count \[rad\].
     pub encoder_scale: [f64; 2],
     /// Largest command \[A\].
     pub current_limit: [f64; 2],
     /// Largest change of a command \[A/s\].
     pub slew: [f64; 2],
-    /// Current that a motor bears for ever \[A\]; the mean square over `thermal_time` stays below its square.
+    /// Continuous current of a motor \[A\]. The mean square over `thermal_time` stays below its square.
     pub continuous: [f64; 2],
-    /// Time over which squares of the current are averaged \[s\].
+    /// Averaging time of the squared current \[s\].
     pub thermal_time: f64,
     /// Largest deflection \[rad\].
     pub deflection_limit: [f64; 2],
-    /// Volts from which a gauge counts as saturated.
+    /// Gauge voltage of saturation \[V\].
     pub saturation: f64,
-    /// Current from which a hub must move \[A\].
+    /// Current above which a joint must move \[A\].
     pub moving_current: f64,
-    /// Time that it may stand still under it \[s\].
+    /// Longest standstill above that current \[s\].
     pub standstill: f64,
-    /// Fastest hub \[rad/s\]: a count that jumps further than it goes in a sample has lost its place.
+    /// Highest joint speed \[rad/s\]. A larger jump of the encoder is a fault.
     pub fastest: f64,
-    /// Longest delay of a write \[s\].
+    /// Longest delay of a command \[s\].
     pub late_limit: f64,
-    /// Missed deadlines in a row that are borne.
+    /// Most consecutive missed deadlines.
     pub missed_limit: u32,
-    /// Sensor filter of both deflections: natural frequency \[rad/s\] and damping.
+    /// Sensor filter of both deflections: natural frequency \[rad/s\] and damping ratio.
     pub filter: Option<(f64, f64)>,
 }
 
@@ -92,10 +91,10 @@ impl Settings {
     }
 }
 
-/// Why the motors were stopped.
+/// Reason for which the motors were stopped.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Fault {
-    /// NaN or infinity.
+    /// Command that is NaN or infinite.
     #[error("the command of motor {stage} is {value}, not a finite current; correct the input")]
     Command {
         /// Which motor.
@@ -103,7 +102,7 @@ pub enum Fault {
         /// The value.
         value: f64,
     },
-    /// No count although the motor is driven.
+    /// Encoder that does not count although its motor is driven.
     #[error("encoder {stage} has not counted for {seconds:.2} s under {current:.2} A or more; it is dead, or the hub is blocked: check its cable and the gear")]
     DeadEncoder {
         /// Which hub.
@@ -113,7 +112,7 @@ pub enum Fault {
         /// Current from which it must move \[A\].
         current: f64,
     },
-    /// More counts than the hub can go.
+    /// Encoder jump beyond the highest joint speed.
     #[error(
         "encoder {stage} jumped by {counts} counts in one sample; its counter wrapped or its cable is loose: check it"
     )]
@@ -123,7 +122,7 @@ pub enum Fault {
         /// How far.
         counts: i64,
     },
-    /// A gauge at its rail.
+    /// Strain gauge in saturation.
     #[error("strain gauge {stage} is saturated at {volts:.2} V; check its amplifier and cable")]
     Saturated {
         /// Which link.
@@ -131,7 +130,7 @@ pub enum Fault {
         /// Reading \[V\].
         volts: f64,
     },
-    /// A gauge that does not follow its motor.
+    /// Strain gauge that does not respond to its motor.
     #[error("strain gauge {stage} has stood at {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is dead, and would not see the link bend: check its amplifier and cable")]
     DeadGauge {
         /// Which link.
@@ -143,7 +142,7 @@ pub enum Fault {
         /// Change of the current which it must follow \[A\].
         current: f64,
     },
-    /// A current sense that reads no number.
+    /// Current sense that is not finite.
     #[error("the current sense of motor {stage} reads {volts} V; check the board's analog inputs")]
     Sense {
         /// Which motor.
@@ -151,7 +150,7 @@ pub enum Fault {
         /// Reading \[V\].
         volts: f64,
     },
-    /// A link bent too far.
+    /// Deflection above its limit.
     #[error("link {stage} is bent by {degrees:.2} degrees, more than the limit of {limit:.2}; use a smaller amplitude or avoid its resonance")]
     Deflection {
         /// Which link.
@@ -161,7 +160,7 @@ pub enum Fault {
         /// Limit \[degrees\].
         limit: f64,
     },
-    /// A limit switch.
+    /// Limit switch that is tripped.
     #[error(
         "limit switch {line} is tripped; move the arm off the switch by hand with the amplifier off, then start again"
     )]
@@ -169,7 +168,7 @@ pub enum Fault {
         /// Digital line.
         line: usize,
     },
-    /// One very late write.
+    /// Single command that is far too late.
     #[error("a command was {milliseconds:.1} ms late, more than the limit of {limit:.0} ms; lower the rate or the machine's load")]
     Late {
         /// Delay \[ms\].
@@ -177,13 +176,13 @@ pub enum Fault {
         /// Limit \[ms\].
         limit: f64,
     },
-    /// Many late writes.
+    /// Too many consecutive missed deadlines.
     #[error("{count} deadlines in a row were missed; lower the rate or the machine's load")]
     Missed {
         /// How many.
         count: u32,
     },
-    /// What the rig itself reports.
+    /// Fault reported by the rig.
     #[error("{0}")]
     Rig(String),
 }
@@ -208,7 +207,7 @@ pub struct Guard {
 }
 
 impl Guard {
-    /// A guard before its run.
+    /// Guard before its run.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a setting that is not a positive, finite number.
@@ -261,36 +260,36 @@ impl Guard {
         })
     }
 
-    /// The first fault; it stays.
+    /// First fault. It is latched.
     #[must_use]
     pub fn fault(&self) -> Option<&Fault> {
         self.fault.as_ref()
     }
 
-    /// Latches a fault, unless there is one already.
+    /// Latch a fault, unless one is latched already.
     pub fn fail(&mut self, fault: Fault) {
         self.fault.get_or_insert(fault);
     }
 
-    /// Currents that were written last \[A\].
+    /// Currents of the last command \[A\].
     #[must_use]
-    pub fn written(&self) -> [f64; 2] {
+    pub fn last_currents(&self) -> [f64; 2] {
         self.written
     }
 
-    /// Gauge readings at rest \[V\].
+    /// Gauge voltages at rest \[V\].
     #[must_use]
     pub fn bias(&self) -> [f64; 2] {
         self.bias
     }
 
-    /// Deadlines missed in all.
+    /// Total number of missed deadlines.
     #[must_use]
-    pub fn missed(&self) -> u64 {
+    pub fn missed_deadlines(&self) -> u64 {
         self.missed_in_all
     }
 
-    /// A reading before the motors are enabled: the gauges' bias and the encoders' zero.
+    /// Process a reading before the motors are enabled: gauge bias and encoder zero.
     pub fn rest(&mut self, reading: &Reading) {
         self.check(reading);
         self.rest += 1;
@@ -304,7 +303,7 @@ impl Guard {
         self.previous = Some(reading.counts);
     }
 
-    /// θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\] and both measured currents \[A\] of a reading that came `late` s after its instant.
+    /// Convert a reading that is `late` s after its deadline: θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\] and both currents \[A\].
     pub fn read(&mut self, reading: &Reading, late: f64) -> [f64; 6] {
         self.check(reading);
         let mut hubs = [0.0; 2];
@@ -317,11 +316,11 @@ impl Guard {
                 let (degrees, limit) = (bends[j].to_degrees(), s.deflection_limit[j].to_degrees());
                 self.fail(Fault::Deflection { stage: j + 1, degrees, limit });
             }
-            self.follow(j, reading.counts[j]);
-            self.bends(j, reading.analog[j]);
+            self.check_encoder(j, reading.counts[j]);
+            self.check_gauge(j, reading.analog[j]);
         }
         self.previous = Some(reading.counts);
-        self.deadline(late);
+        self.check_deadline(late);
         if let Some(filters) = &mut self.filters {
             for (filter, bend) in filters.iter_mut().zip(&mut bends) {
                 *bend = filter.step(*bend);
@@ -331,9 +330,9 @@ impl Guard {
         [hubs[0], bends[0], hubs[1], bends[1], -reading.analog[2] * scale, -reading.analog[3] * scale]
     }
 
-    /// The innermost write: volts for both motors that no command can push outside the limits.
+    /// Volts for both motors within all limits. Every command passes this function last.
     ///
-    /// Zero while a fault is latched; a command that is not finite latches one.
+    /// Zero while a fault is latched. A command that is not finite latches a fault.
     pub fn command(&mut self, current: [f64; 2]) -> [f64; 2] {
         for (j, value) in current.iter().enumerate() {
             if !value.is_finite() {
@@ -352,7 +351,7 @@ impl Guard {
             let slewed = current[j]
                 .clamp(-s.current_limit[j], s.current_limit[j])
                 .clamp(self.written[j] - change, self.written[j] + change);
-            // The largest current that leaves the mean square at or below what the motor bears.
+            // Largest current that keeps the mean square within the continuous limit.
             let room = self.heat[j] + (s.continuous[j] * s.continuous[j] - self.heat[j]) / share;
             let bearable = room.max(0.0).sqrt().min(s.current_limit[j]);
             let written = slewed.clamp(-bearable, bearable);
@@ -381,7 +380,7 @@ impl Guard {
         }
     }
 
-    fn follow(&mut self, j: usize, counts: i32) {
+    fn check_encoder(&mut self, j: usize, counts: i32) {
         let Some(previous) = self.previous else { return };
         let moved = i64::from(counts) - i64::from(previous[j]);
         let s = &self.settings;
@@ -402,8 +401,8 @@ impl Guard {
         }
     }
 
-    /// Noise alone moves a gauge that lives; without any, a changed torque does.
-    fn bends(&mut self, j: usize, volts: f64) {
+    /// Noise alone changes the reading of a working gauge. Without noise, a changed torque does.
+    fn check_gauge(&mut self, j: usize, volts: f64) {
         let (s, gauge) = (&self.settings, &mut self.gauges[j]);
         #[allow(clippy::float_cmp)]
         if gauge.volts != volts {
@@ -417,7 +416,7 @@ impl Guard {
         }
     }
 
-    fn deadline(&mut self, late: f64) {
+    fn check_deadline(&mut self, late: f64) {
         let s = &self.settings;
         if late > s.step {
             self.missed += 1;
@@ -433,7 +432,7 @@ impl Guard {
     }
 }
 
-/// What a strain gauge read last, the current written when it began to, and for how long a changed one has not moved it.
+/// Last voltage of a strain gauge, the current at which it began, and its duration under a changed current.
 #[derive(Debug, Clone, Copy, Default)]
 struct Gauge {
     volts: f64,
@@ -441,7 +440,7 @@ struct Gauge {
     still: f64,
 }
 
-/// A second-order low-pass in the bilinear transform, as a real-time model runs it.
+/// Second-order low-pass filter by the bilinear transform, as in a real-time model.
 #[derive(Debug, Clone, Copy)]
 struct Filter {
     input: [f64; 3],

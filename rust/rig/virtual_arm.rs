@@ -1,11 +1,11 @@
-//! The arm behind its sensors and converters, stepped and paced in real time or not, and what goes wrong on purpose.
+//! Virtual arm: sensors, converters, real-time pacing and fault injection of the simulated arm.
 
 use std::time::{Duration, Instant};
 
 use super::arm_model::Arm;
 use crate::error::{check_finite, check_step, Error, Result};
 
-/// What the arm's sensors and converters make of it.
+/// Sensors and converters of the arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sensors {
     /// Deflection per volt of strain gauge \[rad/V\].
@@ -22,19 +22,19 @@ pub struct Sensors {
     pub command_scale: f64,
     /// Hub angle per count \[rad\].
     pub encoder_scale: [f64; 2],
-    /// Volts from end to end of the converters' range are twice this.
+    /// Half of the voltage range of the converters \[V\].
     pub range: f64,
-    /// Bits of the converters; 0 for none.
+    /// Resolution of the converters in bits. 0 disables quantization.
     pub bits: u32,
     /// Largest current of the amplifiers \[A\].
     pub current_limit: [f64; 2],
-    /// What drives each motor besides its command while its amplifier is enabled \[A\].
+    /// Disturbance of each motor current while its amplifier is enabled \[A\].
     pub offset: [f64; 2],
     /// Hub angle at which a limit switch opens \[rad\].
     pub travel: [f64; 2],
 }
 
-/// What goes wrong on purpose, from a sample on.
+/// Fault injection from a sample on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Injection {
     /// The encoder stops counting.
@@ -58,7 +58,7 @@ pub enum Injection {
         /// First sample.
         from: u64,
     },
-    /// The link bends by this much more \[rad\].
+    /// Deflection increased by this angle \[rad\].
     Deflection {
         /// Stage, from 0.
         stage: usize,
@@ -67,35 +67,35 @@ pub enum Injection {
         /// Angle \[rad\].
         angle: f64,
     },
-    /// The loop is late by this much at one sample \[s\], on the virtual clock.
+    /// Delay of the loop at one sample \[s\], on the virtual clock.
     Late {
         /// Sample.
         at: u64,
         /// Delay \[s\].
         seconds: f64,
     },
-    /// The board hands over no samples any more.
+    /// No samples from the board.
     LostSamples {
         /// First sample.
         from: u64,
     },
 }
 
-/// One reading of all channels at one instant.
+/// Simultaneous reading of all channels.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Reading {
     /// Strain 1, 2, current sense 1, 2 \[V\].
     pub analog: [f64; 4],
     /// Encoder counts.
     pub counts: [i32; 2],
-    /// Limit switches; 0 is tripped.
+    /// Limit switches, 0 if tripped.
     pub switches: [i8; 4],
 }
 
-/// The arm behind its converters.
+/// Arm with sensors and converters.
 #[derive(Debug, Clone)]
 pub struct Plant {
-    /// The arm itself.
+    /// Arm model.
     pub arm: Arm,
     sensors: Sensors,
     current: [f64; 2],
@@ -105,7 +105,7 @@ pub struct Plant {
 }
 
 impl Plant {
-    /// An arm at rest with no current.
+    /// Arm at rest with zero current.
     ///
     /// # Errors
     /// As [`Sensors::check`].
@@ -114,10 +114,10 @@ impl Plant {
         Ok(Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 })
     }
 
-    /// Adds something that goes wrong.
+    /// Add a fault injection.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a stage or a line that is not there, [`Error::NotFinite`] for its number.
+    /// [`Error::OutOfRange`] for a joint or a line that does not exist, [`Error::NotFinite`] for its value.
     pub fn inject(&mut self, injection: Injection) -> Result<()> {
         let place = |name: &str, index: usize, count: usize| {
             if index < count {
@@ -140,13 +140,13 @@ impl Plant {
         Ok(())
     }
 
-    /// Number of the sample that [`Self::read`] reads next.
+    /// Number of the sample that the next [`Self::read`] returns.
     #[must_use]
     pub fn sample(&self) -> u64 {
         self.sample
     }
 
-    /// All channels now; `noise` is standard normal, for strain 1, 2 and sense 1, 2.
+    /// Read all channels. `noise` is standard normal, for strain 1, 2 and sense 1, 2.
     pub fn read(&mut self, noise: [f64; 4]) -> Reading {
         let s = &self.sensors;
         let angles = self.arm.angles();
@@ -173,7 +173,7 @@ impl Plant {
                 }
             }
         }
-        // The arm rests in the middle of a count, so that counting has no bias.
+        // The arm rests in the middle of a count, so that quantization has no bias.
         #[allow(clippy::cast_possible_truncation)]
         let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j] + 0.5).floor() as i32);
         for injection in &self.injections {
@@ -186,13 +186,13 @@ impl Plant {
         Reading { analog, counts, switches }
     }
 
-    /// Whether the board still hands over samples.
+    /// Whether the board delivers samples.
     #[must_use]
     pub fn sampling(&self) -> bool {
         !self.injections.iter().any(|i| matches!(i, Injection::LostSamples { from } if self.sample >= *from))
     }
 
-    /// The injected delay at this sample \[s\].
+    /// Delay injected at this sample \[s\].
     #[must_use]
     pub fn delay(&self) -> f64 {
         let late = |i: &Injection| match *i {
@@ -202,7 +202,7 @@ impl Plant {
         self.injections.iter().map(late).sum()
     }
 
-    /// One sample under these volts at the amplifiers' inputs; disabled amplifiers give no current.
+    /// Advance by one sample with these volts at the amplifiers. Disabled amplifiers give no current.
     pub fn advance(&mut self, volts: [f64; 2], enabled: bool) {
         let s = &self.sensors;
         for ((current, volts), limit) in self.current.iter_mut().zip(volts).zip(s.current_limit) {
@@ -215,7 +215,7 @@ impl Plant {
     }
 }
 
-/// A number of the virtual arm outside its range.
+/// Error for a parameter of the virtual arm that is out of range.
 fn outside(name: &str, value: f64, range: &str) -> Error {
     Error::OutOfRange {
         name: name.into(),
@@ -225,12 +225,12 @@ fn outside(name: &str, value: f64, range: &str) -> Error {
     }
 }
 
-/// Finest converters: beyond these bits a step is below the rounding of the volts.
+/// Highest resolution of the converters. With more bits a step is below the rounding error of the volts.
 const MOST_BITS: u32 = 52;
 
 impl Sensors {
-    /// Refuses scales, limits and a range that are not positive, noise that is negative, offsets that are not finite and
-    /// converters of more bits than a number has.
+    /// Return an error for scales, limits or ranges that are not positive, negative noise, offsets that are not finite,
+    /// or a resolution of more bits than a float has.
     ///
     /// # Errors
     /// [`Error::OutOfRange`], [`Error::NotFinite`].
@@ -259,7 +259,7 @@ impl Sensors {
         Ok(())
     }
 
-    /// Clips to the converters' range and rounds to their steps; what is not a number becomes 0 V.
+    /// Clip to the converter range and quantize. NaN becomes 0 V.
     fn convert(&self, volts: f64) -> f64 {
         if !volts.is_finite() {
             return 0.0;
@@ -273,7 +273,7 @@ impl Sensors {
     }
 }
 
-/// Deadlines of a loop in real time, counted from its start.
+/// Real-time deadlines of a loop, counted from its start.
 #[derive(Debug)]
 pub struct Pace {
     start: Instant,
@@ -281,14 +281,14 @@ pub struct Pace {
     samples: u64,
 }
 
-/// The system's sleep ends late by some tens of microseconds; the rest is waited out awake.
-const AWAKE: Duration = Duration::from_micros(120);
+/// Time before a deadline that is spent spinning. The system's sleep ends late by some tens of microseconds.
+const SPIN_WAIT: Duration = Duration::from_micros(120);
 
-/// A loop in real time has its next sample within a day \[s\]: no instant overflows.
+/// Longest sampling interval in real time \[s\], one day, so that times do not overflow.
 const LONGEST_STEP: f64 = 86_400.0;
 
 impl Pace {
-    /// Starts now, with a deadline every `step` s.
+    /// Timer that starts now, with a deadline every `step` s.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a step that is not positive, or longer than a day.
@@ -300,7 +300,7 @@ impl Pace {
         Ok(Self { start: Instant::now(), step, samples: 0 })
     }
 
-    /// Waits for the next sample instant; how late it is when it returns \[s\].
+    /// Wait for the next deadline and return the delay \[s\].
     pub fn wait(&mut self) -> f64 {
         #[allow(clippy::cast_precision_loss)]
         let due = Duration::try_from_secs_f64(self.step * self.samples as f64)
@@ -312,7 +312,7 @@ impl Pace {
             let now = Instant::now();
             match due.checked_duration_since(now) {
                 None => return now.duration_since(due).as_secs_f64(),
-                Some(left) if left > AWAKE => std::thread::sleep(left - AWAKE),
+                Some(left) if left > SPIN_WAIT => std::thread::sleep(left - SPIN_WAIT),
                 Some(_) => std::hint::spin_loop(),
             }
         }

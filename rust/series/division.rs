@@ -1,9 +1,7 @@
-//! Division of series by forward substitution in blocks that are joined by transforms, O(m log² m).
+//! Division of series by forward substitution in blocks that are joined by FFT products, O(m log² m).
 //!
-//! Exact for every divisor with a leading coefficient, stable or not. [`Division`] hands out the quotient block by block,
-//! so that a search can stop reading a candidate that has lost.
-//!
-//! Quotients of series, and systems of series solved for one right-hand side or for many.
+//! Exact for every divisor with a nonzero leading coefficient, stable or not. [`Division`] returns the quotient block
+//! by block, so that a search can drop a candidate early.
 
 use std::borrow::Cow;
 
@@ -13,31 +11,31 @@ use crate::fft::{self, Bin, Plan, Workspace};
 use crate::linalg::small;
 use crate::simd;
 
-/// Length of a block of forward substitution; measured best of 16, 32, 64, 128 at m = 2048.
-pub const BLOCK: usize = 64;
+/// Length of a block of forward substitution. 64 was the fastest of 16, 32, 64, 128 at m = 2048.
+pub const BLOCK_TERMS: usize = 64;
 
-/// Up to this half length blocks are joined directly: it is faster there and free of transform rounding.
+/// Longest half length of blocks that are joined directly, which is faster there and has no transform rounding.
 const JOINED_DIRECTLY: usize = 64;
 
-/// Terms whose sums stay in registers while a tile of solved ones is taken off them.
-const TILE: usize = 8;
+/// Terms whose sums stay in registers while the products with a tile are subtracted.
+const TILE_TERMS: usize = 8;
 
-/// `open[i] −= Σ_s series[start − s + i]·solved[s]`, s from 0 on; every term by the same operations as one by one.
+/// `open[i] −= Σ_s series[start − s + i]·solved[s]`, s from 0 on, with the same operations for every term.
 #[inline(always)]
 fn take_off(open: &mut [f64], series: &[f64], start: usize, solved: &[f64]) {
     let mut at = start;
-    let mut tiles = open.chunks_exact_mut(2 * TILE);
+    let mut tiles = open.chunks_exact_mut(2 * TILE_TERMS);
     for tile in &mut tiles {
-        let mut sums = [0.0; 2 * TILE];
+        let mut sums = [0.0; 2 * TILE_TERMS];
         sums.copy_from_slice(tile);
         for (s, &y) in solved.iter().enumerate() {
-            let part = &series[at - s..at - s + 2 * TILE];
-            for i in 0..2 * TILE {
+            let part = &series[at - s..at - s + 2 * TILE_TERMS];
+            for i in 0..2 * TILE_TERMS {
                 sums[i] -= part[i] * y;
             }
         }
         tile.copy_from_slice(&sums);
-        at += 2 * TILE;
+        at += 2 * TILE_TERMS;
     }
     let rest = tiles.into_remainder();
     for (s, &y) in solved.iter().enumerate() {
@@ -60,22 +58,22 @@ impl simd::Kernel for Substitution<'_> {
     #[inline(always)]
     fn run(self) {
         let mut open = self.block;
-        while open.len() >= TILE {
-            let (tile, later) = open.split_at_mut(TILE);
-            // Of a length known beforehand: no loop of these is left, and nothing leaves the registers.
-            let mut head = [0.0; TILE];
-            let known = self.divisor.len().min(TILE);
+        while open.len() >= TILE_TERMS {
+            let (tile, later) = open.split_at_mut(TILE_TERMS);
+            // With a constant length the loop is unrolled and its values stay in registers.
+            let mut head = [0.0; TILE_TERMS];
+            let known = self.divisor.len().min(TILE_TERMS);
             head[..known].copy_from_slice(&self.divisor[..known]);
-            let mut solved = [0.0; TILE];
+            let mut solved = [0.0; TILE_TERMS];
             solved.copy_from_slice(tile);
-            for k in 0..TILE {
+            for k in 0..TILE_TERMS {
                 solved[k] *= self.inverse;
-                for i in k + 1..TILE {
+                for i in k + 1..TILE_TERMS {
                     solved[i] -= head[i - k] * solved[k];
                 }
             }
             tile.copy_from_slice(&solved);
-            take_off(later, self.divisor, TILE, &solved);
+            take_off(later, self.divisor, TILE_TERMS, &solved);
             open = later;
         }
         for k in 0..open.len() {
@@ -88,7 +86,7 @@ impl simd::Kernel for Substitution<'_> {
     }
 }
 
-/// What a solved block contributes to the terms right after it.
+/// Contribution of a solved block to the terms right after it.
 struct Join<'a> {
     series: &'a [f64],
     solved: &'a [f64],
@@ -104,25 +102,25 @@ impl simd::Kernel for Join<'_> {
     }
 }
 
-/// Transforms of one length in a division: their plan, and the spectra of the n² series once they are ready.
+/// Transform of one length in a division: plan and spectra of the n² series, computed on demand.
 struct Level {
     plan: Plan,
     ready: bool,
     spectra: Vec<Vec<Bin>>,
 }
 
-/// An n × n division under way: blocks of the quotients come out in order.
+/// State of an n × n division that computes the quotients block by block.
 ///
-/// Right-hand sides are added block by block ([`Division::add`]), then [`Division::advance`] solves the next block and
-/// adds its effect on the rest. After block b the only finished left half of the recursion is the one whose length is
-/// the largest power of two that divides b + 1, so one transform pair a block carries the whole recursion.
+/// Right-hand sides are added block by block ([`Division::add`]). [`Division::advance`] then solves the next block and
+/// adds its contributions to the rest. After block b the only finished left half of the recursion has the largest power
+/// of two that divides b + 1 as its length, so one transform pair a block is enough.
 pub struct Division {
     n: usize,
     m: usize,
     solved: usize,
-    /// Right-hand side less what solved blocks contribute, then the quotient, per unknown.
+    /// Right-hand side minus the contributions of solved blocks, then the quotient, per unknown.
     rest: Vec<Vec<f64>>,
-    /// One per power of two of blocks.
+    /// Transforms, one per power of two of blocks.
     levels: Vec<Level>,
     spectra: Vec<Vec<Bin>>,
     product: Vec<Bin>,
@@ -131,7 +129,7 @@ pub struct Division {
 }
 
 impl Division {
-    /// A division of n unknown series of m terms.
+    /// Division of n unknown series of m terms.
     #[must_use]
     pub fn new(n: usize, m: usize) -> Self {
         Self {
@@ -147,24 +145,24 @@ impl Division {
         }
     }
 
-    /// Forgets everything but the memory.
+    /// Reset everything except allocated memory.
     pub fn reset(&mut self) {
         self.levels.iter_mut().for_each(|level| level.ready = false);
         self.restart();
     }
 
-    /// Forgets the right-hand side but not the spectra: the same divisor follows.
+    /// Reset the right-hand side and keep the spectra, for the same divisor.
     pub fn restart(&mut self) {
         self.solved = 0;
         self.rest.iter_mut().for_each(|r| r.fill(0.0));
     }
 
-    /// Solves for whole right-hand sides.
+    /// Solve for complete right-hand sides.
     pub(super) fn run<S: AsRef<[f64]>>(&mut self, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
         self.run_to(self.m, matrix, inverse, rhs);
     }
 
-    /// The same for the first terms alone, and whatever its blocks solve behind them.
+    /// Solve for the first terms only, rounded up to blocks.
     pub(super) fn run_to<S: AsRef<[f64]>>(&mut self, terms: usize, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
         for (i, b) in rhs.iter().enumerate() {
             self.add(i, 0, b);
@@ -174,26 +172,26 @@ impl Division {
         }
     }
 
-    /// Number of terms solved so far.
+    /// Number of solved terms.
     #[must_use]
-    pub fn solved(&self) -> usize {
+    pub fn solved_terms(&self) -> usize {
         self.solved
     }
 
-    /// Adds to the right-hand side of equation i from term `start` on; `start` must not be solved yet.
+    /// Add to the right-hand side of equation i from term `start` on, which must not be solved yet.
     pub fn add(&mut self, i: usize, start: usize, values: &[f64]) {
         for (rest, &v) in self.rest[i][start..].iter_mut().zip(values) {
             *rest += v;
         }
     }
 
-    /// Quotient i as far as solved.
+    /// Quotient i as far as it is solved.
     #[must_use]
     pub fn quotient(&self, i: usize) -> &[f64] {
         &self.rest[i][..self.solved]
     }
 
-    /// All quotients, as far as they are solved; the rest is what is still to be divided.
+    /// All quotients. Terms beyond the solved ones are remainders.
     pub(super) fn quotients(&self) -> &[Vec<f64>] {
         &self.rest
     }
@@ -204,58 +202,59 @@ impl Division {
         self.rest
     }
 
-    /// How many terms of each series the next [`Division::advance`] reads.
+    /// Number of terms of each series that the next [`Division::advance`] reads.
     #[must_use]
     pub fn reads(&self) -> usize {
-        let hi = (self.solved + BLOCK).min(self.m);
+        let hi = (self.solved + BLOCK_TERMS).min(self.m);
         if hi == self.m {
             return hi - self.solved;
         }
-        (2 * (BLOCK << (hi / BLOCK).trailing_zeros())).min(self.m)
+        (2 * (BLOCK_TERMS << (hi / BLOCK_TERMS).trailing_zeros())).min(self.m)
     }
 
-    /// Number of terms in all.
+    /// Total number of terms.
     #[must_use]
     pub fn terms(&self) -> usize {
         self.m
     }
 
-    /// Solves the next block and joins it to the rest. `inverse` is the row-major inverse of the leading matrix;
-    /// `series(i, j, len)` gives the first `len` terms of A_ij (fewer where m is less), never more than
-    /// [`Division::reads`].
+    /// Solve the next block and join it to the rest.
+    ///
+    /// `inverse` is the row-major inverse of the leading matrix. `series(i, j, len)` returns the first `len` terms of
+    /// A_ij (fewer if m is smaller), never more than [`Division::reads`].
     pub fn advance<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         self.solve_block(inverse, &series);
         self.join(&series);
     }
 
-    /// The first half of [`Division::advance`]: the next block of the quotients, by forward substitution.
+    /// First half of [`Division::advance`]: next block of the quotients, by forward substitution.
     pub fn solve_block<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         let lo = self.solved;
-        let hi = (lo + BLOCK).min(self.m);
+        let hi = (lo + BLOCK_TERMS).min(self.m);
         self.substitute(inverse, &series, lo, hi);
         self.solved = hi;
     }
 
-    /// The second half of [`Division::advance`]: what the solved blocks contribute to those after them.
+    /// Second half of [`Division::advance`]: contributions of the solved blocks to later ones.
     pub fn join<'a>(&mut self, series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         let (n, hi) = (self.n, self.solved);
         if hi == self.m {
             return;
         }
-        let lo = hi.saturating_sub(BLOCK);
-        let blocks = hi / BLOCK;
+        let lo = hi.saturating_sub(BLOCK_TERMS);
+        let blocks = hi / BLOCK_TERMS;
         let level = blocks.trailing_zeros() as usize;
-        let half = BLOCK << level;
+        let half = BLOCK_TERMS << level;
         let end = (hi + half).min(self.m);
         if half <= JOINED_DIRECTLY {
             for i in 0..n {
                 for j in 0..n {
                     let a = series(i, j, (2 * half).min(self.m));
-                    // Split borrows: the solved part of j feeds the open part of i.
-                    let mut solved = [0.0; BLOCK];
+                    // Split borrows: the solved part of j contributes to the open part of i.
+                    let mut solved = [0.0; BLOCK_TERMS];
                     solved[..hi - lo].copy_from_slice(&self.rest[j][lo..hi]);
                     let open = &mut self.rest[i][hi..end];
-                    simd::widest(Join { series: a, solved: &solved[..hi - lo], open });
+                    simd::dispatch_simd(Join { series: a, solved: &solved[..hi - lo], open });
                 }
             }
             return;
@@ -271,7 +270,7 @@ impl Division {
             time[half..].fill(0.0);
             let bins = plan.bins().max(self.spectra[j].len());
             self.spectra[j].resize(bins, zero);
-            plan.forward(time, &mut self.spectra[j][..plan.bins()], &mut self.workspace);
+            plan.transform(time, &mut self.spectra[j][..plan.bins()], &mut self.workspace);
         }
         for i in 0..n {
             let product = &mut self.product[..plan.bins()];
@@ -281,7 +280,7 @@ impl Division {
                     *p += x * k;
                 }
             }
-            // The wrapped part of the cyclic product falls on the first half, which is not read.
+            // Wrapped-around terms of the cyclic product fall on the first half, which is not read.
             plan.inverse(product, &mut self.time[..plan.len()], &mut self.workspace);
             for (rest, &v) in self.rest[i][hi..end].iter_mut().zip(&self.time[half..]) {
                 *rest -= v;
@@ -299,7 +298,7 @@ impl Division {
         let n = self.n;
         if n == 1 {
             let (divisor, block) = (series(0, 0, hi - lo), &mut self.rest[0][lo..hi]);
-            simd::widest(Substitution { divisor, inverse: inverse[0], block });
+            simd::dispatch_simd(Substitution { divisor, inverse: inverse[0], block });
             return;
         }
         let mut values = vec![0.0; n];
@@ -323,7 +322,7 @@ impl Division {
 
     fn prepare<'a>(&mut self, level: usize, series: &impl Fn(usize, usize, usize) -> &'a [f64]) {
         while self.levels.len() <= level {
-            let plan = fft::plan(2 * (BLOCK << self.levels.len()));
+            let plan = fft::plan(2 * (BLOCK_TERMS << self.levels.len()));
             self.levels.push(Level { plan, ready: false, spectra: Vec::new() });
         }
         let Level { plan, ready, spectra } = &mut self.levels[level];
@@ -338,13 +337,13 @@ impl Division {
             time[..a.len()].copy_from_slice(a);
             time[a.len()..].fill(0.0);
             spectrum.resize(plan.bins(), Bin::new(0.0, 0.0));
-            plan.forward(time, spectrum, &mut self.workspace);
+            plan.transform(time, spectrum, &mut self.workspace);
         }
         *ready = true;
     }
 }
 
-/// Quotient mod z^m, m the numerator's length; exact whether or not the divisor is stable. O(m log² m).
+/// Quotient mod z^m with m the numerator's length, exact for stable and unstable divisors. O(m log² m).
 ///
 /// # Errors
 /// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than m.
@@ -353,7 +352,7 @@ pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
     quotient.into_iter().next().ok_or_else(|| Error::Internal { what: "a division without a quotient".into() })
 }
 
-/// 1 over a series, mod z^m; not finite where it starts with zero. O(m log² m).
+/// Reciprocal of a series mod z^m. Not finite if the series starts with zero. O(m log² m).
 ///
 /// ```
 /// assert_eq!(ftlm::series::reciprocal(&[1.0, -1.0, 0.0]), [1.0, 1.0, 1.0]);
@@ -368,7 +367,7 @@ pub fn reciprocal(series: &[f64]) -> Vec<f64> {
     division.into_quotients().pop().unwrap_or_default()
 }
 
-/// Solves the n × n system Σ_j A_ij y_j = b_i of series mod z^m, A_ij of length m at least. O(n² m log² m).
+/// Solve the n × n system Σ_j A_ij y_j = b_i of series mod z^m, A_ij of length m at least. O(n² m log² m).
 ///
 /// # Errors
 /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
@@ -387,7 +386,7 @@ pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<V
     for b in rhs {
         check_length("right-hand side", m, b.len())?;
     }
-    // An empty series starts with nothing, which cannot be divided by either.
+    // An empty series starts with zero, so division by it fails too.
     let first = |s: &S| s.as_ref().first().copied().unwrap_or(0.0);
     let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
     let inverse = small::inverse(&leading, n)?;
@@ -396,7 +395,7 @@ pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<V
     Ok(division.into_quotients())
 }
 
-/// A system of series that is solved for many right-hand sides: the spectra of its matrix are made once.
+/// Solver of a system of series for many right-hand sides. The spectra of its matrix are computed once.
 pub struct Solver<'a> {
     matrix: Cow<'a, [Vec<Vec<f64>>]>,
     inverse: Vec<f64>,
@@ -404,7 +403,7 @@ pub struct Solver<'a> {
 }
 
 impl<'a> Solver<'a> {
-    /// Takes an n × n matrix of series of m terms.
+    /// Solver of an n × n matrix of series of m terms.
     ///
     /// # Errors
     /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
@@ -412,11 +411,11 @@ impl<'a> Solver<'a> {
         Self::of(Cow::Borrowed(matrix))
     }
 
-    /// The same of a matrix that it keeps.
+    /// Solver that owns its matrix.
     ///
     /// # Errors
     /// As [`Solver::new`].
-    pub fn keeping(matrix: Vec<Vec<Vec<f64>>>) -> Result<Solver<'static>> {
+    pub fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Solver<'static>> {
         Solver::of(Cow::Owned(matrix))
     }
 
@@ -441,7 +440,7 @@ impl<'a> Solver<'a> {
         self.division.terms()
     }
 
-    /// Solves for one right-hand side of n series of m terms, or of fewer, as many for all.
+    /// Solve for one right-hand side of n series of m terms. Shorter series are allowed if all have equal length.
     ///
     /// # Errors
     /// [`Error::Length`].
@@ -457,7 +456,7 @@ impl<'a> Solver<'a> {
         Ok(self.division.quotients().iter().map(|quotient| quotient[..asked].to_vec()).collect())
     }
 
-    /// Series of A⁻¹: `[j][i]` is what a unit pulse in the error of equation i does to unknown j. n solutions.
+    /// Series of A⁻¹: `[j][i]` is the response of unknown j to a unit pulse in the error of equation i. n solutions.
     ///
     /// # Errors
     /// As [`Solver::solve`].

@@ -1,9 +1,9 @@
-//! Truncated power series in the one-step delay: multiply, divide, solve, and the naive oracles beside them.
+//! Power series in the one-step delay, truncated: multiply, divide, solve, and naive oracles.
 //!
-//! A causal operator on pulse means is a polynomial in the delay z cut off at z^m; the fractional integral F^η is one of
-//! them. All such operators commute. Products ([`product`]) are convolutions by FFT, quotients ([`division`]) forward
-//! substitution in blocks joined by FFT products; [`solve`] solves several unknown series at once. Where all orders are
-//! whole, [`mod@running_sums`] does the same by running sums.
+//! A causal operator on pulse means is a polynomial in the delay z truncated at z^m. The fractional integral F^η is one
+//! of them. All such operators commute. Products ([`product`]) are convolutions by FFT. Quotients ([`division`]) use
+//! forward substitution in blocks that are joined by FFT products. [`solve`] solves for several unknown series. If all
+//! orders are integers, [`mod@running_sums`] does the same by running sums.
 //!
 //! ```
 //! # fn main() -> ftlm::error::Result<()> {
@@ -22,8 +22,8 @@ pub mod naive;
 pub mod product;
 pub mod running_sums;
 
-pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK};
+pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK_TERMS};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
 pub use product::{multiply, Buffers, Kernel, SumOfProducts};
-pub use running_sums::{running_sums, Recursion, Source, ABREAST, MAX_SUMS};
+pub use running_sums::{running_sums, Recursion, Source, MAX_SUMS, RIGHT_SIDE_LANES};

@@ -1,16 +1,15 @@
-//! Products and quotients of series by definition: the oracles of the fast ones.
+//! Products and quotients of series by definition, the oracles of the fast algorithms.
 
 use super::product::direct;
 use crate::error::{Error, Result};
 
-/// Product mod z^m by definition: the oracle of [`super::product::multiply`]. O(m²).
+/// Product mod z^m by definition, the oracle of [`super::product::multiply`]. O(m²).
 #[must_use]
 pub fn multiply_naive(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     direct(a, b, m)
 }
 
-/// Quotient `numerator / divisor` mod z^m by plain forward substitution: the oracle of [`super::division::divide`].
-/// O(m²).
+/// Quotient `numerator / divisor` mod z^m by forward substitution, the oracle of [`super::division::divide`]. O(m²).
 ///
 /// # Errors
 /// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than the numerator.

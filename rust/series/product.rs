@@ -1,11 +1,11 @@
-//! Products of series mod z^m by real transforms, O(m log m), with spectra that are kept for many products.
+//! Products of series mod z^m by real FFTs, O(m log m), with cached spectra for repeated products.
 
 use std::cell::RefCell;
 
 use crate::fft::{self, Bin, Plan, Workspace};
 
-/// Below this length a product is formed directly: it is faster there and free of transform rounding.
-const DIRECT: usize = 64;
+/// Longest shorter factor of a direct product. Direct products are faster there and have no transform rounding.
+const MAX_DIRECT_TERMS: usize = 64;
 
 /// Product mod z^m by definition. O(m²).
 pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
@@ -18,37 +18,37 @@ pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     out
 }
 
-/// Product mod z^m, equivalently the causal convolution of a kernel with a signal. O(m log m).
+/// Product mod z^m, that is the causal convolution of a kernel with a signal. O(m log m).
 ///
 /// # Panics
-/// Where m points exceed what memory holds, as `vec![0.0; m]` does.
+/// If m points exceed the memory, as `vec![0.0; m]` does.
 #[must_use]
 pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     let (a, b) = (&a[..a.len().min(m)], &b[..b.len().min(m)]);
-    if a.len().min(b.len()) <= DIRECT {
+    if a.len().min(b.len()) <= MAX_DIRECT_TERMS {
         return direct(a, b, m);
     }
     let kernel = Kernel::with_length(a, a.len() + b.len());
     let mut out = vec![0.0; m];
-    spare(kernel.plan.len(), |buffers| kernel.apply(b, &mut out, buffers));
+    with_thread_buffers(kernel.plan.len(), |buffers| kernel.apply(b, &mut out, buffers));
     out
 }
 
-/// Points of a transform whose buffers a thread keeps for the next one.
-const SPARE: usize = 1 << 17;
+/// Longest transform whose buffers a thread reuses.
+const MAX_REUSED_BUFFER_POINTS: usize = 1 << 17;
 
 thread_local!(static BUFFERS: RefCell<Buffers> = RefCell::default());
 
-/// Work on buffers that this thread has used before, unless they would be long; it asks for none itself.
-fn spare<R>(points: usize, work: impl FnOnce(&mut Buffers) -> R) -> R {
-    if points <= SPARE {
+/// Run `work` on reused buffers of this thread, or on new ones for long transforms. `work` must not call this function.
+fn with_thread_buffers<R>(points: usize, work: impl FnOnce(&mut Buffers) -> R) -> R {
+    if points <= MAX_REUSED_BUFFER_POINTS {
         BUFFERS.with_borrow_mut(work)
     } else {
         work(&mut Buffers::default())
     }
 }
 
-/// Reusable memory of the transforms of one thread.
+/// Reusable buffers of the transforms of one thread.
 #[derive(Default)]
 pub struct Buffers {
     time: Vec<f64>,
@@ -56,62 +56,62 @@ pub struct Buffers {
     workspace: Workspace,
 }
 
-/// A series with its spectrum, to be applied to many signals: two transforms each.
+/// Series with cached spectrum, for products with many signals at two transforms each.
 pub struct Kernel {
     plan: Plan,
     spectrum: Vec<Bin>,
 }
 
 impl Kernel {
-    /// Caches a series of length m for signals of up to m points.
+    /// Kernel of a series of length m for signals of up to m points.
     #[must_use]
     pub fn new(series: &[f64]) -> Self {
         Self::with_length(series, 2 * series.len())
     }
 
-    /// Caches a series for products of up to `total` terms in all factors together.
+    /// Kernel of a series for products of up to `total` terms in all factors together.
     #[must_use]
     pub fn with_length(series: &[f64], total: usize) -> Self {
         let plan = fft::plan(fft::fast_length(total));
-        spare(plan.len(), |buffers| Self::planned(plan.clone(), series, buffers))
+        with_thread_buffers(plan.len(), |buffers| Self::from_plan(plan.clone(), series, buffers))
     }
 
-    /// [`Kernel::new`] in memory that the caller has at hand.
+    /// [`Kernel::new`] with buffers of the caller.
     #[must_use]
     pub(crate) fn made_with(series: &[f64], buffers: &mut Buffers) -> Self {
-        Self::planned(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
+        Self::from_plan(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
     }
 
-    fn planned(plan: Plan, series: &[f64], buffers: &mut Buffers) -> Self {
+    fn from_plan(plan: Plan, series: &[f64], buffers: &mut Buffers) -> Self {
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
         let mut made = Self { plan, spectrum };
         made.read(series.iter().copied(), buffers);
         made
     }
 
-    /// That of a series of `m` noughts.
+    /// Kernel of a zero series of `m` terms.
     pub(crate) fn noughts(m: usize) -> Self {
         let plan = fft::plan(fft::fast_length(2 * m));
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
         Self { plan, spectrum }
     }
 
-    /// Becomes that of another series of the same length, in the memory that it has.
+    /// Replace the series by another one of the same length, in place.
     pub(crate) fn read(&mut self, series: impl Iterator<Item = f64>, Buffers { time, workspace, .. }: &mut Buffers) {
         time.clear();
         time.extend(series);
         time.resize(self.plan.len(), 0.0);
-        self.plan.forward(time, &mut self.spectrum, workspace);
+        self.plan.transform(time, &mut self.spectrum, workspace);
     }
 
-    /// The first `out.len()` terms of the product with `signal`; neither longer than the length cached for.
+    /// First `out.len()` terms of the product with `signal`. Neither may be longer than the cached length.
     pub fn apply(&self, signal: &[f64], out: &mut [f64], buffers: &mut Buffers) {
         buffers.time.clear();
         buffers.time.extend_from_slice(signal);
         buffers.time.resize(self.plan.len(), 0.0);
         buffers.spectrum.resize(self.plan.bins(), Bin::new(0.0, 0.0));
         let spectrum = &mut buffers.spectrum[..self.plan.bins()];
-        self.plan.forward(&mut buffers.time, spectrum, &mut buffers.workspace);
+        self.plan.transform(&mut buffers.time, spectrum, &mut buffers.workspace);
         for (x, k) in spectrum.iter_mut().zip(&self.spectrum) {
             *x *= k;
         }
@@ -120,12 +120,12 @@ impl Kernel {
         out[..read].copy_from_slice(&buffers.time[..read]);
     }
 
-    /// Multiplies with another series that is cached for the same number of terms, in all factors together.
+    /// Multiply by another cached series of the same number of terms in all factors together.
     pub fn multiply(&mut self, other: &Self) {
         self.spectrum.iter_mut().zip(&other.spectrum).for_each(|(x, y)| *x *= y);
     }
 
-    /// The first `out.len()` terms of the product with another cached series of the same length: one transform.
+    /// First `out.len()` terms of the product with another cached series of the same length, by one transform.
     pub fn times(&self, other: &Self, out: &mut [f64], buffers: &mut Buffers) {
         buffers.spectrum.clear();
         buffers.spectrum.extend(self.spectrum.iter().zip(&other.spectrum).map(|(x, y)| x * y));
@@ -136,7 +136,7 @@ impl Kernel {
     }
 }
 
-/// A sum of products of series, formed in the frequency domain: one inverse transform however many products.
+/// Sum of products of series in the frequency domain, by one inverse transform for all products.
 pub struct SumOfProducts {
     plan: Plan,
     spectrum: Vec<Bin>,
@@ -157,31 +157,31 @@ impl SumOfProducts {
         Self { plan, spectrum }
     }
 
-    /// Forgets what was added.
+    /// Reset the sum to zero.
     pub fn clear(&mut self) {
         self.spectrum.fill(Bin::new(0.0, 0.0));
     }
 
-    /// Adds a series by itself.
+    /// Add a series.
     pub fn add_series(&mut self, series: &Kernel) {
         self.spectrum.iter_mut().zip(&series.spectrum).for_each(|(sum, x)| *sum += x);
     }
 
-    /// Adds the product of another sum with a series; all cached for the same number of terms.
+    /// Add the product of another sum with a series, all cached for the same number of terms.
     pub fn add_product(&mut self, other: &Self, series: &Kernel) {
         for ((sum, x), y) in self.spectrum.iter_mut().zip(&other.spectrum).zip(&series.spectrum) {
             *sum += x * y;
         }
     }
 
-    /// Adds weight·a·b; both cached for the same m as the sum.
+    /// Add weight·a·b, both cached for the same m as the sum.
     pub fn add(&mut self, weight: f64, a: &Kernel, b: &Kernel) {
         for ((sum, x), y) in self.spectrum.iter_mut().zip(&a.spectrum).zip(&b.spectrum) {
             *sum += x * y * weight;
         }
     }
 
-    /// The first `out.len()` terms of the sum, which is left empty.
+    /// First `out.len()` terms of the sum, which is reset to zero.
     pub fn take(&mut self, out: &mut [f64], buffers: &mut Buffers) {
         buffers.time.resize(self.plan.len(), 0.0);
         let time = &mut buffers.time[..self.plan.len()];

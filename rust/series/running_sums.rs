@@ -1,29 +1,29 @@
-//! Systems of integrals of whole order, solved by running sums instead of transforms: O(n² K) a term.
+//! Systems of integrals of integer order by running sums instead of transforms: O(n² K) a term.
 //!
-//! In pulse means I^η of whole order is h^η/(η+1)!·A(z)/(1−z)^η with an Eulerian polynomial A of degree η. Written in
-//! powers of 1−z it is a sum of running sums Q^l, Q = 1/(1−z), l = 0 … η, so that a system of such integrals is
-//! y = G₀ + Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and in what drives them: one state for each sum. The sums
-//! stay as small as the motion is, which a difference equation in y alone does not.
+//! In pulse means I^η of integer order is h^η/(η+1)!·A(z)/(1−z)^η with an Eulerian polynomial A of degree η. In powers
+//! of 1−z it is a combination of running sums Q^l, Q = 1/(1−z), l = 0 … η. A system of such integrals is thus y = G₀ +
+//! Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and the inputs: one state for each sum. The sums stay as small as
+//! the motion, unlike the terms of a difference equation in y alone.
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::small;
-use crate::simd::{widest, Kernel};
+use crate::simd::{dispatch_simd, Kernel};
 
-/// Highest order of an integral: beyond it transforms are as good.
+/// Highest order of an integral. Transforms are as fast for higher orders.
 pub const MAX_SUMS: usize = 6;
 
-/// Right-hand sides that are solved for side by side: each alone waits for its own last term.
-pub const ABREAST: usize = 4;
+/// Right-hand sides solved side by side. A single one would wait for the latency of its last term.
+pub const RIGHT_SIDE_LANES: usize = 4;
 
-/// Terms at a time, so that what drives them stays near.
-const BLOCK: usize = 256;
+/// Terms of one chunk, so that its inputs stay in the cache.
+const CHUNK_TERMS: usize = 256;
 
 /// Weights of the running sums Q^0 … Q^η in I^η of pulse means.
 ///
 /// By Frobenius' identity they are h^η/(η+1)!·(−1)^{η−l}·(l+1)!·S(η+1, l+1), S Stirling's numbers of the second kind.
 ///
 /// ```
-/// // I^1 of a pulse: half of it within itself, all of it in every later one.
+/// // I^1 of a pulse: half of it within the pulse, all of it in every later one.
 /// assert_eq!(ftlm::series::running_sums(1, 0.1), [-0.05, 0.1]);
 /// ```
 #[must_use]
@@ -50,34 +50,35 @@ pub fn running_sums(eta: usize, step: f64) -> Vec<f64> {
     weights
 }
 
-/// What drives one equation: `weight` times I^`order` of a series.
+/// Input of one equation: `weight` times I^`order` of a series.
 #[derive(Debug, Clone, Copy)]
 pub struct Source<'a> {
-    /// The equation.
+    /// Index of the equation.
     pub equation: usize,
-    /// Whole order of the integral.
+    /// Integer order of the integral.
     pub order: usize,
-    /// What it weighs.
+    /// Coefficient.
     pub weight: f64,
-    /// The series.
+    /// Series of the input.
     pub series: &'a [f64],
 }
 
-/// y_i = Σ c·I^η y_j + what drives, solved for any number of right-hand sides.
+/// System y_i = Σ c·I^η y_j + inputs, for any number of right-hand sides.
 #[derive(Debug, Clone)]
 pub struct Recursion {
     n: usize,
     /// Number of running sums of each equation.
     sums: usize,
     step: f64,
-    /// What each unknown adds to each sum of each equation: `[(i·(sums + 1) + l)·n + j]`.
+    /// Weight of each unknown in each sum of each equation: `[(i·(sums + 1) + l)·n + j]`.
     own: Vec<f64>,
-    /// Inverse of the matrix of leading coefficients, row by row.
+    /// Inverse of the matrix of leading coefficients, row-major.
     inverse: Vec<f64>,
 }
 
 impl Recursion {
-    /// n equations with terms (i, j, η, c): c·I^η y_j in equation i; `sums` is the highest η of them and of all sources.
+    /// System of n equations with terms (i, j, η, c): c·I^η y_j in equation i. `sums` is the highest η of terms and
+    /// sources.
     ///
     /// # Errors
     /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Structure`] for an order
@@ -94,18 +95,18 @@ impl Recursion {
             for (l, weight) in running_sums(order, step).iter().enumerate() {
                 own[(i * (sums + 1) + l) * n + j] += c * weight;
             }
-            leading[i * n + j] -= c * crate::fractional::kernels::first(whole(order), step);
+            leading[i * n + j] -= c * crate::fractional::kernels::first_coefficient(order_to_float(order), step);
         }
         Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
     }
 
-    /// The n unknown series of m terms that each list of sources drives.
+    /// Response of the n unknown series of m terms to each list of sources.
     ///
     /// # Errors
     /// [`Error::Length`] for a source shorter than m.
     ///
     /// # Panics
-    /// Where a source names an equation that is not there or an order above the sums.
+    /// If a source names an equation that does not exist or an order above the sums.
     pub fn solve(&self, m: usize, lists: &[Vec<Source>]) -> Result<Vec<Vec<Vec<f64>>>> {
         for source in lists.iter().flatten() {
             if source.series.len() < m {
@@ -113,23 +114,23 @@ impl Recursion {
             }
         }
         if self.n > 1 {
-            return Ok(lists.iter().map(|sources| self.many(m, sources)).collect());
+            return Ok(lists.iter().map(|sources| self.solve_coupled(m, sources)).collect());
         }
         let solve = match self.sums {
-            0 => Self::abreast::<1>,
-            1 => Self::abreast::<2>,
-            2 => Self::abreast::<3>,
-            3 => Self::abreast::<4>,
-            4 => Self::abreast::<5>,
-            5 => Self::abreast::<6>,
-            _ => Self::abreast::<7>,
+            0 => Self::solve_one_unknown::<1>,
+            1 => Self::solve_one_unknown::<2>,
+            2 => Self::solve_one_unknown::<3>,
+            3 => Self::solve_one_unknown::<4>,
+            4 => Self::solve_one_unknown::<5>,
+            5 => Self::solve_one_unknown::<6>,
+            _ => Self::solve_one_unknown::<7>,
         };
-        let solved = lists.chunks(ABREAST).flat_map(|part| solve(self, m, part));
+        let solved = lists.chunks(RIGHT_SIDE_LANES).flat_map(|part| solve(self, m, part));
         Ok(solved.map(|answer| vec![answer]).collect())
     }
 
-    /// One unknown under up to [`ABREAST`] right-hand sides; L is one more than there are sums.
-    fn abreast<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
+    /// One unknown for up to [`RIGHT_SIDE_LANES`] right-hand sides. L is the number of sums plus one.
+    fn solve_one_unknown<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
         let mut own = [0.0; L];
         own.copy_from_slice(&self.own[..L]);
         let driven: Vec<Vec<(Vec<f64>, &[f64])>> = lists
@@ -137,12 +138,12 @@ impl Recursion {
             .map(|list| list.iter().map(|source| (self.weights(source), source.series)).collect())
             .collect();
         let mut out = vec![vec![0.0; m]; lists.len()];
-        let mut states = [[0.0; ABREAST]; L];
-        let mut drive = vec![[[0.0; ABREAST]; L]; BLOCK.min(m)];
-        let mut answer = vec![[0.0; ABREAST]; BLOCK.min(m)];
-        for start in (0..m).step_by(BLOCK) {
-            let length = BLOCK.min(m - start);
-            drive[..length].fill([[0.0; ABREAST]; L]);
+        let mut states = [[0.0; RIGHT_SIDE_LANES]; L];
+        let mut drive = vec![[[0.0; RIGHT_SIDE_LANES]; L]; CHUNK_TERMS.min(m)];
+        let mut answer = vec![[0.0; RIGHT_SIDE_LANES]; CHUNK_TERMS.min(m)];
+        for start in (0..m).step_by(CHUNK_TERMS) {
+            let length = CHUNK_TERMS.min(m - start);
+            drive[..length].fill([[0.0; RIGHT_SIDE_LANES]; L]);
             for (lane, sources) in driven.iter().enumerate() {
                 for (weights, series) in sources {
                     for (given, value) in drive.iter_mut().zip(&series[start..start + length]) {
@@ -151,7 +152,7 @@ impl Recursion {
                 }
             }
             let (drive, answer) = (&drive[..length], &mut answer[..length]);
-            widest(Block { own: &own, inverse: self.inverse[0], states: &mut states, drive, answer });
+            dispatch_simd(Block { own: &own, inverse: self.inverse[0], states: &mut states, drive, answer });
             for (lane, series) in out.iter_mut().enumerate() {
                 series[start..start + length].iter_mut().zip(&*answer).for_each(|(value, y)| *value = y[lane]);
             }
@@ -159,14 +160,14 @@ impl Recursion {
         out
     }
 
-    /// What a source adds to each sum, by its series.
+    /// Weights of a source in each sum.
     fn weights(&self, source: &Source) -> Vec<f64> {
         running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect()
     }
 
-    fn many(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
+    fn solve_coupled(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
         let (n, stride) = (self.n, self.sums + 1);
-        // Term by term, then equation by equation, what drives each sum.
+        // Inputs of each sum, term by term, then equation by equation.
         let mut drive = vec![0.0; m * n * stride];
         for source in sources {
             let weights = self.weights(source);
@@ -200,13 +201,13 @@ impl Recursion {
     }
 }
 
-/// One unknown under [`ABREAST`] right-hand sides over a block of terms.
+/// One unknown for [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms.
 struct Block<'a, const L: usize> {
     own: &'a [f64; L],
     inverse: f64,
-    states: &'a mut [[f64; ABREAST]; L],
-    drive: &'a [[[f64; ABREAST]; L]],
-    answer: &'a mut [[f64; ABREAST]],
+    states: &'a mut [[f64; RIGHT_SIDE_LANES]; L],
+    drive: &'a [[[f64; RIGHT_SIDE_LANES]; L]],
+    answer: &'a mut [[f64; RIGHT_SIDE_LANES]],
 }
 
 impl<const L: usize> Kernel for Block<'_, L> {
@@ -218,16 +219,16 @@ impl<const L: usize> Kernel for Block<'_, L> {
         for (given, y) in self.drive.iter().zip(self.answer) {
             let mut open = given[0];
             for l in 1..L {
-                for w in 0..ABREAST {
+                for w in 0..RIGHT_SIDE_LANES {
                     open[w] += given[l][w] + states[l][w];
                 }
             }
-            let mut above = [0.0; ABREAST];
-            for w in 0..ABREAST {
+            let mut above = [0.0; RIGHT_SIDE_LANES];
+            for w in 0..RIGHT_SIDE_LANES {
                 y[w] = self.inverse * open[w];
             }
             for l in (1..L).rev() {
-                for w in 0..ABREAST {
+                for w in 0..RIGHT_SIDE_LANES {
                     states[l][w] += given[l][w] + self.own[l] * y[w] + above[w];
                 }
                 above = states[l];
@@ -238,6 +239,6 @@ impl<const L: usize> Kernel for Block<'_, L> {
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn whole(order: usize) -> f64 {
+fn order_to_float(order: usize) -> f64 {
     order as f64
 }

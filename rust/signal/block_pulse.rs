@@ -1,30 +1,29 @@
-//! From point samples to pulse means: the inter-sample behaviour of a record, integrated exactly.
+//! Block-pulse coefficients: means of samples over pulses, delays, and interpolation back to nonuniform sample
+//! times.
 //!
-//! Row j of a record holds t = jh. An input that is a command is held over [jh, (j+1)h); a measured signal is read at
-//! jh and taken as linear in between. Samples taken for means bias every estimate, so this step is never skipped.
+//! Row j of a record is the sample at t = jh. An input command is held over [jh, (j+1)h). A measured signal is linear
+//! between its samples. Samples used in place of means would bias every estimate.
 //!
-//! What a signal is at times of its own, from its pulse means: readings whose clock jitters, rows that were lost.
-//!
-//! Four pulse means around a reading tell its value to fourth order where the signal is smooth: the slope of the quartic
-//! through the integral at their edges. It is not smooth where a held input jumps: I^η of a jump of size Δ at p is
-//! Δ (t − p)^η/Γ(η + 1), a corner that no polynomial follows, and the pulses see the jump spread over the pulse in which
-//! it stands. Both are known exactly, so a reading near a jump gets what its four means lack of that corner.
+//! Four pulse means around a sample time determine a smooth signal to fourth order: the slope of the quartic through
+//! the integral at the pulse edges. Jumps of a held input break the smoothness. I^η of a jump of size Δ at p is Δ (t −
+//! p)^η/Γ(η + 1), which has a slope discontinuity, and pulse means spread the jump over its pulse. Both effects are
+//! known exactly, so samples near a jump are corrected by their difference.
 
 use crate::error::{check_finite, check_points, Error, Result};
 
-/// What a signal does between two samples.
+/// Inter-sample behavior of a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Intersample {
-    /// Zero-order hold: row j holds until row j+1. A command.
+    /// Zero-order hold, for commands: row j is held until row j+1.
     Hold,
-    /// First-order hold: linear between rows. A measured signal.
+    /// First-order hold, for measured signals: linear between rows.
     Linear,
 }
 
-/// Means over `m` equal pulses of [0, (N−1)h] of a signal given by N samples. O(N + m).
+/// Means over `m` equal pulses of [0, (N−1)h] of a signal with N samples. O(N + m).
 ///
-/// `m` may be any number: N−1 is the record's own grid, a multiple of it refines the grid under the same
-/// inter-sample behaviour, less integrates it exactly.
+/// `m` is arbitrary: N−1 is the grid of the record, a multiple of it refines the grid with the same inter-sample
+/// behavior, and a smaller `m` integrates exactly.
 ///
 /// # Errors
 /// Fewer than two samples, m = 0 or beyond memory, a sample that is not finite.
@@ -57,7 +56,7 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Ve
         Intersample::Hold => samples[j] * x,
         Intersample::Linear => x * (samples[j] + 0.5 * x * (samples[j + 1] - samples[j])),
     };
-    // Edge k of the pulses stands at interval k·n/m: whole part and remainder in integers, so that edges are exact.
+    // Edge k of the pulses is at interval k·n/m. Integer quotient and remainder make edges exact.
     let edge = |k: usize| {
         let product = k as u128 * intervals as u128;
         let whole = (product / m as u128) as usize;
@@ -87,7 +86,7 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Ve
     Ok(means)
 }
 
-/// Integral over interval j from fraction a to b, without the cancellation of two partial integrals.
+/// Integral over interval j from fraction a to b, without cancellation of two partial integrals.
 fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f64) -> f64 {
     match between {
         Intersample::Hold => samples[j] * (b - a),
@@ -97,21 +96,21 @@ fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f6
     }
 }
 
-/// Samples delayed by `delay` steps (whole and fractional): u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
+/// Delay samples by `delay` steps, whole and fractional: u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
 ///
-/// Exact means of a held command after a delay of (d+φ)h. `before` stands for the samples before the record.
+/// The result gives exact means of a held command after a delay of (d+φ)h. `before` is the value before the record.
 ///
 /// # Errors
 /// A delay that is negative or not finite, a sample that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
-/// assert_eq!(ftlm::signal::block_pulse::delayed(&[1.0, 2.0, 3.0], 1.5, 0.0)?, [0.0, 0.5, 1.5]);
+/// assert_eq!(ftlm::signal::block_pulse::delay_samples(&[1.0, 2.0, 3.0], 1.5, 0.0)?, [0.0, 0.5, 1.5]);
 /// # Ok(())
 /// # }
 /// ```
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-pub fn delayed(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
+pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
     if !(delay >= 0.0 && delay.is_finite()) {
         return Err(Error::OutOfRange {
             name: "delay".into(),
@@ -138,8 +137,8 @@ pub fn delayed(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
         .collect())
 }
 
-/// Point samples at 0, h, …, mh from m pulse means: the mean of the pulses on either side, second-order
-/// extrapolation at the two ends.
+/// Point samples at 0, h, …, mh from m pulse means: the average of neighboring pulses, with second-order extrapolation
+/// at both ends.
 #[must_use]
 pub fn point_samples(means: &[f64]) -> Vec<f64> {
     let m = means.len();
@@ -153,59 +152,59 @@ pub fn point_samples(means: &[f64]) -> Vec<f64> {
     samples
 }
 
-/// Pulse means that a reading is made of.
-const STENCIL: usize = 4;
-/// Pulses after a jump within which a reading is mended: beyond them what the spreading leaves falls with the square of
-/// the step, like every other error of the scheme.
-const REACH: f64 = 16.0;
+/// Pulse means in the stencil of one sample.
+const STENCIL_PULSES: usize = 4;
+/// Pulses after a jump within which samples are corrected. Beyond, the error of spreading the jump falls with the
+/// square of the step, like all other errors of the scheme.
+const KINK_RANGE_PULSES: f64 = 16.0;
 
-/// A jump of a held signal near a reading, in pulses.
+/// Jump of a held signal near a sample time. Lengths in pulses.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Near {
-    /// How long before the reading; negative: after it.
+struct NearbyJump {
+    /// Time from the jump to the sample, negative for a later jump.
     before: f64,
-    /// First pulse of the reading's stencil, counted from that of the jump.
+    /// First pulse of the stencil, relative to the pulse of the jump.
     first: isize,
-    /// Share of its pulse that had passed at the jump.
+    /// Fraction of its pulse before the jump.
     share: f64,
     size: f64,
 }
 
-/// Times of readings on a grid of pulses, and what each is made of.
+/// Nonuniform sample times on a grid of pulses, with the interpolation weights.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Readings {
+pub struct SampleInterpolation {
     first: Vec<usize>,
-    weights: Vec<[f64; STENCIL]>,
+    weights: Vec<[f64; STENCIL_PULSES]>,
     places: Vec<f64>,
 }
 
-/// Jumps of one held signal near each reading.
+/// Jumps of one held signal near each sample time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Jumps {
     starts: Vec<usize>,
-    near: Vec<Near>,
+    near: Vec<NearbyJump>,
 }
 
-impl Readings {
-    /// Readings at these places, in pulses from the first pulse's start, among m pulses.
+impl SampleInterpolation {
+    /// Interpolation at these positions, in pulses from the start of the first one, among m pulses.
     ///
     /// # Errors
-    /// Fewer than four pulses, a place that is not among them.
+    /// Fewer than four pulses, a position outside them.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
     /// // Means of t³ over pulses of 1 s.
     /// let means: Vec<f64> = (0..6).map(|k| 0.25 * (f64::from(k + 1).powi(4) - f64::from(k).powi(4))).collect();
-    /// let readings = ftlm::signal::block_pulse::Readings::new(vec![0.3, 2.5, 5.9], 6)?;
-    /// let read = readings.read(&means);
+    /// let readings = ftlm::signal::block_pulse::SampleInterpolation::new(vec![0.3, 2.5, 5.9], 6)?;
+    /// let read = readings.interpolate(&means);
     /// assert!(read.iter().zip([0.3_f64, 2.5, 5.9]).all(|(y, t)| (y - t.powi(3)).abs() < 1e-9));
     /// # Ok(())
     /// # }
     /// ```
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn new(places: Vec<f64>, m: usize) -> Result<Self> {
-        if m < STENCIL {
-            return Err(Error::Length { name: "pulses around a reading".into(), expected: STENCIL, found: m });
+        if m < STENCIL_PULSES {
+            return Err(Error::Length { name: "pulses around a reading".into(), expected: STENCIL_PULSES, found: m });
         }
         check_finite("times of readings", &places)?;
         if let Some(&value) = places.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
@@ -217,47 +216,47 @@ impl Readings {
                 remedy,
             });
         }
-        let half = STENCIL / 2;
+        let half = STENCIL_PULSES / 2;
         let first: Vec<usize> =
-            places.iter().map(|p| ((p + 0.5) as usize).saturating_sub(half).min(m - STENCIL)).collect();
+            places.iter().map(|p| ((p + 0.5) as usize).saturating_sub(half).min(m - STENCIL_PULSES)).collect();
         let weights = places.iter().zip(&first).map(|(p, &f)| stencil(p - f as f64)).collect();
         Ok(Self { first, weights, places })
     }
 
-    /// How many there are.
+    /// Number of sample times.
     #[must_use]
     pub fn len(&self) -> usize {
         self.first.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are no sample times.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.first.is_empty()
     }
 
-    /// Values of a signal at the readings from its pulse means, where it is smooth.
+    /// Samples of a smooth signal from its pulse means.
     #[must_use]
-    pub fn read(&self, means: &[f64]) -> Vec<f64> {
-        let value = |(&first, weights): (&usize, &[f64; STENCIL])| -> f64 {
+    pub fn interpolate(&self, means: &[f64]) -> Vec<f64> {
+        let value = |(&first, weights): (&usize, &[f64; STENCIL_PULSES])| -> f64 {
             weights.iter().zip(&means[first..]).map(|(w, v)| w * v).sum()
         };
         self.first.iter().zip(&self.weights).map(value).collect()
     }
 
-    /// The jumps of a held signal that matter to each reading, from their places in pulses (ascending) and sizes.
+    /// Jumps of a held signal near each sample time, from their positions in pulses (ascending) and sizes.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
     pub fn jumps(&self, at: &[f64], sizes: &[f64]) -> Jumps {
         let mut out = Jumps { starts: vec![0], near: Vec::new() };
         for (&place, &first) in self.places.iter().zip(&self.first) {
-            let from = at.partition_point(|&p| p < place - REACH);
-            let to = at.partition_point(|&p| p < (first + STENCIL) as f64);
+            let from = at.partition_point(|&p| p < place - KINK_RANGE_PULSES);
+            let to = at.partition_point(|&p| p < (first + STENCIL_PULSES) as f64);
             for (&p, &size) in
                 at[from..to.max(from)].iter().zip(sizes.iter().skip(from)).filter(|(_, size)| **size != 0.0)
             {
                 let pulse = p.floor();
-                out.near.push(Near {
+                out.near.push(NearbyJump {
                     before: place - p,
                     first: first as isize - pulse as isize,
                     share: p - pulse,
@@ -269,17 +268,17 @@ impl Readings {
         out
     }
 
-    /// What the readings of I^η of a held signal lack: its corners at the jumps less what its pulse means show of them.
+    /// Corrections of the samples of I^η of a held signal: exact response to the jumps minus that in the pulse means.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
-    pub fn corners(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {
+    pub fn kink_corrections(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {
         let scale = libm::pow(step, eta);
         let (corner, mean) = (scale / libm::tgamma(eta + 1.0), scale / libm::tgamma(eta + 2.0));
-        // Mean of the corner over the n-th pulse after a jump at a pulse's start.
-        let longest = jumps.near.iter().map(|near| near.first).max().unwrap_or(0).max(0) + STENCIL as isize;
+        // Mean response over the n-th pulse after a jump at the start of a pulse.
+        let longest = jumps.near.iter().map(|near| near.first).max().unwrap_or(0).max(0) + STENCIL_PULSES as isize;
         let powers: Vec<f64> = (0..=longest + 1).map(|n| libm::pow(n as f64, eta + 1.0)).collect();
         let of_pulse = |n: isize| usize::try_from(n).map_or(0.0, |n| mean * (powers[n + 1] - powers[n]));
-        let lacking = |near: &Near, weights: &[f64; STENCIL]| {
+        let lacking = |near: &NearbyJump, weights: &[f64; STENCIL_PULSES]| {
             let there = match near.before {
                 before if before < 0.0 => 0.0,
                 before if eta == 0.0 && before == 0.0 => corner,
@@ -296,20 +295,20 @@ impl Readings {
     }
 }
 
-/// Weights of four pulse means for the value at x pulses from the first one's start: slopes of Lagrange's polynomials
-/// through the integral at the five edges.
+/// Weights of four pulse means for the value at x pulses from the start of the first one: slopes of the Lagrange
+/// polynomials through the integral at the five edges.
 #[allow(clippy::cast_precision_loss)]
-fn stencil(x: f64) -> [f64; STENCIL] {
+fn stencil(x: f64) -> [f64; STENCIL_PULSES] {
     let slope = |m: usize| -> f64 {
-        let others: Vec<f64> = (0..=STENCIL).filter(|&j| j != m).map(|j| j as f64).collect();
+        let others: Vec<f64> = (0..=STENCIL_PULSES).filter(|&j| j != m).map(|j| j as f64).collect();
         let below: f64 = others.iter().map(|j| m as f64 - j).product();
         let skipping =
             |i: usize| others.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| x - v).product::<f64>();
         (0..others.len()).map(skipping).sum::<f64>() / below
     };
-    let mut weights = [0.0; STENCIL];
+    let mut weights = [0.0; STENCIL_PULSES];
     let mut sum = 0.0;
-    for k in (0..STENCIL).rev() {
+    for k in (0..STENCIL_PULSES).rev() {
         sum += slope(k + 1);
         weights[k] = sum;
     }

@@ -1,9 +1,9 @@
-//! How far a response is from a measurement: error (45), RMSE (46), NR (47), fit; correlations for residual tests.
+//! Comparison of a response with a measurement: error (45), RMSE (46), NR (47), fit. Correlations for residual tests.
 
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::fft;
 
-/// The four figures of one output over the M pulses of a record.
+/// Figures of merit of one output over the M pulses of a record.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Metrics {
     /// Σ|y − ŷ| (paper (45)), in the unit of the output.
@@ -16,10 +16,10 @@ pub struct Metrics {
     pub fit_percent: f64,
 }
 
-/// Compares a measurement with residuals e = y − ŷ of the same length. Not finite where the residuals are not.
+/// Compare a measurement with residuals e = y − ŷ of equal length. Not finite if the residuals are not.
 ///
 /// # Errors
-/// [`Error::Length`] for nothing, or for lengths that differ; [`Error::NotFinite`] for the measurement.
+/// [`Error::Length`] for empty or different lengths, [`Error::NotFinite`] for the measurement.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -39,7 +39,7 @@ pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
     let mean = measured.iter().sum::<f64>() / m;
     let deviation = measured.iter().map(|y| (y - mean) * (y - mean)).sum::<f64>();
     let error = residuals.iter().map(|e| e.abs()).sum::<f64>();
-    // A diverged response squares to infinity before its own size does.
+    // A diverged response overflows when squared before it overflows itself.
     let largest = residuals.iter().fold(0.0_f64, |a, e| a.max(e.abs()));
     let squares = if largest > 1e150 { f64::INFINITY } else { residuals.iter().map(|e| e * e).sum::<f64>() };
     let error = if error.is_nan() { f64::INFINITY } else { error };
@@ -48,25 +48,27 @@ pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
     Ok(Metrics { error, rmse: (squares / m).sqrt(), nr, fit_percent: 100.0 * (1.0 - nr) })
 }
 
-/// Correlations of two signals, pooled over runs.
+/// Correlation of two signals, pooled over runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Correlation {
-    /// r(k) = corr(x(t + k), y(t)) for k = −lags … lags; 0 where a signal does not vary.
+    /// r(k) = corr(x(t + k), y(t)) for k = −lags … lags. Zero for a constant signal.
     pub values: Vec<f64>,
-    /// Variance of each of these if x and y are independent: Bartlett's Σ ρx(τ)ρy(τ)/N (doi:10.2307/2983611), the sum
-    /// cut off where the correlations of x have died away and no less than for white noise.
+    /// Variance of each value for independent x and y: Bartlett's Σ ρx(τ)ρy(τ)/N (doi:10.2307/2983611).
+    ///
+    /// The sum is truncated where the correlations of x have decayed. It is at least that of white noise.
     pub variance: f64,
-    /// Number of lags that the sum took in on each side.
+    /// Number of lags of the truncated sum on each side.
     pub window: usize,
 }
 
-/// Correlation times that a sum of estimated correlations takes in (Sokal's windowing): more adds only noise.
-const WINDOW: f64 = 6.0;
+/// Correlation times in the truncated sum (Sokal's windowing). A longer window adds only noise.
+const WINDOW_CORRELATION_TIMES: f64 = 6.0;
 
-/// Correlations up to `lags` of x with y, each run about its own means. O(N log N).
+/// Correlations up to `lags` of x with y, each run about its own mean. O(N log N).
 ///
 /// # Errors
-/// [`Error::Length`] where x and y differ in runs or samples, [`Error::OutOfRange`] where a run has no more samples than
+/// [`Error::Length`] where x and y differ in runs or samples, [`Error::OutOfRange`] where a run has no more samples
+/// than
 /// `lags`, [`Error::NotFinite`].
 ///
 /// ```
@@ -94,42 +96,44 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
             remedy: "give longer runs or fewer lags".into(),
         });
     }
-    // Correlations further out than a quarter of a run are estimated from too little.
+    // Correlations beyond a quarter of a run are estimated from too few samples.
     let reach = lags.max(shortest / 4);
-    let (cross, own_x, own_y) = (pooled(x, y, reach), pooled(x, x, reach), pooled(y, y, reach));
+    let (cross, own_x, own_y) =
+        (pool_covariances(x, y, reach), pool_covariances(x, x, reach), pool_covariances(y, y, reach));
     let (power_x, power_y) = (own_x[reach], own_y[reach]);
     let scale = (power_x * power_y).sqrt();
     let over = |value: f64, by: f64| if by > 0.0 { value / by } else { 0.0 };
     let values = cross[reach - lags..=reach + lags].iter().map(|c| over(*c, scale)).collect();
     let count = x.iter().map(Vec::len).sum::<usize>() as f64;
     let (mut sum, mut time, mut window) = (1.0, 1.0, 0);
-    while window < shortest / 4 && (window as f64) < WINDOW * time {
+    while window < shortest / 4 && (window as f64) < WINDOW_CORRELATION_TIMES * time {
         window += 1;
         let (rx, ry) = (over(own_x[reach + window], power_x), over(own_y[reach + window], power_y));
         sum += 2.0 * rx * ry;
         time += 2.0 * rx * rx;
     }
-    // Estimated correlations of signals that swing apart may add up to nothing or less; white noise is the floor.
+    // The sum over estimated correlations of signals with opposite oscillations may vanish or be negative. White noise
+    // is the lower limit.
     Ok(Correlation { values, variance: sum.max(1.0) / count, window })
 }
 
 /// Covariances Σ x(t + k) y(t), k = −lags … lags, about the means, summed over runs.
-fn pooled(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Vec<f64> {
+fn pool_covariances(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Vec<f64> {
     let mut sums = vec![0.0; 2 * lags + 1];
     for (a, b) in x.iter().zip(y) {
-        let found = covariances(&centred(a), &centred(b), lags);
+        let found = covariances(&subtract_mean(a), &subtract_mean(b), lags);
         sums.iter_mut().zip(found).for_each(|(s, c)| *s += c);
     }
     sums
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn centred(x: &[f64]) -> Vec<f64> {
+fn subtract_mean(x: &[f64]) -> Vec<f64> {
     let mean = x.iter().sum::<f64>() / (x.len().max(1)) as f64;
     x.iter().map(|v| v - mean).collect()
 }
 
-/// Σ x(t + k) y(t) for k = −lags … lags, by one product of spectra.
+/// Cross-covariances Σ x(t + k) y(t) for k = −lags … lags, by one product of spectra.
 #[must_use]
 pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     let plan = fft::plan(fft::fast_length(x.len().max(y.len()) + lags + 1));
@@ -138,7 +142,7 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
         let mut time = vec![0.0; plan.len()];
         time[..signal.len()].copy_from_slice(signal);
         let mut spectrum = vec![fft::Bin::new(0.0, 0.0); plan.bins()];
-        plan.forward(&mut time, &mut spectrum, &mut workspace);
+        plan.transform(&mut time, &mut spectrum, &mut workspace);
         spectrum
     };
     let (mut product, other) = (spectrum_of(x), spectrum_of(y));
@@ -149,7 +153,7 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     behind.chain(&time[..=lags]).copied().collect()
 }
 
-/// The same by definition: the oracle of [`covariances`]. O(N lags).
+/// Oracle of [`covariances`] by definition. O(N lags).
 #[cfg(feature = "oracles")]
 #[must_use]
 pub fn covariances_naive(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {

@@ -1,20 +1,18 @@
-//! Numbers that tell of a series what it scatters by, how it hangs together, and whether it is white.
-//!
-//! Colour of noise: an autoregression of what a model leaves, and the autocovariances that it tells.
+//! Statistics of series: robust noise scale, autocovariance, whiteness test, autoregressive noise models.
 
 use crate::fft::{plan, Bin, Workspace};
-use crate::simd::{dot, widest, Kernel};
+use crate::simd::{dispatch_simd, dot, Kernel};
 
-/// Median absolute deviation of a normal variable in units of its standard deviation.
-pub const MAD: f64 = 0.674_489_750_196_081_7;
-/// Residuals beyond so many deviations count by their size: 95 % of the precision of squares under normal noise.
-pub const BEND: f64 = 1.345;
-/// 99 % quantile of a normal variable: one in a hundred true models is refused.
+/// Median absolute deviation of a normal variable, in units of its standard deviation.
+pub const NORMAL_MAD_PER_SIGMA: f64 = 0.674_489_750_196_081_7;
+/// Huber's threshold in standard deviations. Under normal noise the efficiency is 95 % of that of least squares.
+pub const HUBER_THRESHOLD: f64 = 1.345;
+/// 99 % quantile of a normal variable. The test rejects one in a hundred true models.
 const NORMAL_99: f64 = 2.326_347_874_040_840_8;
-/// Lags that a test for whiteness looks at where nothing else is asked.
-pub const LAGS: usize = 25;
-/// Values that are summed one after another before sums are joined by pairs.
-const TOGETHER: usize = 128;
+/// Default number of lags of a whiteness test.
+pub const WHITENESS_LAGS: usize = 25;
+/// Most values that are summed serially before pairwise summation.
+const MAX_SERIAL_SUM_VALUES: usize = 128;
 
 /// Inner product of two rows of one length.
 struct Inner<'a>(&'a [f64], &'a [f64]);
@@ -28,19 +26,19 @@ impl Kernel for Inner<'_> {
     }
 }
 
-/// Σ a·b in the widest vectors at hand; rows are of one length.
+/// Dot product Σ a·b of rows of equal length, vectorized.
 #[must_use]
 pub fn inner(a: &[f64], b: &[f64]) -> f64 {
-    widest(Inner(a, b))
+    dispatch_simd(Inner(a, b))
 }
 
-/// Sum of values, halves of them by themselves: rounding grows with the logarithm of their number.
+/// Pairwise sum of values. Rounding errors grow with the logarithm of their number.
 #[must_use]
 pub fn sum(values: &[f64]) -> f64 {
     if values.len() < 8 {
         return values.iter().sum();
     }
-    if values.len() > TOGETHER {
+    if values.len() > MAX_SERIAL_SUM_VALUES {
         let half = values.len() / 2 / 8 * 8;
         return sum(&values[..half]) + sum(&values[half..]);
     }
@@ -55,34 +53,34 @@ pub fn sum(values: &[f64]) -> f64 {
     rest.iter().fold(((a + b) + (c + d)) + ((e + f) + (g + h)), |total, value| total + value)
 }
 
-/// Mean of values; not a number where there are none.
+/// Mean of values, NaN if there are none.
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn mean(values: &[f64]) -> f64 {
     sum(values) / values.len() as f64
 }
 
-/// Root of the mean of squares; infinite beyond the numbers.
+/// Root mean square. Infinite on overflow.
 #[must_use]
 pub fn root_mean_square(values: &[f64]) -> f64 {
     mean(&values.iter().map(|v| v * v).collect::<Vec<_>>()).sqrt()
 }
 
-/// Deviation of normal values from the median of their sizes, which a few that are far off do not move; 0 of none.
+/// Robust standard deviation from the median of absolute values, insensitive to outliers. 0 without values.
 ///
 /// ```
 /// let found = ftlm::signal::statistics::robust_deviation(&[1.0, -2.0, 3.0, -1000.0]);
-/// assert!((found - 2.5 / ftlm::signal::statistics::MAD).abs() < 1e-12);
+/// assert!((found - 2.5 / ftlm::signal::statistics::NORMAL_MAD_PER_SIGMA).abs() < 1e-12);
 /// ```
 #[must_use]
 pub fn robust_deviation(values: &[f64]) -> f64 {
     if values.is_empty() {
         return 0.0;
     }
-    median(values.iter().map(|v| v.abs()).collect()) / MAD
+    median(values.iter().map(|v| v.abs()).collect()) / NORMAL_MAD_PER_SIGMA
 }
 
-/// The middle one of values, or the mean of the two in the middle; not a number of none.
+/// Median of values, NaN if there are none.
 ///
 /// ```
 /// assert_eq!(ftlm::signal::statistics::median(vec![3.0, 1.0, 8.0, 2.0]), 2.5);
@@ -100,8 +98,9 @@ pub fn median(mut values: Vec<f64>) -> f64 {
     }
 }
 
-/// Autocovariances of series at lags from 0 to `most`, and how many pairs each is the mean of. What is no number is not
-/// there; each series is taken about its own mean, and they are pooled. O(most · N).
+/// Autocovariances of series at lags from 0 to `most`, and the number of pairs in each mean. O(most · N).
+///
+/// NaN counts as a missing sample. Each series is centered on its own mean, and the results are pooled.
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
@@ -121,8 +120,9 @@ pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
     (sums, pairs)
 }
 
-/// Whether autocorrelations up to some lags could be those of white noise: Ljung and Box's test at 1 %. Where some values are
-/// not there, each correlation has the variance of its own pairs.
+/// Whether autocorrelations up to some lags are consistent with white noise: Ljung–Box test at 1 %.
+///
+/// With missing samples each correlation has the variance of its own pairs.
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn is_white(series: &[f64], lags: usize) -> bool {
@@ -139,41 +139,42 @@ pub fn is_white(series: &[f64], lags: usize) -> bool {
     (pairs[0] + 2.0) * pairs[0] * summed <= chi_squared(lags as f64, NORMAL_99)
 }
 
-/// Value that chi-squared exceeds as often as a normal variable exceeds `quantile`, by Wilson and Hilferty: good to 0.3 %
-/// from five degrees of freedom, to 1 % from one.
+/// Quantile of chi-squared at the level of a normal `quantile`, by Wilson and Hilferty.
+///
+/// Accurate to 0.3 % from five degrees of freedom, to 1 % from one.
 #[must_use]
 pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
     let spread = 2.0 / (9.0 * degrees);
     degrees * libm::pow(1.0 - spread + quantile * spread.sqrt(), 3.0)
 }
 
-/// An autoregression has at most one coefficient for so many samples of the shortest run.
+/// Samples of the shortest run needed for each coefficient of an autoregression.
 const SAMPLES_A_COEFFICIENT: usize = 10;
-/// Least points of a circle of frequencies: on it a colour of 0.99 a sample has died away.
+/// Fewest points of the circulant. A correlation of 0.99 per sample has decayed within it.
 const LEAST_CIRCLE: usize = 4096;
 
-/// The whitening filter 1, a₁, …, aₙ of series that share one colour, and the power that it leaves.
+/// Whitening filter 1, a₁, …, aₙ of series with one spectrum, and the innovation variance.
 ///
-/// Yule-Walker's equations by Levinson and Durbin (doi:10.1093/biomet/47.3-4.233), covariances pooled over the series and
-/// each about its own mean; the order, `most` at most, is that of the least Bayesian information criterion. What is no
-/// number is not there.
+/// Yule-Walker equations by Levinson-Durbin (doi:10.1093/biomet/47.3-4.233). Covariances are pooled over the series,
+/// each about its own mean. The order, `most` at most, minimizes the Bayesian information criterion. NaN counts as a
+/// missing sample.
 ///
 /// ```
-/// // Every other value the opposite: x_k = −0.9 x_{k−1} and what does not follow from it.
+/// // Every other value the opposite: x_k = −0.9 x_{k−1} + a bounded disturbance.
 /// let mut x = vec![1.0];
 /// (0..399_u32).for_each(|k| x.push(-0.9 * x[k as usize] + f64::from(k % 7) / 7.0 - 3.0 / 7.0));
-/// let (filter, power) = ftlm::signal::statistics::coloured(&[&x], 5);
+/// let (filter, power) = ftlm::signal::statistics::whitening_filter(&[&x], 5);
 /// assert!(filter.len() > 1 && power > 0.0);
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
-pub fn coloured(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
+pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
     let most = most.min(counts.iter().min().copied().unwrap_or(0) / SAMPLES_A_COEFFICIENT);
     let (mut covariance, pairs) = autocovariances(series, most);
     let (count, all) = (counts.iter().sum::<usize>() as f64, series.iter().map(|x| x.len()).sum::<usize>() as f64);
     for (lag, (value, &of)) in covariance.iter_mut().zip(&pairs).enumerate() {
-        // A lag whose pairs are few counts for as little: all lags together remain those of one positive spectrum.
+        // A lag with few pairs gets a small weight, so that all lags belong to one positive spectrum.
         let whole = series.iter().map(|x| x.len().saturating_sub(lag)).sum::<usize>() as f64;
         *value *= if of > 0.0 { (if whole > 0.0 { whole } else { 1.0 }) / all } else { 0.0 };
     }
@@ -203,26 +204,27 @@ pub fn coloured(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     (best, left)
 }
 
-/// Autocovariances at lags 0 to `count` − 1 of noise that a filter makes white, of this power then.
+/// Autocovariances at lags 0 to `count` − 1 of an autoregression with this filter and innovation variance.
 #[must_use]
-pub fn covariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
-    // Its spectrum, on a circle so fine that what wraps round has died away.
+pub fn filter_autocovariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
+    // The circle of frequencies is so fine that wrapped-around covariances have decayed.
     let size = power_above(2 * count + 8 * filter.len()).max(LEAST_CIRCLE);
     let plan = plan(size);
     let mut time = filter.to_vec();
     time.resize(size, 0.0);
     let (mut spectrum, mut workspace) = (vec![Bin::new(0.0, 0.0); plan.bins()], Workspace::new());
-    plan.forward(&mut time, &mut spectrum, &mut workspace);
+    plan.transform(&mut time, &mut spectrum, &mut workspace);
     spectrum.iter_mut().for_each(|bin| *bin = Bin::new(power / bin.norm_sqr(), 0.0));
     plan.inverse(&mut spectrum, &mut time, &mut workspace);
     time.truncate(count);
     time
 }
 
-/// Rows times the matrix of a series' autocovariances, row by row: as a product on a circle that holds them. O(N log N) a
-/// row.
+/// Products of rows with the symmetric Toeplitz matrix of these autocovariances. O(N log N) a row.
+///
+/// The Toeplitz matrix is embedded in a circulant matrix.
 #[must_use]
-pub fn weighted(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> {
+pub fn multiply_toeplitz(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> {
     let count = covariances.len();
     let size = power_above(2 * count);
     let plan = plan(size);
@@ -232,14 +234,14 @@ pub fn weighted(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> {
         time[size - lag] = covariances[lag];
     }
     let (mut circle, mut workspace) = (vec![Bin::new(0.0, 0.0); plan.bins()], Workspace::new());
-    plan.forward(&mut time, &mut circle, &mut workspace);
+    plan.transform(&mut time, &mut circle, &mut workspace);
     let mut spectrum = circle.clone();
     rows.iter()
         .map(|row| {
             time[..count].copy_from_slice(row);
             time[count..].fill(0.0);
-            plan.forward(&mut time, &mut spectrum, &mut workspace);
-            // The spectrum of what is even is real.
+            plan.transform(&mut time, &mut spectrum, &mut workspace);
+            // The spectrum of an even sequence is real.
             spectrum.iter_mut().zip(&circle).for_each(|(bin, of)| *bin *= of.re);
             plan.inverse(&mut spectrum, &mut time, &mut workspace);
             time[..count].to_vec()

@@ -51,7 +51,7 @@ def german():
     text = "Messprotokoll Prüfstand 3;;\n;;\nZeit [ms];Strom (A);Weg [mm]\n"
     text += table(separator=";", time=1e3, gain=1e3).replace(".", ",")
     return Stranger(
-        "messung.csv", text.replace("\n", "\r\n").encode("cp1252"), ("-u", "u=Strom", "-y", "y=Weg", "--unit", "y=mm")
+        "messung.csv", text.replace("\n", "\r\n").encode("cp1252"), ("-u", "u=Strom", "-y", "y=Weg", "--units", "y=mm")
     )
 
 
@@ -206,7 +206,7 @@ def columns():
     return Stranger(
         "bench.dat",
         (text + "".join(rows).replace(".", ",")).encode(),
-        ("-u", "u=force", "-y", "y=tip", "--unit", "y=mm"),
+        ("-u", "u=force", "-y", "y=tip", "--units", "y=mm"),
     )
 
 

@@ -235,11 +235,11 @@ def test_the_command(tmp_path):
     run = changing([40.0, 48.0])
     table = np.column_stack([np.arange(run.length) * run.step, run["u"], run["y"]])
     np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="t,u,y", comments="")
-    asked = ["agreement", str(tmp_path / "run.csv"), "-u", "u", "-y", "y", "--structure", "D^2 y = d D y + a y + b u"]
+    asked = ["consistency", str(tmp_path / "run.csv"), "-u", "u", "-y", "y", "--structure", "D^2 y = d D y + a y + b u"]
     done = CliRunner().invoke(app, [*asked, "--report", str(tmp_path / "parts.html")])
     assert done.exit_code == 0, done.output
     assert "Not the same model: a is -" in done.output
     assert (tmp_path / "parts.html").exists()
-    done = CliRunner().invoke(app, [*asked, "--parts", "1"])
+    done = CliRunner().invoke(app, [*asked, "--segments", "1"])
     assert done.exit_code == 2
     assert "at least 2" in done.output

@@ -348,11 +348,11 @@ def test_a_file_that_is_being_read_is_not_yet_fitted_and_says_so(page):
         text = page.own("POST", path, wanted)[2]
         assert "'large.csv' is still being read; wait until its columns are shown" in told(text)
     # What was read before is no longer meant once it is read anew.
-    page.desk.files["large.csv"].told = {"problem": "", "options": {}}
+    page.desk.files["large.csv"].preview = {"problem": "", "options": {}}
     page.desk.files["large.csv"].task = Task({}, page.desk.folder, lambda _: None)
     assert "still being read" in told(page.own("POST", "models", wanted)[2])
     page.desk.files["large.csv"].task = None
-    page.desk.files["large.csv"].told["problem"] = "no output is named"
+    page.desk.files["large.csv"].preview["problem"] = "no output is named"
     assert "is no run yet: no output is named" in told(page.own("POST", "models", wanted)[2])
     assert page.desk.models == {}
 
@@ -461,13 +461,13 @@ def test_a_file_is_told_as_ftlm_open_tells_it(used, content, tmp_path):
     path.write_bytes(content)
     opened = ftlm.open_file(path).to_dict()
     assert json.loads(json.dumps(opened["columns"])) == file.preview["columns"]
-    assert json.loads(json.dumps(opened["options"])) == file.told["options"]
-    assert file.told["assumed"] == [a.words for a in ftlm.open_file(path).assumed]
+    assert json.loads(json.dumps(opened["options"])) == file.preview["options"]
+    assert file.preview["assumed"] == [a.words for a in ftlm.open_file(path).assumed]
     shown = view.file(file)
     assert "300 rows, step 0.05 s, 14.95 s in all" in shown
     assert "by their names" in shown
-    assert [o["structure"] for o in file.told["offers"]][:2] == ["D y = a0 y + b0 u", "D^alpha y = a0 y + b0 u"]
-    assert [len(ftlm.equation(o["structure"]).outputs) for o in file.told["offers"]] == [1] * 5
+    assert [o["structure"] for o in file.preview["offers"]][:2] == ["D y = a0 y + b0 u", "D^alpha y = a0 y + b0 u"]
+    assert [len(ftlm.equation(o["structure"]).outputs) for o in file.preview["offers"]] == [1] * 5
 
 
 def scripted(page, key, content, folder):
@@ -487,7 +487,7 @@ def scripted(page, key, content, folder):
 def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
     (key,) = used.desk.models
     printed = scripted(used, key, content, tmp_path)
-    assert printed.splitlines()[0].startswith(used.desk.models[key].told["verdict"]["level"].upper())
+    assert printed.splitlines()[0].startswith(used.desk.models[key].preview["verdict"]["level"].upper())
     model = ftlm.load_model(tmp_path / "lag-model.json")
     assert model.coefficients["a0"] == pytest.approx(-2, abs=0.1)
 
@@ -709,8 +709,8 @@ def test_roles_are_changed_and_what_is_missing_is_said(page, content):
     status, _, text = page.own("POST", f"files/{key}", {"columns": columns, "from": "1", "to": "9"})
     assert status == 200
     assert "To do" not in text
-    assert page.desk.files[key].told["options"]["window"] == [1.0, 9.0]
-    assert page.desk.files[key].told["length"] == 160
+    assert page.desk.files[key].preview["options"]["window"] == [1.0, 9.0]
+    assert page.desk.files[key].preview["length"] == 160
     assert page.own("DELETE", f"files/{key}")[0] == 200
     assert list(page.desk.folder.iterdir()) == []
 

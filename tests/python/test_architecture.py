@@ -323,7 +323,7 @@ def test_public_names_are_what_they_should_be():
 
 
 def test_every_public_name_has_a_docstring():
-    for name in set(ftlm.__all__) - {"PARAMETERS", "__version__"}:
+    for name in set(ftlm.__all__) - {"PARAMETER_SETS", "__version__"}:
         text = getattr(ftlm, name).__doc__
         assert text, name
         assert text.strip().splitlines()[0].rstrip()[-1] in ".:", name

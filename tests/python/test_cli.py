@@ -56,9 +56,9 @@ SEARCH = (
     EQUATION,
     "--method",
     "least-squares",
-    "--lattice",
+    "--order-grid",
     "alpha=1.3:1.7:0.1",
-    "--lattice",
+    "--order-grid",
     "nu=0.3:0.7:0.1",
 )
 
@@ -79,7 +79,9 @@ def test_two_commands_from_a_file_to_a_validated_model(folder: Path) -> None:
 
 def test_foreign_csv_by_options_and_by_columns_file_give_the_same_numbers(folder: Path) -> None:
     common = ("identify", "square-foreign.csv", *SEARCH, "--json")
-    by_options = ftlm_command(*common, "--time", "seconds", "-u", "u=volts", "-y", "y=mm", "--unit", "y=mm", cwd=folder)
+    by_options = ftlm_command(
+        *common, "--time", "seconds", "-u", "u=volts", "-y", "y=mm", "--units", "y=mm", cwd=folder
+    )
     by_file = ftlm_command(*common, "--columns", "columns.toml", cwd=folder)
     own = ftlm_command("identify", "square.csv", *SEARCH, "--json", cwd=folder)
     found = [json.loads(r.stdout) for r in (by_options, by_file, own)]
@@ -101,7 +103,7 @@ def test_json_prints_the_figures_that_compare_prints(folder: Path) -> None:
 
 def test_search_prints_a_ranked_table_and_counts(folder: Path) -> None:
     words = [w if w != "--method" else "--coefficients" for w in SEARCH]
-    found = ftlm_command("search", "square.csv", *words, "--keep", "3", "--json", cwd=folder)
+    found = ftlm_command("search", "square.csv", *words, "--top", "3", "--json", cwd=folder)
     assert found.returncode == 0, found.stderr
     table = json.loads(found.stdout)["y"]
     assert [row["rank"] for row in table["table"]] == [1, 2, 3]
@@ -197,25 +199,25 @@ BAD = [
     (("identify", "square.csv", "--structure", "D^alpha y = = u"), 2, "character"),
     (("identify", "square.csv", "--structure", "D^1.5 z = a0 z + b0 u"), 3, "z"),
     (("identify", "square.csv", *SEARCH, "--method", "magic"), 2, "magic"),
-    (("identify", "square.csv", *SEARCH, "--p", "0", "--method", "multi-innovation"), 2, "p = 0"),
-    (("identify", "square.csv", *SEARCH, "--k0", "-1", "--method", "multi-innovation"), 2, "K0"),
+    (("identify", "square.csv", *SEARCH, "--innovation-length", "0", "--method", "multi-innovation"), 2, "p = 0"),
+    (("identify", "square.csv", *SEARCH, "--prior-covariance", "-1", "--method", "multi-innovation"), 2, "K0"),
     (("identify", "square.csv", *SEARCH, "--m", "4096"), 2, "4096"),
     (("identify", "square.csv", *SEARCH, "--m", "1000", "--method", "multi-innovation"), 2, "power of two"),
     (("identify", "square.csv", *SEARCH, "--threads", "0"), 2, "threads"),
-    (("identify", "square.csv", *SEARCH, "--keep", "0"), 2, "keep"),
-    (("identify", "square.csv", *SEARCH, "--slice", "5"), 2, "--slice"),
-    (("identify", "square.csv", *SEARCH, "--slice", "5:4"), 3, "slice"),
-    (("identify", "square.csv", *SEARCH, "--order", "alhpa=1.5"), 2, "alpha"),
-    (("identify", "square.csv", *SEARCH, "--order", "alpha=10.5"), 2, "10.5"),
+    (("identify", "square.csv", *SEARCH, "--top", "0"), 2, "keep"),
+    (("identify", "square.csv", *SEARCH, "--window", "5"), 2, "--window"),
+    (("identify", "square.csv", *SEARCH, "--window", "5:4"), 3, "slice"),
+    (("identify", "square.csv", *SEARCH, "--orders", "alhpa=1.5"), 2, "alpha"),
+    (("identify", "square.csv", *SEARCH, "--orders", "alpha=10.5"), 2, "10.5"),
     (("identify", "square.csv", *SEARCH, "--fixed", "a1=x"), 2, "'x'"),
     (("identify", "square.csv", *SEARCH, "--delay", "u=-1"), 2, "delay"),
     (("identify", "square.csv", *SEARCH, "--initial", "sleepy"), 2, "sleepy"),
-    (("identify", "square.csv", *SEARCH, "--lattice", "beta=0:1:0.1"), 2, "beta"),
-    (("identify", "square.csv", *SEARCH[:4], "--step", "1e-7"), 2, "step"),
+    (("identify", "square.csv", *SEARCH, "--order-grid", "beta=0:1:0.1"), 2, "beta"),
+    (("identify", "square.csv", *SEARCH[:4], "--increment", "1e-7"), 2, "step"),
     (("identify", "square.csv", *SEARCH, "--validation", "none.csv"), 3, "none.csv"),
     (("identify", "square.csv", *SEARCH, "-o", "nowhere/model.json"), 3, "nowhere"),
     (("identify", "square-foreign.csv", *SEARCH, "-u", "u=amps", "-y", "y=mm"), 3, "amps"),
-    (("identify", "square-foreign.csv", *SEARCH, "-u", "u=volts", "-y", "y=mm", "--unit", "y=furlong"), 3, "furlong"),
+    (("identify", "square-foreign.csv", *SEARCH, "-u", "u=volts", "-y", "y=mm", "--units", "y=furlong"), 3, "furlong"),
     (("identify", "square-foreign.csv", *SEARCH, "-u", "=volts", "-y", "y=mm"), 2, "NAME=VALUE"),
     (("inspect", "square-foreign.csv", "-u", "Motor (A)", "-y", "y=mm"), 2, '-u "motor=Motor (A)"'),
     (("inspect", "square-foreign.csv"), 3, "-u NAME=COLUMN and -y NAME=COLUMN"),
@@ -296,9 +298,9 @@ def test_ctrl_c_ends_a_search_with_130_and_shows_progress_before(folder: Path) -
             "D^alpha y = a2 D^nu y + a1 D^mu y + a0 D^xi y + b0 u",
             "--coefficients",
             "least-squares",
-            "--step",
+            "--increment",
             "0.005",
-            "--lattice",
+            "--order-grid",
             "alpha=1.0:2.0:0.005",
         ],
         cwd=folder,
@@ -330,9 +332,9 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
     run = DATA / "two_link_psf"
     mats = sorted(str(p) for p in run.glob("*.mat"))
     assert len(mats) == 6
-    for cross in ((), ("--cross-stage",)):
+    for cross in ((), ("--cross-stage", "torques")):
         options = (
-            "--slice",
+            "--window",
             "1.1:7.1",
             "--structure",
             "flexible-link:1",
@@ -340,7 +342,7 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
             "measured",
             "--method",
             "least-squares",
-            "--step",
+            "--increment",
             "0.2",
             "--initial",
             "caputo",
@@ -363,7 +365,7 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
             str(DATA / "two_link_lqr" / "lqr.csv"),
             "--columns",
             "csv.toml",
-            "--slice",
+            "--window",
             "0:6",
             cwd=tmp_path,
         )
@@ -378,13 +380,13 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
     [
         (
             "robot_arm/robot_arm.dat",
-            ("--sampling", "1", "-u", "torque=c1", "-y", "acceleration=c2", "--lattice", "alpha=1.5:2.5:0.1"),
+            ("--step", "1", "-u", "torque=c1", "-y", "acceleration=c2", "--order-grid", "alpha=1.5:2.5:0.1"),
             "D^alpha acceleration = a1 D^nu acceleration + a0 acceleration + b0 torque + b1 D^mu torque",
             0.0,
         ),
         (
             "heating/heating_system.dat",
-            ("--time", "c1", "-u", "voltage=c2", "-y", "temperature=c3", "--unit", "temperature=degC"),
+            ("--time", "c1", "-u", "voltage=c2", "-y", "temperature=c3", "--units", "temperature=degC"),
             "D^alpha temperature = a0 temperature + b0 voltage",
             80.0,
         ),
@@ -394,9 +396,9 @@ def test_the_classic_data_sets_give_a_model_each(
     tmp_path: Path, file: str, options: tuple[str, ...], structure: str, least: float
 ) -> None:
     # Least squares does badly on the robot arm, whose noise is large; the model is there and says so.
-    rest = ("--structure", structure, "--method", "least-squares", "--step", "0.1", "--json", "-o", "m.json")
+    rest = ("--structure", structure, "--method", "least-squares", "--increment", "0.1", "--json", "-o", "m.json")
     if "alpha=1.5:2.5:0.1" not in options:
-        rest = (*rest, "--lattice", "alpha=0.3:1.5:0.05")
+        rest = (*rest, "--order-grid", "alpha=0.3:1.5:0.05")
     found = ftlm_command("identify", str(DATA / file), *options, *rest, cwd=tmp_path)
     assert found.returncode == 0, found.stderr
     data = json.loads(found.stdout)

@@ -24,11 +24,11 @@ WORDS = [
     "control",
     "--design",
     "lqg",
-    "--allowed",
+    "--max-deviation",
     "hub=0.02",
-    "--allowed",
+    "--max-deviation",
     "bend=0.02",
-    "--effort",
+    "--max-input",
     "1",
     "--noise",
     "hub=3e-4",
@@ -170,14 +170,16 @@ def test_a_damaged_lqg_is_refused_by_what_is_wrong(tmp_path):
 
 def test_control_writes_a_controller_and_a_plan(saved, tmp_path):
     out, plan = tmp_path / "c.json", tmp_path / "p.csv"
-    done = run(*WORDS, saved, "--move", "0.3:0.5", "--of", "hub+bend", "-o", out, "--plan", plan, "--limit", 5)
+    done = run(
+        *WORDS, saved, "--path", "0.3:0.5", "--output", "hub+bend", "-o", out, "--trajectory", plan, "--limit", 5
+    )
     assert done.exit_code == 0, done.output
     assert "realised by" in done.output
     assert "phase margin" in done.output
     rows = np.genfromtxt(plan, delimiter=",", names=True)
     assert rows["path"][-1] == pytest.approx(0.3)
     assert rows["hub"] + rows["bend"] == pytest.approx(rows["path"], abs=1e-6)
-    as_json = json.loads(run(*WORDS, saved, "--json", "--move", "0.3:0.5", "--of", "hub+bend").output)
+    as_json = json.loads(run(*WORDS, saved, "--json", "--path", "0.3:0.5", "--output", "hub+bend").output)
     assert as_json["nominal"]["stable"] is True
     assert as_json["planned"]["rows"] == rows.size
     pid = tmp_path / "pid.json"
@@ -188,42 +190,42 @@ def test_control_writes_a_controller_and_a_plan(saved, tmp_path):
 
 def test_shape_writes_what_a_reference_is_convolved_with(saved, tmp_path):
     out = tmp_path / "s.csv"
-    done = run("shape", saved, "--kind", "zvd", "--rate", 200, "--coupling", "measured", "-o", out)
+    done = run("input-shaper", saved, "--kind", "zvd", "--rate", 200, "--coupling", "measured", "-o", out)
     assert done.exit_code == 0, done.output
     assert "ZVD shaper of" in done.output
     rows = np.genfromtxt(out, delimiter=",", names=True)
     shaper = control.input_shaper(ftlm.load_model(saved), "zvd", coupling="measured")
     assert rows["share"] == pytest.approx(shaper.impulses(200.0), abs=1e-11)
-    assert json.loads(run("shape", saved, "--json").output)["kind"] == "zv"
+    assert json.loads(run("input-shaper", saved, "--json").output)["kind"] == "zv"
 
 
 REFUSED = [
     (("control", "MODEL", "--crossover", 40), "several outputs: say which, --output"),
     (("control", "MODEL", "--output", "hub"), "--crossover is missing"),
-    (("control", "MODEL", "--output", "hub", "--crossover", 40, "--effort", 1), "--effort: of --design lqg"),
-    (("control", "MODEL", "--design", "lqg"), "--allowed OUTPUT=A and --effort A are missing"),
+    (("control", "MODEL", "--output", "hub", "--crossover", 40, "--max-input", 1), "--max-input: of --design lqg"),
+    (("control", "MODEL", "--design", "lqg"), "--max-deviation OUTPUT=A and --max-input A are missing"),
     ((*WORDS, "MODEL", "--crossover", 40), "--crossover: of --design pid"),
-    ((*WORDS, "MODEL", "--allowed", "hob=1"), "did you mean 'hub'"),
+    ((*WORDS, "MODEL", "--max-deviation", "hob=1"), "did you mean 'hub'"),
     ((*WORDS, "MODEL", "--noise", "hub"), "names 'hub' twice"),
     ((*WORDS, "MODEL", "--band", "1"), "--band '1' is not 2 numbers"),
     ((*WORDS, "MODEL", "--band", "9:1"), "is no interval"),
-    ((*WORDS, "MODEL", "--move", "0.3"), "--move '0.3' is not 2 numbers"),
-    ((*WORDS, "MODEL", "--move", "0.3:0.5", "--of", "tip"), "is not a sum of outputs"),
-    ((*WORDS, "MODEL", "--move", "9:0.5", "--of", "hub+bend", "--limit", "0.9"), "over the limit of 0.9"),
-    ((*WORDS, "MODEL", "--plan", "p.csv"), "give --move SIZE:SECONDS"),
-    ((*WORDS, "MODEL", "--of", "hub"), "give --move SIZE:SECONDS"),
+    ((*WORDS, "MODEL", "--path", "0.3"), "--path '0.3' is not 2 numbers"),
+    ((*WORDS, "MODEL", "--path", "0.3:0.5", "--output", "tip"), "is not a sum of outputs"),
+    ((*WORDS, "MODEL", "--path", "9:0.5", "--output", "hub+bend", "--limit", "0.9"), "over the limit of 0.9"),
+    ((*WORDS, "MODEL", "--trajectory", "p.csv"), "give --path SIZE:SECONDS"),
+    ((*WORDS, "MODEL", "--output", "hub"), "give --path SIZE:SECONDS"),
     ((*WORDS, "MODEL", "-o", "c.mat"), "does not end in .json"),
-    ((*WORDS, "MODEL", "--move", "0.3:0.5", "--plan", "p.txt"), "does not end in .csv"),
+    ((*WORDS, "MODEL", "--path", "0.3:0.5", "--trajectory", "p.txt"), "does not end in .csv"),
     ((*WORDS, "MODEL", "--limit", -1), "limit = -1"),
     ((*WORDS, "MODEL", "--rate", 0), "rate = 0"),
     ((*WORDS, "MODEL", "--samples", -1), "samples = -1"),
     ((*WORDS, "MODEL", "--input", "U"), "input = 'U' is not one"),
     ((*WORDS, "no.json"), "cannot be read"),
-    (("shape", "MODEL", "--modes", 0), "modes_shaped = 0"),
-    (("shape", "MODEL", "--modes", 9), "modes that swing, and 9 are to be shaped"),
-    (("shape", "MODEL", "--rate", 1), "fewer than four samples"),
-    (("shape", "MODEL", "--kind", "zw"), "is not one of"),
-    (("shape", "MODEL", "-o", "s.json"), "does not end in .csv"),
+    (("input-shaper", "MODEL", "--modes", 0), "--modes 0"),
+    (("input-shaper", "MODEL", "--modes", 9), "modes that swing, and 9 are to be shaped"),
+    (("input-shaper", "MODEL", "--rate", 1), "fewer than four samples"),
+    (("input-shaper", "MODEL", "--kind", "zw"), "is not one of"),
+    (("input-shaper", "MODEL", "-o", "s.json"), "does not end in .csv"),
 ]
 
 
@@ -242,8 +244,8 @@ def test_a_model_that_is_not_stable_is_refused(tmp_path):
     ftlm.Model(ftlm.equation("D^2 hub = 9 D hub + I")).save(path)
     for words in (
         ("control", path, "--crossover", 40),
-        ("control", path, "--design", "lqg", "--allowed", "hub=1", "--effort", 1, "--noise", "hub=1e-3"),
-        ("shape", path),
+        ("control", path, "--design", "lqg", "--max-deviation", "hub=1", "--max-input", 1, "--noise", "hub=1e-3"),
+        ("input-shaper", path),
     ):
         failed = run(*words)
         assert failed.exit_code == 2

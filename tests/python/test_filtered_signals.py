@@ -429,11 +429,15 @@ def test_the_command_line_names_filtered_signals():
     assert built == ftlm.equation(WORDS, sensor_filter=sensor(("y", "v")))
     assert StructureOptions(filtered=["v"]).structure(WORDS).sensor_filter == ftlm.SensorFilter.low_pass(["v"])
     for options, text, words in [
-        ({"low_pass": "2"}, WORDS, "--low-pass is of signals that --filtered names"),
-        ({"filtered": ["y"], "low_pass": "slow"}, WORDS, "--low-pass 'slow' is not HZ or HZ:DAMPING"),
+        ({"low_pass": "2"}, WORDS, "--sensor-filter is of signals that --filtered-signals names"),
+        ({"filtered": ["y"], "low_pass": "slow"}, WORDS, "--sensor-filter 'slow' is not HZ or HZ:DAMPING"),
         ({"filtered": ["w"]}, WORDS, "filtered signal 'w' does not occur"),
-        ({"filtered": ["theta12"]}, "flexible-link:1", "of equations in words; the flexible link has --stock-filter"),
-        ({"filtered": ["theta12"]}, "arm", "--filtered: --structure arm has its own; leave it out"),
+        (
+            {"filtered": ["theta12"]},
+            "flexible-link:1",
+            "of equations in words; the flexible link has --sensor-filter stock",
+        ),
+        ({"filtered": ["theta12"]}, "arm", "--filtered-signals: --structure arm has its own; leave it out"),
         ({"cross_stage": True, "inertial": True}, "flexible-link:1", "use one of them"),
         ({}, "arm:3", "--structure 'arm:3' is not known; use arm:1, :2 or :both"),
     ]:

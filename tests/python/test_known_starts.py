@@ -80,7 +80,15 @@ def test_the_command_takes_a_saved_model(run, simple, tmp_path):
     assert json.loads(done.stdout)["output_error"]["y"]["rmse"] <= simple.output_error["y"].rmse * (1 + 1e-3)
     unused = CliRunner().invoke(
         app,
-        [*words, "--method", "least-squares", "--lattice", "alpha=1.5:2:0.1", "--start", str(tmp_path / "simple.json")],
+        [
+            *words,
+            "--method",
+            "least-squares",
+            "--order-grid",
+            "alpha=1.5:2:0.1",
+            "--start",
+            str(tmp_path / "simple.json"),
+        ],
     )
     assert unused.exit_code == 2
     assert "--start is not used by --method least-squares" in unused.output

@@ -549,11 +549,11 @@ def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_pat
     words = [
         "design-input",
         model,
-        "--like",
+        "--reference-run",
         reference_run,
-        "--limit",
+        "--limits",
         "y=0.9",
-        "--for",
+        "--parameters",
         "alpha",
         "--peak",
         "u=0.8",
@@ -571,8 +571,8 @@ def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_pat
         ("-o", str(tmp_path / "next.mat")): "does not end in .csv",
         ("--slew", "fast"): "neither a number nor INPUT=NUMBER",
         ("--slew", "1e-3"): "raise --slew or --duration",
-        ("--limit", "z=1"): "limits names 'z'",
-        ("--for", "beta"): "is no free number of the model",
+        ("--limits", "z=1"): "limits names 'z'",
+        ("--parameters", "beta"): "is no free number of the model",
     }
     for more, said in refused.items():
         failed = CliRunner().invoke(app, [*words, *more])

@@ -143,12 +143,12 @@ def test_what_names_leave_open_is_asked_and_then_answered(tmp_path):
     assert "to do: which columns are inputs and which are outputs" in shown.stdout
     assert "-u NAME=COLUMN and -y NAME=COLUMN" in shown.stdout
     assert "no numbers (line 2: 'a' is not a number)" in shown.stdout
-    answered = command("open", path, "-u", "CH1", "-y", "y=CH2", "--unit", "y=mm", "--slice", "0.02:", "--json")
+    answered = command("open", path, "-u", "CH1", "-y", "y=CH2", "--units", "y=mm", "--window", "0.02:", "--json")
     told = json.loads(answered.stdout)
     assert (told["step"], told["problem"]) == (0.01, "")
     words = shlex.split(told["commands"][1])
     assert words[:3] == ["ftlm", "identify", str(path)]
-    assert words[3:-2] == ["--time", "Time", "--slice", "0.02:", "-u", "CH1", "-y", "y=CH2", "--unit", "y=mm"]
+    assert words[3:-2] == ["--time", "Time", "--window", "0.02:", "-u", "CH1", "-y", "y=CH2", "--units", "y=mm"]
     assert json.loads(command(*shlex.split(told["commands"][0])[1:], "--json").stdout)[0]["rows"] == 10
 
 
@@ -194,7 +194,7 @@ def test_what_stands_in_the_way_is_said_and_the_options_that_help_are_passed_on(
 BAD = {
     "no such file": (["no.csv"], "does not exist"),
     "no such column": (["x.csv", "-u", "w"], "column 'w' (signal 'w') is not in"),
-    "no such unit": (["x.csv", "--unit", "y=furlong", "-y", "y"], "furlong"),
+    "no such unit": (["x.csv", "--units", "y=furlong", "-y", "y"], "furlong"),
     "detrend": (["x.csv", "--detrend", "constant"], "--detrend is not used with open"),
     "skip": (["x.csv", "--skip", "-3"], "skip is -3"),
     "header": (["x.csv", "--header", "7"], "header is 7"),

@@ -215,19 +215,19 @@ ASKED = {
     "identify": ("the fit", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "identify --method multi-innovation": (
         "the search",
-        "run.csv -u u -y y --step 0.1 --structure",
+        "run.csv -u u -y y --increment 0.1 --structure",
         "D^alpha y = a D^beta y + b0 u",
     ),
     "identify --method genetic --evaluations 400": (
         "the genetic algorithm on y",
-        "run.csv -u u -y y --step 0.1 --structure",
+        "run.csv -u u -y y --increment 0.1 --structure",
         "D^alpha y = a0 y + b0 u",
     ),
     "agreement": ("fitting all parts", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "select": ("choosing", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
-    "search": ("the search", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
+    "search": ("the search", "run.csv -u u -y y --increment 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
     "identify-frequency": ("the fit", "bode.csv -u u -y y --structure", "D^alpha y = a0 y + b0 u"),
-    "design-input": ("the design", "model.json --peak 1 --duration 5 --sampling", "0.05"),
+    "design-input": ("the design", "model.json --peak 1 --duration 5 --step", "0.05"),
 }
 
 

@@ -406,7 +406,17 @@ def test_live_estimates_are_shown(tmp_path, capsys):
     path = tmp_path / "run.csv"
     assert (
         command(
-            *("record", "--parameters", "linear", "--duration", 2, "--live", "flexible-link:2", "--k0", 1e8),
+            *(
+                "record",
+                "--parameters",
+                "linear",
+                "--duration",
+                2,
+                "--live",
+                "flexible-link:2",
+                "--prior-covariance",
+                1e8,
+            ),
             *("-o", path, "--json"),
         )
         == 0

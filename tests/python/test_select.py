@@ -542,9 +542,9 @@ def test_the_command(tmp_path):
     by_file = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", files[1]])
     assert by_file.exit_code == 0, by_file.output
     assert "1, not fitted to" in by_file.output
-    wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--order", "alpha=1"])
+    wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--orders", "alpha=1"])
     assert wrong.exit_code == 2
-    assert "--order: of a structure that is given, not used with --structure auto" in wrong.output
+    assert "--orders: of a structure that is given, not used with --structure auto" in wrong.output
 
 
 def test_a_fit_below_all_measure_keeps_its_column():

@@ -148,7 +148,7 @@ def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, c
 
     data, path = tmp_path / "a.csv", str(tmp_path / "s.ftlm")
     clean_a.to_csv(data)
-    common = ["--structure", "flexible-link:1", "--step", "0.25", "--m", "128", "--json"]
+    common = ["--structure", "flexible-link:1", "--increment", "0.25", "--m", "128", "--json"]
     call = ["search", str(data), *common]
     plain = CliRunner().invoke(app, call)
     kept = CliRunner().invoke(app, [*call, "--store", path])
@@ -158,7 +158,7 @@ def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, c
     status = CliRunner().invoke(app, ["status", path, "--json"])
     assert {n: s["complete"] for n, s in json.loads(status.stdout).items()} == {"theta11": True, "theta12": True}
     assert "100.0 %" in CliRunner().invoke(app, ["status", path]).stdout
-    other = CliRunner().invoke(app, [*call, "--store", path, "--keep", "5"])
+    other = CliRunner().invoke(app, [*call, "--store", path, "--top", "5"])
     assert other.exit_code == 3
     assert "other settings: top = 5" in other.stderr
     # Under the order law both are one search.
@@ -207,7 +207,19 @@ def test_control_c_leaves_a_store_that_goes_on(tmp_path):
     bench.run().to_csv(data)
     # With the handler that a terminal's shell leaves.
     start = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import ftlm.cli; ftlm.cli.main()"
-    call = [sys.executable, "-c", start, "search", str(data), "--structure", EQUATION, "--step", "0.1", "--m", "2048"]
+    call = [
+        sys.executable,
+        "-c",
+        start,
+        "search",
+        str(data),
+        "--structure",
+        EQUATION,
+        "--increment",
+        "0.1",
+        "--m",
+        "2048",
+    ]
     call += ["--coefficients", "least-squares", "--norm", "l2", "--initial", "rest"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
@@ -237,7 +249,7 @@ def test_control_c_at_a_terminal_ends_a_search_that_can_be_resumed(tmp_path):
     """R3: the search gives the terminal back, exit code 130, and goes on to the same bytes."""
     path, data = tmp_path / "s.ftlm", tmp_path / "a.csv"
     bench.run().to_csv(data)
-    call = ["search", str(data), "--structure", EQUATION, "--step", "0.02", "--m", "2048", "--initial", "rest"]
+    call = ["search", str(data), "--structure", EQUATION, "--increment", "0.02", "--m", "2048", "--initial", "rest"]
     call += ["--coefficients", "instrumental-variables"]
     code, _, said = bench.control_c([*call, "--store", str(path)], path, 3)
     assert code == 130
@@ -656,7 +668,7 @@ def test_the_command_identify_goes_on_with_its_store(tmp_path, clean_a):
     data, path = tmp_path / "a.csv", tmp_path / "s.ftlm"
     clean_a.to_csv(data)
     call = ["identify", str(data), "--structure", "flexible-link:1", "--laws", "orders", "--method", "least-squares"]
-    call += ["--step", "0.25", "--m", "128", "--json"]
+    call += ["--increment", "0.25", "--m", "128", "--json"]
     plain = CliRunner().invoke(app, call)
     kept = CliRunner().invoke(app, [*call, "--store", str(path)])
     os.truncate(path, path.stat().st_size * 3 // 4)

@@ -37,7 +37,7 @@ def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
         *made[name].words,
         "--structure",
         strangers.EQUATION,
-        "--slice",
+        "--window",
         ":3.6",
         "--intervals",
         "quadratic",

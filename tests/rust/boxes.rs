@@ -2,10 +2,10 @@
 
 use ftlm::equation::{Equation, Initial};
 use ftlm::order_search::batches::search;
-use ftlm::order_search::branch_and_bound::{box_bounds, left_open, Boxed};
+use ftlm::order_search::branch_and_bound::{box_bounds, open_candidates, BoxBound};
 use ftlm::order_search::control::Control;
 use ftlm::order_search::dual_bound::lower_bounds;
-use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Criterion, Norm, Options};
 use ftlm::regressors::Record;
 use ftlm::simulate::respond;
@@ -23,7 +23,7 @@ fn grid(random: &mut Random, highest: f64, most: usize) -> Vec<f64> {
 }
 
 /// Records and a lattice whose candidates are one slab for each order of the terms that do not vary.
-fn problem(random: &mut Random) -> (Vec<Record>, Lattice) {
+fn problem(random: &mut Random) -> (Vec<Record>, OrderGrid) {
     let noise = 10.0_f64.powf(random.uniform(-5.0, -1.0));
     let truth = equation(0, 1.6, &[(0, 0.9, -2.0), (0, 0.0, -9.0), (1, 0.3, 1.5), (2, 0.0, 6.0)]);
     let step = random.uniform(0.01, 0.05);
@@ -47,7 +47,7 @@ fn problem(random: &mut Random) -> (Vec<Record>, Lattice) {
     if random.chance(0.7) {
         axes.push(axis(2, vec![random.uniform(-0.3, 0.5)]));
     }
-    (records, Lattice::new(0, &[alpha], &axes, |s| s == 2).unwrap())
+    (records, OrderGrid::new(0, &[alpha], &axes, |s| s == 2).unwrap())
 }
 
 #[test]
@@ -65,14 +65,8 @@ fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
         };
         let samples: usize = records.iter().map(Record::m).sum();
         // Brute force, which asks no bound.
-        let options = Options {
-            criterion,
-            norm,
-            keep: 10_000,
-            early_stopping: false,
-            initial: Initial::Rest,
-            ..Options::default()
-        };
+        let options =
+            Options { criterion, norm, top: 10_000, pruning: false, initial: Initial::Rest, ..Options::default() };
         let fixed = vec![None; lattice.width()];
         let found = search(&records, &lattice, &fixed, &options, &Control::default()).unwrap();
         let mut scores = vec![f64::INFINITY; lattice.count() as usize];
@@ -89,7 +83,7 @@ fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
         for index in [0, lattice.count() / 2, lattice.count() - 1] {
             let limit = ranked[random.below(ranked.len().min(20))];
             let (from, to) = (random.below(scores.len()) as u64 / 2, lattice.count());
-            let left = left_open(&records, &lattice, criterion, norm, index, from..to, limit).unwrap();
+            let left = open_candidates(&records, &lattice, criterion, norm, index, from..to, limit).unwrap();
             let all = box_bounds(&records, &lattice, criterion, norm, index).unwrap();
             if let Some(slab) = all.iter().max_by_key(|b| b.rows * b.values) {
                 let within = slab.first.max(from)..slab.first + slab.rows * slab.stride;
@@ -102,9 +96,10 @@ fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
             }
             // What is proved of a box is proved of each of its candidates by the same test vectors, which says more than
             // that it is below a score.
-            let telling_boxes: Vec<&Boxed> = all.iter().filter(|b| b.bound > 0.0 && b.rows * b.values >= 4).collect();
+            let telling_boxes: Vec<&BoxBound> =
+                all.iter().filter(|b| b.bound > 0.0 && b.rows * b.values >= 4).collect();
             for _ in 0..if criterion == Criterion::OutputError { telling_boxes.len().min(60) } else { 0 } {
-                let Boxed { first, rows, values, stride, bound } = *telling_boxes[random.below(telling_boxes.len())];
+                let BoxBound { first, rows, values, stride, bound } = *telling_boxes[random.below(telling_boxes.len())];
                 let (row, value) = (random.below(rows as usize) as u64, random.below(values as usize) as u64);
                 let index = first + row * stride + value;
                 let Some(row) = found.rows.iter().find(|row| row.index == index) else { continue };
@@ -118,7 +113,7 @@ fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
                 );
                 (held, near) = (held + 1, near + usize::from(bound > 0.9 * alone));
             }
-            for Boxed { first, rows, values, stride, bound } in all {
+            for BoxBound { first, rows, values, stride, bound } in all {
                 let all = (0..rows).flat_map(|i| (0..values).map(move |j| first + i * stride + j));
                 let least = all.map(|i| scores[i as usize]).fold(f64::INFINITY, f64::min);
                 assert!(bound <= least, "box of {rows} by {values} from {first}: bound {bound:e}, score {least:e}");

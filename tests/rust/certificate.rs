@@ -2,7 +2,7 @@
 //! do better than what is proved.
 
 use ftlm::equation::Equation;
-use ftlm::order_search::certificate::{cell_bounds, certify, Asked, Certificate, Range, Region};
+use ftlm::order_search::certificate::{cell_bounds, certify, Certificate, CertificateOptions, Range, Region};
 use ftlm::order_search::control::Control;
 use ftlm::regressors::Record;
 use ftlm::simulate::respond;
@@ -160,8 +160,8 @@ fn no_bound_of_a_cell_exceeds_what_any_of_its_orders_leave() {
     assert!(telling[1] > 300 && most[1] > 0.8, "{telling:?}, {most:?}");
 }
 
-fn asked(within: f64) -> Asked {
-    Asked { within, largest: 1e3, cells: 400_000, threads: 2, memory: 1 << 29 }
+fn asked(within: f64) -> CertificateOptions {
+    CertificateOptions { tolerance: within, max_coefficient: 1e3, max_cells: 400_000, threads: 2, memory: 1 << 29 }
 }
 
 fn region() -> Region {
@@ -170,7 +170,7 @@ fn region() -> Region {
         output: 0,
         alpha: (1.2, 1.9),
         terms: vec![range(0, 0.5, 1.1), range(0, 0.0, 0.0), range(1, 0.0, 0.6)],
-        apart: 0.1,
+        min_separation: 0.1,
     }
 }
 
@@ -191,7 +191,7 @@ fn no_orders_of_a_region_do_better_than_is_proved() {
             ((squares / samples as f64).sqrt(), size)
         };
         println!("{found:?}");
-        let Certificate { at_least, best, order, ref orders, open, .. } = found;
+        let Certificate { lower_bound: at_least, best, order, ref orders, open_cells: open, .. } = found;
         // What is said to be reached is.
         assert!((rmse(order, orders).0 / best - 1.0).abs() < 1e-6, "{:?} {best}", rmse(order, orders));
         assert!(at_least <= best);
@@ -229,12 +229,17 @@ fn threads_change_no_bit_and_cells_that_are_not_allowed_are_said() {
     let mut random = Random::new(1203);
     let records = problem(&mut random, 40);
     let of = |threads: usize, cells: u64| {
-        certify(&records, &region(), &Asked { threads, cells, ..asked(0.3) }, &Control::default())
+        certify(
+            &records,
+            &region(),
+            &CertificateOptions { threads, max_cells: cells, ..asked(0.3) },
+            &Control::default(),
+        )
     };
     let whole = of(1, 400_000).unwrap();
     assert_eq!(whole, of(3, 400_000).unwrap());
     let cut = of(2, whole.cells - 1).unwrap();
-    assert!(cut.open > 0 && cut.cells < whole.cells && cut.at_least <= whole.at_least);
+    assert!(cut.open_cells > 0 && cut.cells < whole.cells && cut.lower_bound <= whole.lower_bound);
     let error = of(1, 3).unwrap_err().to_string();
     assert!(error.contains("cells of orders") && error.contains("allow more"), "{error}");
 }
@@ -253,11 +258,17 @@ fn what_is_no_region_is_refused() {
         assert!(of(&Region { alpha, ..region() }, 0.1).contains("alpha"));
     }
     for largest in [0.5, 1e10, f64::NAN, f64::INFINITY] {
-        let error = certify(&records, &region(), &Asked { largest, ..asked(0.1) }, &Control::default()).unwrap_err();
+        let error = certify(
+            &records,
+            &region(),
+            &CertificateOptions { max_coefficient: largest, ..asked(0.1) },
+            &Control::default(),
+        )
+        .unwrap_err();
         assert!(error.to_string().contains("largest"), "{error}");
     }
-    for apart in [0.0, -1.0, f64::NAN, 2.0] {
-        assert!(of(&Region { apart, ..region() }, 0.1).contains("apart"));
+    for min_separation in [0.0, -1.0, f64::NAN, 2.0] {
+        assert!(of(&Region { min_separation, ..region() }, 0.1).contains("apart"));
     }
     let terms = |range: Range| Region { terms: vec![range], ..region() };
     assert!(of(&terms(Range { signal: 9, lowest: 0.0, highest: 1.0 }), 0.1).contains("signal 9"));

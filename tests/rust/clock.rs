@@ -1,7 +1,7 @@
 //! Numbers in the unit of the runs' own: every product before a term is the power of time that its orders make it.
 
 use ftlm::equation::{AffineOrder, Initial};
-use ftlm::estimation::joint_fit::{Clock, Problem};
+use ftlm::estimation::joint_fit::{Problem, TimeScaling};
 use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial};
 
 use crate::common::check;
@@ -39,9 +39,9 @@ const SPANS: [(f64, f64); 2] = [(0.01, 20.0), (0.02, 7.0)];
 /// What every product grows by in the unit, beside what its orders say.
 fn compare(name: &str, equations: &[(Orders, Terms<'_>)], values: &[f64]) {
     let problem = problem(equations, values.len());
-    let clock = Clock::of(&problem, &SPANS);
+    let clock = TimeScaling::from_runs(&problem, &SPANS);
     let all = [FREE.as_slice(), values].concat();
-    let told = clock.told(&all);
+    let told = clock.to_scaled(&all);
     assert_eq!(told[..2], FREE, "{name}");
     for (highest, terms) in equations {
         for (_, nu, powers) in *terms {
@@ -51,7 +51,7 @@ fn compare(name: &str, equations: &[(Orders, Terms<'_>)], values: &[f64]) {
             check(name, ((product(&told) / product(&all)).ln() - wanted).abs(), 1e-12);
         }
     }
-    let back = clock.untold(&told);
+    let back = clock.from_scaled(&told);
     check(name, back.iter().zip(&all).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f64::max), 1e-14);
 }
 
@@ -76,10 +76,10 @@ fn products_of_a_law_are_the_powers_of_time_that_their_orders_make_them() {
 fn a_number_before_terms_of_several_orders_keeps_its_own_unit_and_so_do_its_companions() {
     let none: Orders = (0.0, [0.0, 0.0]);
     let terms: Terms<'_> = &[(0, MU, &[(0, 1)]), (1, none, &[(1, 1)]), (1, MU, &[(1, 1), (0, 1)])];
-    let clock = Clock::of(&problem(&[(ALPHA, terms)], 2), &SPANS);
-    assert_eq!(clock.told(&[1.7, 0.6, 2.0, 3.0]), [1.7, 0.6, 2.0, 3.0]);
+    let clock = TimeScaling::from_runs(&problem(&[(ALPHA, terms)], 2), &SPANS);
+    assert_eq!(clock.to_scaled(&[1.7, 0.6, 2.0, 3.0]), [1.7, 0.6, 2.0, 3.0]);
     // Beside the laws' absence the first term tells: each number is still one.
     let terms: Terms<'_> = &[(0, MU, &[(0, 1)]), (1, none, &[(0, 1)])];
-    let clock = Clock::of(&problem(&[(ALPHA, terms)], 1), &SPANS);
-    check("the first", (clock.told(&[1.7, 0.6, 2.0])[2] / 2.0).ln() - 1.1 * clock.unit(), 1e-12);
+    let clock = TimeScaling::from_runs(&problem(&[(ALPHA, terms)], 1), &SPANS);
+    check("the first", (clock.to_scaled(&[1.7, 0.6, 2.0])[2] / 2.0).ln() - 1.1 * clock.unit(), 1e-12);
 }

@@ -106,7 +106,7 @@ fn an_offset_is_one_more_power_of_time_under_every_kind_of_initial_terms() {
             expected.dedup();
             let initial = under.clone().with_offset(offset).unwrap();
             assert_eq!(plant.initial_exponents(&initial), expected);
-            assert_eq!((initial.under(), initial.at_rest()), (&under, under == Initial::Rest));
+            assert_eq!((initial.under(), initial.is_at_rest()), (&under, under == Initial::Rest));
         }
     }
     assert!(matches!(Initial::Rest.with_offset(3), Err(Error::OutOfRange { .. })));

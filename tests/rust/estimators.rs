@@ -4,13 +4,13 @@
 use ftlm::equation::{Initial, Structure};
 use ftlm::error::Error;
 use ftlm::estimation::least_squares::{self, Regression};
-use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, Rows};
+use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, RowBasis};
 use ftlm::fractional::operational_matrices;
-use ftlm::linalg::small::{self, packed};
+use ftlm::linalg::small::{self, packed_index};
 use ftlm::parallel::pool;
 use ftlm::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
 use ftlm::series;
-use ftlm::simd::{self, WIDTH};
+use ftlm::simd::{self, LANE_COUNT};
 use ftlm::simulate;
 use proptest::prelude::*;
 
@@ -129,7 +129,7 @@ fn the_regression_is_what_the_equation_says() {
     // Caputo: 1, t and t^0.9 of the output, t^1.5 of the second input, for each record.
     let exponents = model.structure.initial_exponents(&Initial::Caputo);
     assert_eq!(exponents, [0.0, 0.9, 1.0, 1.5]);
-    assert_eq!((regression.columns.len(), regression.free()), (3 + 2 * 4, 3));
+    assert_eq!((regression.columns.len(), regression.free_count()), (3 + 2 * 4, 3));
     assert_eq!(regression.starts, [0, 100, 160]);
     for (r, range) in [(0, 0..100), (1, 100..160)] {
         let record = &records[r];
@@ -193,7 +193,7 @@ fn what_cannot_be_fitted_is_refused() {
     // Fewer rows than coefficients.
     let short = obeying(&model, 3, 0.01, &[], 0.0, 51);
     assert!(matches!(fit(&[short], &FREE), Err(Error::Singular { .. })));
-    let innovation = Innovation { length: 1, prior_covariance: 1.0, rows: Rows::Haar };
+    let innovation = Innovation { length: 1, prior_covariance: 1.0, row_basis: RowBasis::Haar };
     for bad in [
         Innovation { length: 0, ..innovation },
         Innovation { prior_covariance: 0.0, ..innovation },
@@ -216,7 +216,7 @@ fn least_squares_is_the_same_in_haar_coordinates() {
         let time = least_squares::fit(std::slice::from_ref(&record), &model.structure, &FREE, &Initial::Rest).unwrap();
         let mut regression = Regression::new(&[record], &model.structure, &FREE, &Initial::Rest).unwrap();
         for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-            operational_matrices::transform(series).unwrap();
+            operational_matrices::haar_transform(series).unwrap();
         }
         let (coefficients, _) = least_squares::solve(&regression.columns, &regression.target, 4).unwrap();
         check("Haar against block pulses", relative_distance(&coefficients, &time.coefficients), 1e-11);
@@ -265,15 +265,15 @@ fn published(columns: &[Vec<f64>], target: &[f64], p: usize, prior: f64) -> Vec<
 fn the_recursion_is_the_published_one() {
     let model = damped();
     let record = obeying(&model, 128, 0.02, &[], 0.02, 56);
-    for rows in [Rows::Haar, Rows::Time] {
+    for rows in [RowBasis::Haar, RowBasis::Time] {
         for length in [1, 2, 5, 200] {
-            let innovation = Innovation { length, prior_covariance: 10.0, rows };
+            let innovation = Innovation { length, prior_covariance: 10.0, row_basis: rows };
             let records = std::slice::from_ref(&record);
             let (found, _) = recursion(records, &model.structure, &FREE, &Initial::Rest, &innovation).unwrap();
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
-            if rows == Rows::Haar {
+            if rows == RowBasis::Haar {
                 for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-                    operational_matrices::transform(series).unwrap();
+                    operational_matrices::haar_transform(series).unwrap();
                 }
             }
             let oracle = published(&regression.columns, &regression.target, length, 10.0);
@@ -298,10 +298,10 @@ fn the_recursion_ends_at_the_closed_form() {
         (&two[..], &FREE, Initial::Powers(vec![0.0, 1.0])),
         (&two[..], &fixed, Initial::Rest),
     ] {
-        for rows in [Rows::Haar, Rows::Time] {
+        for rows in [RowBasis::Haar, RowBasis::Time] {
             for length in [1, 3, 5, 7] {
                 for prior_covariance in [1.0, 100.0] {
-                    let innovation = Innovation { length, prior_covariance, rows };
+                    let innovation = Innovation { length, prior_covariance, row_basis: rows };
                     let closed = closed_form(records, &model.structure, fixed, &initial, &innovation).unwrap();
                     let (ended, trace) = recursion(records, &model.structure, fixed, &initial, &innovation).unwrap();
                     worst = worst.max(relative_distance(&ended.coefficients, &closed.coefficients));
@@ -320,7 +320,7 @@ fn the_recursion_ends_at_the_closed_form() {
 
 #[test]
 fn every_row_weighs_as_often_as_it_is_used() {
-    let innovation = |length| Innovation { length, prior_covariance: 1.0, rows: Rows::Time };
+    let innovation = |length| Innovation { length, prior_covariance: 1.0, row_basis: RowBasis::Time };
     let weights = |length, m| (0..m).map(|i| innovation(length).weight(i, m)).collect::<Vec<_>>();
     assert_eq!(weights(1, 4), [1, 1, 1, 1]);
     assert_eq!(weights(3, 6), [3, 3, 3, 3, 2, 1]);
@@ -328,15 +328,15 @@ fn every_row_weighs_as_often_as_it_is_used() {
     // The closed form against the normal equations written out with these weights.
     let model = damped();
     let record = obeying(&model, 64, 0.03, &[], 0.05, 60);
-    for rows in [Rows::Haar, Rows::Time] {
+    for rows in [RowBasis::Haar, RowBasis::Time] {
         for length in [1, 4, 64, 100] {
-            let innovation = Innovation { length, prior_covariance: 50.0, rows };
+            let innovation = Innovation { length, prior_covariance: 50.0, row_basis: rows };
             let records = std::slice::from_ref(&record);
             let found = closed_form(records, &model.structure, &FREE, &Initial::Rest, &innovation).unwrap();
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
-            if rows == Rows::Haar {
+            if rows == RowBasis::Haar {
                 for series in regression.columns.iter_mut().chain([&mut regression.target]) {
-                    operational_matrices::transform(series).unwrap();
+                    operational_matrices::haar_transform(series).unwrap();
                 }
             }
             let weighted =
@@ -357,21 +357,21 @@ fn innovation_length_and_coordinates_are_all_one_without_a_prior() {
     let record = obeying(&model, 512, 0.01, &[], 0.02, 61);
     let records = std::slice::from_ref(&record);
     let of = |length, prior_covariance, rows| {
-        let innovation = Innovation { length, prior_covariance, rows };
+        let innovation = Innovation { length, prior_covariance, row_basis: rows };
         closed_form(records, &model.structure, &FREE, &Initial::Rest, &innovation).unwrap().coefficients
     };
     // With p = 1 every row weighs the same, so coordinates cannot matter, prior or not.
     for prior in [1.0, 100.0] {
         check(
             "p = 1, Haar against time",
-            relative_distance(&of(1, prior, Rows::Haar), &of(1, prior, Rows::Time)),
+            relative_distance(&of(1, prior, RowBasis::Haar), &of(1, prior, RowBasis::Time)),
             1e-11,
         );
     }
     let batch = least_squares::fit(records, &model.structure, &FREE, &Initial::Rest).unwrap().coefficients;
-    check("weak prior against least squares", relative_distance(&of(1, 1e14, Rows::Time), &batch), 1e-10);
+    check("weak prior against least squares", relative_distance(&of(1, 1e14, RowBasis::Time), &batch), 1e-10);
     // p multiplies the data, all but the last rows, as K0 does: the prior pulls ever less.
-    let pull = |p| relative_distance(&of(p, 1.0, Rows::Haar), &batch);
+    let pull = |p| relative_distance(&of(p, 1.0, RowBasis::Haar), &batch);
     assert!(pull(1) > pull(3) && pull(3) > pull(7));
 }
 
@@ -462,10 +462,10 @@ fn solve_one(gram: &[f64], rhs: &[f64], needed: usize) -> (Vec<f64>, bool) {
     let k = rhs.len();
     let scale: Vec<f64> =
         (0..k).map(|i| if gram[i * k + i] > 0.0 { 1.0 / gram[i * k + i].sqrt() } else { 0.0 }).collect();
-    let mut lower = vec![[0.0]; packed(k, 0)];
+    let mut lower = vec![[0.0]; packed_index(k, 0)];
     for i in 0..k {
         for j in 0..=i {
-            lower[packed(i, j)] =
+            lower[packed_index(i, j)] =
                 [if scale[i] * scale[j] == 0.0 { 0.0 } else { gram[i * k + j] * scale[i] * scale[j] }];
         }
     }
@@ -499,13 +499,13 @@ fn dependent_columns_of_a_gram_matrix() {
     assert_eq!(solve_one(&[], &[], 0), (vec![], false));
 }
 
-struct Wide<'a>(&'a mut [[f64; WIDTH]], &'a mut [[f64; WIDTH]], usize);
+struct Wide<'a>(&'a mut [[f64; LANE_COUNT]], &'a mut [[f64; LANE_COUNT]], usize);
 
 impl simd::Kernel for Wide<'_> {
-    type Output = [bool; WIDTH];
+    type Output = [bool; LANE_COUNT];
 
     #[inline(always)]
-    fn run(self) -> [bool; WIDTH] {
+    fn run(self) -> [bool; LANE_COUNT] {
         small::solve_lanes(self.0, self.1, self.2)
     }
 }
@@ -525,7 +525,7 @@ impl simd::Kernel for Dot<'_> {
 fn lanes_do_not_know_each_other_nor_the_instructions_they_run_on() {
     let mut random = Random::new(65);
     for k in 1..9 {
-        let mut systems: Vec<(Vec<f64>, Vec<f64>)> = (0..WIDTH)
+        let mut systems: Vec<(Vec<f64>, Vec<f64>)> = (0..LANE_COUNT)
             .map(|_| {
                 let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(30)).collect();
                 gram(&columns, &random.signal(30))
@@ -534,28 +534,28 @@ fn lanes_do_not_know_each_other_nor_the_instructions_they_run_on() {
         // One lane that is singular from its first unknown on, and one that is no number.
         systems[2].0.fill(0.0);
         systems[5].0.fill(f64::NAN);
-        let pack = |lanes: &[usize]| -> (Vec<[f64; WIDTH]>, Vec<[f64; WIDTH]>) {
+        let pack = |lanes: &[usize]| -> (Vec<[f64; LANE_COUNT]>, Vec<[f64; LANE_COUNT]>) {
             let lower = (0..k)
                 .flat_map(|i| (0..=i).map(move |j| (i, j)))
                 .map(|(i, j)| std::array::from_fn(|n| systems[lanes[n]].0[i * k + j]))
                 .collect();
             (lower, (0..k).map(|i| std::array::from_fn(|n| systems[lanes[n]].1[i])).collect())
         };
-        let straight: Vec<usize> = (0..WIDTH).collect();
-        let turned: Vec<usize> = (0..WIDTH).rev().collect();
+        let straight: Vec<usize> = (0..LANE_COUNT).collect();
+        let turned: Vec<usize> = (0..LANE_COUNT).rev().collect();
         let (mut a, mut x) = pack(&straight);
         let flags = small::solve_lanes(&mut a, &mut x, k.min(2));
         let (mut a, mut y) = pack(&straight);
-        let widest = simd::widest(Wide(&mut a, &mut y, k.min(2)));
+        let widest = simd::dispatch_simd(Wide(&mut a, &mut y, k.min(2)));
         let (mut a, mut z) = pack(&turned);
         let backwards = small::solve_lanes(&mut a, &mut z, k.min(2));
         assert_eq!(flags, widest);
         assert!(flags[2] && flags[5] && !flags[0]);
-        for n in 0..WIDTH {
-            assert_eq!(flags[n], backwards[WIDTH - 1 - n]);
+        for n in 0..LANE_COUNT {
+            assert_eq!(flags[n], backwards[LANE_COUNT - 1 - n]);
             for i in 0..k {
                 assert_eq!(x[i][n].to_bits(), y[i][n].to_bits());
-                assert_eq!(x[i][n].to_bits(), z[i][WIDTH - 1 - n].to_bits());
+                assert_eq!(x[i][n].to_bits(), z[i][LANE_COUNT - 1 - n].to_bits());
             }
             let mut one: Vec<[f64; 1]> = (0..k).map(|i| [systems[n].1[i]]).collect();
             let mut lower: Vec<[f64; 1]> =
@@ -565,7 +565,7 @@ fn lanes_do_not_know_each_other_nor_the_instructions_they_run_on() {
         }
     }
     let (a, b) = (random.signal(1003), random.signal(1003));
-    assert_eq!(simd::dot(&a, &b).to_bits(), simd::widest(Dot(&a, &b)).to_bits());
+    assert_eq!(simd::dot(&a, &b).to_bits(), simd::dispatch_simd(Dot(&a, &b)).to_bits());
     check("dot product", (simd::dot(&a, &b) - a.iter().zip(&b).map(|(x, y)| x * y).sum::<f64>()).abs(), 1e-13);
 }
 

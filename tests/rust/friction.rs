@@ -3,10 +3,10 @@
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
-use ftlm::friction::contact::{is_p_matrix, March, Rubbing, Trace};
-use ftlm::friction::convolution::{Heads, Online};
-use ftlm::friction::law::{Moves, Phase};
-use ftlm::friction::{fit, Body, FreeLaw, FrictionModel, Law, Start};
+use ftlm::friction::contact::{is_p_matrix, ContactLaw, ContactSolution, Trace};
+use ftlm::friction::convolution::{Heads, OnlineConvolution};
+use ftlm::friction::law::{Phase, PulseDerivatives};
+use ftlm::friction::{fit, Body, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
 use ftlm::regressors::Record;
 
 use crate::common::Random;
@@ -14,7 +14,7 @@ use crate::common::Random;
 fn body(order: f64, friction: f64) -> Body {
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
     let structure = Structure { output: 0, order, terms };
-    Body::alone(Equation { structure, coefficients: vec![-1.0, 1.0] }, Law::coulomb(friction))
+    Body::single(Equation { structure, coefficients: vec![-1.0, 1.0] }, FrictionLaw::coulomb(friction))
 }
 
 fn force(m: usize) -> Vec<f64> {
@@ -25,7 +25,7 @@ fn force(m: usize) -> Vec<f64> {
 fn sums_over_the_past_are_the_plain_ones() {
     let (kernel, signal) = (force(1000), force(1500).split_off(500));
     let heads = Heads::new(&kernel);
-    let mut online = Online::new(&heads);
+    let mut online = OnlineConvolution::new(&heads);
     for (k, &x) in signal.iter().enumerate() {
         let plain: f64 = (0..k).map(|j| kernel[k - j] * signal[j]).sum();
         assert!((online.past() - plain).abs() < 1e-10, "{k}");
@@ -35,9 +35,9 @@ fn sums_over_the_past_are_the_plain_ones() {
 }
 
 /// One body by itself, from rest.
-fn marched(linear: &[f64], response: &[f64], law: Law) -> Trace {
-    let rubbing = Rubbing::new(vec![law], vec![response[0]]).expect("one body moves only itself");
-    March::new(&[linear.to_vec()], &[vec![Heads::new(response)]], rubbing, &[0.0]).bodies.swap_remove(0)
+fn marched(linear: &[f64], response: &[f64], law: FrictionLaw) -> Trace {
+    let rubbing = ContactLaw::new(vec![law], vec![response[0]]).expect("one body moves only itself");
+    ContactSolution::new(&[linear.to_vec()], &[vec![Heads::new(response)]], rubbing, &[0.0]).bodies.swap_remove(0)
 }
 
 #[test]
@@ -46,7 +46,7 @@ fn a_march_obeys_its_law() {
     let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
     let linear: Vec<f64> = force(m);
     let strength = 3.0;
-    let march = marched(&linear, &response, Law::coulomb(strength));
+    let march = marched(&linear, &response, FrictionLaw::coulomb(strength));
     assert!(march.phases.contains(&Phase::Stick) && march.phases.contains(&Phase::Slip));
     for k in 0..m {
         let past: f64 = (0..=k).map(|j| response[k - j] * march.force[j]).sum();
@@ -66,7 +66,7 @@ fn a_march_that_falls_with_speed_obeys_its_law() {
     let m = 2000;
     let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
     let linear = force(m);
-    let law = Law { coulomb: 2.0, stribeck: 3.0, speed: 0.05 };
+    let law = FrictionLaw { coulomb: 2.0, stribeck: 3.0, speed: 0.05 };
     let march = marched(&linear, &response, law);
     for phase in [Phase::Slip, Phase::Stick, Phase::Turn] {
         assert!(march.phases.contains(&phase), "{phase:?}");
@@ -90,7 +90,7 @@ fn a_march_that_falls_with_speed_obeys_its_law() {
 
 #[test]
 fn slopes_of_a_pulse_are_those_of_differences() {
-    let law = Law { coulomb: 0.4, stribeck: 0.7, speed: 0.3 };
+    let law = FrictionLaw { coulomb: 0.4, stribeck: 0.7, speed: 0.3 };
     // (velocity, free end, first number of the response): slips near and far, from rest, both ways; stops; turns.
     let pulses = [
         (0.5, 0.52, 0.05),
@@ -117,12 +117,14 @@ fn slopes_of_a_pulse_are_those_of_differences() {
             unit[moved] = 1.0;
             let near = |by: f64| {
                 let [dv, dp, dg, dc, ds, dw] = unit.map(|u| by * u);
-                let there = Law { coulomb: law.coulomb + dc, stribeck: law.stribeck + ds, speed: law.speed + dw };
+                let there =
+                    FrictionLaw { coulomb: law.coulomb + dc, stribeck: law.stribeck + ds, speed: law.speed + dw };
                 there.pulse(v + dv, p + dp, g + dg, 0.0)
             };
             let (up, down) = (near(1e-6), near(-1e-6));
             assert_eq!((up.phase, down.phase), (at.phase, at.phase));
-            let moves = Moves { start: unit[0], free: unit[1], first: unit[2], law: [unit[3], unit[4], unit[5]] };
+            let moves =
+                PulseDerivatives { start: unit[0], free: unit[1], first: unit[2], law: [unit[3], unit[4], unit[5]] };
             let (force, end) = law.slope(v, p, g, &at, &moves);
             assert!((force - (up.force - down.force) / 2e-6).abs() < 1e-6 * (1.0 + force.abs()), "{v} {p} {moved}");
             assert!((end - (up.end - down.end) / 2e-6).abs() < 1e-6 * (1.0 + end.abs()), "{v} {p} {moved}");
@@ -138,7 +140,7 @@ fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
     let record = Record::new(0.01, vec![vec![0.0; 50], vec![1.0; 50]], None)?;
     for (stribeck, speed) in [(-0.1, 0.2), (0.1, 0.0), (0.1, -0.2)] {
         let mut wrong = body(1.8, 0.5);
-        wrong.frictions[0].1 = Law { stribeck, speed, ..wrong.frictions[0].1 };
+        wrong.frictions[0].1 = FrictionLaw { stribeck, speed, ..wrong.frictions[0].1 };
         assert!(matches!(wrong.run(&record, &[vec![]]), Err(Error::OutOfRange { .. })));
     }
     let mut lost = body(1.8, 0.5);
@@ -151,7 +153,7 @@ fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
 fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
     let record = Record::new(0.01, vec![vec![0.0; 400], force(400)], None)?;
     let motion = body(2.0, 2.5).run(&record, &[vec![(0.0, 0.7), (1.0, 0.7)]])?;
-    assert!(motion.bodies[0].is_still());
+    assert!(motion.bodies[0].is_always_at_rest());
     assert!(motion.outputs[0].iter().all(|y| (y - 0.7).abs() < 1e-15));
     Ok(())
 }
@@ -171,7 +173,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
             order: order(0.0, 1.0),
             terms: vec![(0, order(1.0, 0.0), free(0, -1.0)), (1, order(0.0, 0.0), free(1, 1.0))],
         }],
-        frictions: vec![(0, FreeLaw::coulomb(free(2, 1.0)))],
+        frictions: vec![(0, FreeFrictionLaw::coulomb(free(2, 1.0)))],
         inputs: vec![],
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
@@ -186,7 +188,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
         assert!((value - truth).abs() < 1e-4, "{:?}", found.coefficients);
     }
     let strange = FrictionModel {
-        frictions: vec![(0, FreeLaw::coulomb(Monomial { factor: -1.0, powers: vec![] }))],
+        frictions: vec![(0, FreeFrictionLaw::coulomb(Monomial { factor: -1.0, powers: vec![] }))],
         ..model.clone()
     };
     assert!(matches!(strange.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
@@ -303,8 +305,8 @@ fn of_all_combinations_of_bodies_at_rest_exactly_one_is_taken() {
         let p: Vec<f64> = (0..n).map(|_| random.uniform(-2.0, 2.0)).collect();
         let all = consistent(&most, &p, &gains);
         assert_eq!(all.len(), 1, "{gains:?} {p:?}");
-        let laws = most.iter().map(|f| Law::coulomb(*f)).collect();
-        let rubbing = Rubbing::new(laws, gains).expect("a P-matrix");
+        let laws = most.iter().map(|f| FrictionLaw::coulomb(*f)).collect();
+        let rubbing = ContactLaw::new(laws, gains).expect("a P-matrix");
         let mut at = Vec::new();
         rubbing.pulse(&vec![0.0; n], &p, &vec![0.0; n], &vec![0.0; n], &mut at);
         for (body, force) in at.iter().zip(&all[0]) {
@@ -325,10 +327,11 @@ fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
         let across = random.uniform(-0.9, 0.9) * (gains[0] * gains[3]).sqrt();
         let gains = vec![gains[0], across, across, gains[3]];
         let stribeck = if case % 2 == 0 { 0.0 } else { 0.3 };
-        let laws: Vec<Law> = (0..2).map(|_| Law { coulomb: random.uniform(0.1, 2.0), stribeck, speed: 0.5 }).collect();
+        let laws: Vec<FrictionLaw> =
+            (0..2).map(|_| FrictionLaw { coulomb: random.uniform(0.1, 2.0), stribeck, speed: 0.5 }).collect();
         let (v, p): (Vec<f64>, Vec<f64>) =
             (0..2).map(|_| (random.uniform(-0.4, 0.4), random.uniform(-0.7, 0.7))).unzip();
-        let rubbing = Rubbing::new(laws.clone(), gains.clone()).expect("a P-matrix");
+        let rubbing = ContactLaw::new(laws.clone(), gains.clone()).expect("a P-matrix");
         let (mut at, mut other) = (Vec::new(), Vec::new());
         rubbing.pulse(&v, &p, &[0.0; 2], &[0.0; 2], &mut at);
         for begun in [[2.0, 2.0], [-2.0, 2.0], [0.3, -1.0]] {
@@ -344,7 +347,10 @@ fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
         seen.insert((at[0].1.phase as usize, at[1].1.phase as usize));
     }
     assert_eq!(seen.len(), 9);
-    assert!(matches!(Rubbing::new(vec![Law::coulomb(1.0); 2], vec![0.1, 0.2, 0.2, 0.1]), Err(Error::Diverged { .. })));
+    assert!(matches!(
+        ContactLaw::new(vec![FrictionLaw::coulomb(1.0); 2], vec![0.1, 0.2, 0.2, 0.1]),
+        Err(Error::Diverged { .. })
+    ));
 }
 
 #[test]
@@ -352,8 +358,8 @@ fn slopes_of_a_pulse_of_two_bodies_are_those_of_differences() {
     let mut random = Random::new(7);
     let (mut compared, mut seen) = (0, std::collections::HashSet::new());
     for _ in 0..400 {
-        let laws: Vec<Law> =
-            (0..2).map(|_| Law { coulomb: random.uniform(0.1, 2.0), stribeck: 0.4, speed: 0.5 }).collect();
+        let laws: Vec<FrictionLaw> =
+            (0..2).map(|_| FrictionLaw { coulomb: random.uniform(0.1, 2.0), stribeck: 0.4, speed: 0.5 }).collect();
         let gains = vec![0.2, random.uniform(-0.1, 0.1), random.uniform(-0.1, 0.1), 0.1];
         let numbers: Vec<f64> = (0..4).map(|_| random.uniform(-0.6, 0.6)).collect();
         let ways: Vec<f64> = (0..4).map(|_| random.uniform(-1.0, 1.0)).collect();
@@ -361,14 +367,14 @@ fn slopes_of_a_pulse_of_two_bodies_are_those_of_differences() {
         let run = |by: f64| {
             let at: Vec<f64> = numbers.iter().zip(&ways).map(|(x, w)| x + by * w).collect();
             let moved = (laws.iter().enumerate())
-                .map(|(a, law)| Law {
+                .map(|(a, law)| FrictionLaw {
                     coulomb: law.coulomb + by * turns[3 * a],
                     stribeck: law.stribeck + by * turns[3 * a + 1],
                     speed: law.speed + by * turns[3 * a + 2],
                 })
                 .collect();
             let mut out = Vec::new();
-            Rubbing::new(moved, gains.clone()).expect("a P-matrix").pulse(
+            ContactLaw::new(moved, gains.clone()).expect("a P-matrix").pulse(
                 &at[..2],
                 &at[2..],
                 &[0.0; 2],
@@ -383,8 +389,8 @@ fn slopes_of_a_pulse_of_two_bodies_are_those_of_differences() {
         }
         compared += 1;
         seen.insert((here[0].1.phase as usize, here[1].1.phase as usize));
-        let moves: Vec<Moves> = (0..2)
-            .map(|a| Moves {
+        let moves: Vec<PulseDerivatives> = (0..2)
+            .map(|a| PulseDerivatives {
                 start: ways[a],
                 free: ways[2 + a],
                 first: 0.0,
@@ -392,7 +398,12 @@ fn slopes_of_a_pulse_of_two_bodies_are_those_of_differences() {
             })
             .collect();
         let mut slopes = Vec::new();
-        Rubbing::new(laws.clone(), gains.clone()).expect("a P-matrix").slope(&numbers[..2], &here, &moves, &mut slopes);
+        ContactLaw::new(laws.clone(), gains.clone()).expect("a P-matrix").slope(
+            &numbers[..2],
+            &here,
+            &moves,
+            &mut slopes,
+        );
         for (a, &(force, end)) in slopes.iter().enumerate() {
             let (by_force, by_end) = (up[a].1.force - down[a].1.force, up[a].1.end - down[a].1.end);
             assert!((force - by_force / 2e-6).abs() < 1e-5 * (1.0 + force.abs()), "{here:?}");

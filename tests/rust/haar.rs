@@ -13,7 +13,7 @@ use crate::common::{cases, check, distance, largest, norm, toeplitz, Random};
 #[test]
 fn the_haar_matrix_is_orthogonal() {
     for m in [1, 2, 4, 8, 64, 256, 512] {
-        let phi = operational_matrices::matrix(m).unwrap();
+        let phi = operational_matrices::haar_matrix(m).unwrap();
         let mut worst = 0.0_f64;
         for i in 0..m {
             for j in 0..=i {
@@ -29,21 +29,21 @@ fn the_haar_matrix_is_orthogonal() {
 fn the_haar_matrix_of_four_is_the_printed_one() {
     let r = 0.5_f64.sqrt();
     let printed = [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, -0.5, -0.5, r, -r, 0.0, 0.0, 0.0, 0.0, r, -r];
-    assert!(distance(&operational_matrices::matrix(4).unwrap(), &printed) < 1e-15);
-    assert_eq!(operational_matrices::matrix(1).unwrap(), [1.0]);
+    assert!(distance(&operational_matrices::haar_matrix(4).unwrap(), &printed) < 1e-15);
+    assert_eq!(operational_matrices::haar_matrix(1).unwrap(), [1.0]);
 }
 
 #[test]
 fn the_fast_transform_is_the_matrix() {
     let mut random = Random::new(20);
     for m in [1, 2, 4, 16, 128, 1024] {
-        let phi = operational_matrices::matrix(m).unwrap();
+        let phi = operational_matrices::haar_matrix(m).unwrap();
         let f = random.signal(m);
         let mut fast = f.clone();
-        operational_matrices::transform(&mut fast).unwrap();
+        operational_matrices::haar_transform(&mut fast).unwrap();
         assert!(distance(&fast, &dense::multiply(&phi, &f, m, m, 1)) < 1e-14 * norm(&f));
         let mut back = fast.clone();
-        operational_matrices::inverse(&mut back).unwrap();
+        operational_matrices::haar_inverse(&mut back).unwrap();
         assert!(distance(&back, &dense::multiply(&fast, &phi, 1, m, m)) < 1e-14 * norm(&f));
         assert!(distance(&back, &f) < 1e-14 * norm(&f));
     }
@@ -54,10 +54,10 @@ fn lengths_that_are_no_power_of_two_are_named_with_their_neighbours() {
     for (m, below, above) in [(12, 8, 16), (2047, 1024, 2048), (2049, 2048, 4096), (3, 2, 4)] {
         let error = Error::NotPowerOfTwo { m, below, above };
         let mut x = vec![1.0; m];
-        assert_eq!(operational_matrices::transform(&mut x), Err(error.clone()));
-        assert_eq!(operational_matrices::inverse(&mut x), Err(error.clone()));
+        assert_eq!(operational_matrices::haar_transform(&mut x), Err(error.clone()));
+        assert_eq!(operational_matrices::haar_inverse(&mut x), Err(error.clone()));
         assert!(x.iter().all(|&v| v == 1.0), "a refused signal is left as it was");
-        assert_eq!(operational_matrices::matrix(m), Err(error.clone()));
+        assert_eq!(operational_matrices::haar_matrix(m), Err(error.clone()));
         assert_eq!(operational_matrices::operational_matrix(0.5, m, 0.1), Err(error.clone()));
         assert_eq!(operational_matrices::operational_matrix_dense(0.5, m, 0.1), Err(error));
     }
@@ -68,7 +68,7 @@ fn lengths_that_are_no_power_of_two_are_named_with_their_neighbours() {
     );
     // Nothing has no neighbours to be named.
     assert!(matches!(operational_matrices::check_power_of_two(0), Err(Error::Length { expected: 1, found: 0, .. })));
-    assert!(operational_matrices::transform(&mut []).is_err());
+    assert!(operational_matrices::haar_transform(&mut []).is_err());
 }
 
 #[test]
@@ -114,11 +114,11 @@ fn the_operational_matrix_integrates_haar_coefficients() {
     let (m, step, eta) = (256, 0.02, 0.85);
     let f = random.signal(m);
     let mut coefficients = f.clone();
-    operational_matrices::transform(&mut coefficients).unwrap();
+    operational_matrices::haar_transform(&mut coefficients).unwrap();
     let p = operational_matrices::operational_matrix(eta, m, step).unwrap();
     let by_matrix = dense::multiply(&coefficients, &p, 1, m, m);
     let mut by_series = series::multiply(&block_pulse_kernel(eta, m, step), &f, m);
-    operational_matrices::transform(&mut by_series).unwrap();
+    operational_matrices::haar_transform(&mut by_series).unwrap();
     check("P on coefficients against F on means", distance(&by_matrix, &by_series) / largest(&by_series), 1e-13);
 }
 
@@ -190,14 +190,14 @@ fn singular_values_make_up_the_columns() {
     let mut random = Random::new(26);
     for (k, m) in [(1, 1), (3, 2), (4, 300), (9, 9), (13, 2300)] {
         let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(m)).collect();
-        let found = dense::singular(&columns).unwrap();
+        let found = dense::singular_values(&columns).unwrap();
         let count = k.min(m);
-        assert_eq!((found.left.len(), found.sizes.len(), found.right.len()), (count, count, count));
-        assert!(found.sizes.windows(2).all(|pair| pair[0] >= pair[1]));
+        assert_eq!((found.left.len(), found.values.len(), found.right.len()), (count, count, count));
+        assert!(found.values.windows(2).all(|pair| pair[0] >= pair[1]));
         for (j, column) in columns.iter().enumerate() {
             for (i, value) in column.iter().enumerate() {
-                let sum: f64 = (0..count).map(|l| found.left[l][i] * found.sizes[l] * found.right[l][j]).sum();
-                assert!((sum - value).abs() < 1e-13 * found.sizes[0]);
+                let sum: f64 = (0..count).map(|l| found.left[l][i] * found.values[l] * found.right[l][j]).sum();
+                assert!((sum - value).abs() < 1e-13 * found.values[0]);
             }
         }
         let inner = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
@@ -241,8 +241,8 @@ proptest! {
         let (mut f, mut g) = (random.signal(m), random.signal(m));
         let before: f64 = f.iter().zip(&g).map(|(a, b)| a * b).sum();
         let size = norm(&f) * norm(&g);
-        operational_matrices::transform(&mut f).unwrap();
-        operational_matrices::transform(&mut g).unwrap();
+        operational_matrices::haar_transform(&mut f).unwrap();
+        operational_matrices::haar_transform(&mut g).unwrap();
         let after: f64 = f.iter().zip(&g).map(|(a, b)| a * b).sum();
         prop_assert!((after - before).abs() <= 1e-14 * size);
     }

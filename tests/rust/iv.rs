@@ -10,7 +10,7 @@ use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::linalg::small;
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
-use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::parallel::Stop;
 use ftlm::regressors::Record;
@@ -281,7 +281,10 @@ fn the_projection_keeps_what_inputs_excite_and_little_of_the_noise() {
     check("the projection repeated", distance(&again, &kept) / norm(&kept), 1e-9);
     assert!(project(&clean, 0, &[], true).is_err());
     let stop = Stop::default();
-    assert_eq!(with_projections(clean.clone(), &[false, true, true], true, &stop).unwrap().cleaned().signal(0), kept);
+    assert_eq!(
+        with_projections(clean.clone(), &[false, true, true], true, &stop).unwrap().clean_record().signal(0),
+        kept
+    );
     stop.set();
     let told = with_projections(clean.clone(), &[false, true, true], true, &stop);
     assert!(matches!(told, Err(Error::Interrupted)));
@@ -458,16 +461,16 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
     let noisy = with_clean(&noisy, 0, &[1]);
     let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
     let terms = [axis(0, &[0.7, 0.9, 1.1]), axis(0, &[0.0, 0.2]), axis(1, &[0.0, 0.1])];
-    let lattice = Lattice::new(0, &[1.6, 1.8, 2.0], &terms, |s| s == 1).unwrap();
+    let lattice = OrderGrid::new(0, &[1.6, 1.8, 2.0], &terms, |s| s == 1).unwrap();
     let settings = Settings { iterations: 6, tolerance: 1e-9 };
     let options = |threads, early_stopping| Options {
         criterion: Criterion::OutputError,
         norm: Norm::L1,
         estimator: Estimator::InstrumentalVariables(settings),
         initial: Initial::Rest,
-        keep: 10,
+        top: 10,
         threads,
-        early_stopping,
+        pruning: early_stopping,
         memory: 2 << 30,
     };
     let run = |threads, stopping| {
@@ -478,12 +481,12 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
     assert_eq!(found.rows, run(2, true).rows);
     assert_eq!(found.rows, run(1, false).rows);
     let counts = found.counts;
-    let left = counts.beaten + counts.bounded + counts.stopped + counts.singular + counts.diverged;
+    let left = counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged;
     assert_eq!(counts.kept + left, lattice.count());
 
     let band = 2.0 * power_frequency(noisy.signal(0), noisy.step());
-    let smooth = noisy.cleaned().through(&low_pass(band, &noisy).unwrap()).unwrap();
-    let tidy = noisy.cleaned();
+    let smooth = noisy.clean_record().with_filter(&low_pass(band, &noisy).unwrap()).unwrap();
+    let tidy = noisy.clean_record();
     let mut scores: Vec<(f64, u64)> = Vec::new();
     for index in 0..lattice.count() {
         let structure = lattice.structure(index);
@@ -531,7 +534,7 @@ fn what_no_coefficients_can_bring_below_the_kept_ones_is_left_out_and_nothing_el
     let values = |low: f64, count: i32| -> Vec<f64> { (0..count).map(|i| low + 0.2 * f64::from(i)).collect() };
     let axis = |signal, values: Vec<f64>| TermAxis { signal, values, interchangeable: signal == 0 };
     let terms = [axis(0, values(0.0, 8)), axis(0, values(0.0, 8)), axis(1, values(0.0, 4))];
-    let lattice = Lattice::new(0, &[1.2, 1.4, 1.6, 1.8], &terms, |s| s == 1).unwrap();
+    let lattice = OrderGrid::new(0, &[1.2, 1.4, 1.6, 1.8], &terms, |s| s == 1).unwrap();
     let mut bounded = 0;
     for (seed, keep, norm, initial) in [
         (30, 1, Norm::L1, Initial::Rest),
@@ -554,7 +557,8 @@ fn what_no_coefficients_can_bring_below_the_kept_ones_is_left_out_and_nothing_el
             let estimator = Estimator::InstrumentalVariables(settings);
             let (criterion, initial) = (Criterion::OutputError, initial.clone());
             let memory = 2 << 30;
-            let options = Options { criterion, norm, estimator, initial, keep, threads, early_stopping, memory };
+            let options =
+                Options { criterion, norm, estimator, initial, top: keep, threads, pruning: early_stopping, memory };
             search(&records, &lattice, &[None; 3], &options, &Control::default()).unwrap()
         };
         let (brute, found) = (run(2, false), run(1, true));
@@ -563,8 +567,8 @@ fn what_no_coefficients_can_bring_below_the_kept_ones_is_left_out_and_nothing_el
             assert_eq!(a.score.to_bits(), b.score.to_bits());
         }
         assert_eq!(run(3, true), found, "seed {seed}");
-        println!("seed {seed}: {} of {} excluded", found.counts.bounded, lattice.count());
-        bounded += found.counts.bounded;
+        println!("seed {seed}: {} of {} excluded", found.counts.excluded_by_bound, lattice.count());
+        bounded += found.counts.excluded_by_bound;
     }
     assert!(bounded > 200, "{bounded}");
 }

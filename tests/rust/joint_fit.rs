@@ -2,9 +2,10 @@
 
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
-use ftlm::estimation::joint_fit::covariance::long_run;
+use ftlm::estimation::joint_fit::covariance::long_run_covariance;
 use ftlm::estimation::joint_fit::{
-    freed, refined, settled, Grid, Loss, Optimum, Place, Problem, Sampled, Sampling, Signal, Source, Weights,
+    best_alternative, fit_reweighted, refine_step, Iterate, Loss, Objective, Optimum, Problem, SampledRuns, Sampling,
+    Signal, Source, Weights,
 };
 use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
 use ftlm::parallel::Stop;
@@ -42,23 +43,23 @@ fn three_terms() -> Problem {
     problem(equation, &[(0.05, 3.0), (0.0, 3.0)], 3, Initial::Rest)
 }
 
-fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> Sampled {
-    let of = |samples: &Vec<f64>, between| Signal { samples: samples.clone(), between };
+fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> SampledRuns {
+    let of = |samples: &Vec<f64>, between| Signal { samples: samples.clone(), intersample: between };
     let runs = outputs.iter().zip(inputs).map(|(y, u)| vec![of(y, Intersample::Linear), of(u, Intersample::Hold)]);
-    Sampled::new(step, vec![0], runs.collect()).unwrap()
+    SampledRuns::new(step, vec![0], runs.collect()).unwrap()
 }
 
-fn place(orders: &[f64], coefficients: &[f64]) -> Place {
+fn place(orders: &[f64], coefficients: &[f64]) -> Iterate {
     let point = Point { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() };
-    Place { point, states: Vec::new() }
+    Iterate { point, states: Vec::new() }
 }
 
 fn sampling(every: usize, decimation: usize) -> Sampling {
-    Sampling { every, decimation, first: None }
+    Sampling { pulses_per_sample: every, decimation, leading_intervals: None }
 }
 
 fn weighing(weight: f64) -> Weights {
-    Weights { outputs: vec![weight], shares: None }
+    Weights { outputs: vec![weight], robust_weights: None }
 }
 
 fn close(what: &str, found: &[f64], told: &[f64], tolerance: f64) {
@@ -81,44 +82,44 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
         let loss = if case["loss"] == "huber" { Loss::Huber } else { Loss::Squares };
         let (inputs, outputs) = (table(&case["inputs"]), table(&case["outputs"]));
         let source = sampled(number(&told["step"]), &outputs, &inputs);
-        let grid = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
-        let (best, grid) = settled(&place(&start[..2], &start[2..]), grid, loss).unwrap();
+        let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
+        let (best, grid) = fit_reweighted(&place(&start[..2], &start[2..]), grid, loss).unwrap();
         close(&format!("{name}: settled"), &best.values(), &numbers(&case["settled"]["values"]), 1e-9);
         close(&format!("{name}: weights"), &grid.weights.outputs, &numbers(&case["settled"]["weights"]), 1e-9);
         close(&format!("{name}: cost"), &[best.cost], &[number(&case["settled"]["cost"])], 1e-9);
-        let rough = Optimum::unrefined(best.clone(), grid.clone()).unwrap().finished();
-        assert_eq!((rough.every, &rough.estimate), (1, &best.values()));
-        let found = refined(best, grid, loss, &[]).unwrap().finished();
-        assert_eq!(found.every as u64, case["refinement"].as_u64().unwrap());
-        assert_eq!(found.settled, case["stands"].as_bool().unwrap());
+        let rough = Optimum::without_refinement(best.clone(), grid.clone()).unwrap().into_statistics();
+        assert_eq!((rough.pulses_per_sample, &rough.estimate), (1, &best.values()));
+        let found = refine_step(best, grid, loss, &[]).unwrap().into_statistics();
+        assert_eq!(found.pulses_per_sample as u64, case["refinement"].as_u64().unwrap());
+        assert_eq!(found.step_converged, case["stands"].as_bool().unwrap());
         close(&format!("{name}: estimate"), &found.estimate, &numbers(&case["estimate"]), 1e-9);
         close(&format!("{name}: on its grid"), &found.attempt.values(), &numbers(&case["on_grid"]), 1e-9);
         close(&format!("{name}: covariance"), &found.covariance, &table(&case["covariance"]).concat(), 1e-7);
         close(&format!("{name}: noise"), &found.noise, &[number(&case["noise"])], 1e-9);
-        let robust = found.robust.map(|r| vec![r.lowered as u64, r.outliers as u64, r.samples as u64]);
+        let robust = found.robust.map(|r| vec![r.reduced_weight_count as u64, r.outliers as u64, r.samples as u64]);
         let counted = case["robust"].as_array().map(|of| of.iter().map(|v| v.as_u64().unwrap()).collect());
         assert_eq!(robust, counted);
         // The colour of what is left, and what sums of it scatter by.
         let series: Vec<Vec<f64>> = found.residuals.iter().map(|run| run[0].clone()).collect();
         let rows: Vec<&[f64]> = series.iter().map(Vec::as_slice).collect();
-        let (filter, power) = statistics::coloured(&rows, 6);
+        let (filter, power) = statistics::whitening_filter(&rows, 6);
         close(&format!("{name}: filter"), &filter, &numbers(&case["filter"]), 1e-7);
         close(&format!("{name}: power"), &[power], &[number(&case["power"])], 1e-8);
         close(
             &format!("{name}: covariances"),
-            &statistics::covariances(&filter, power, 8),
+            &statistics::filter_autocovariances(&filter, power, 8),
             &numbers(&case["covariances"]),
             1e-7,
         );
         let inner =
             |signals: &[Vec<f64>]| -> Vec<f64> { signals.iter().flat_map(|s| s[1..s.len() - 1].to_vec()).collect() };
-        let sums = long_run(&[inner(&inputs), inner(&outputs)], &series).unwrap();
+        let sums = long_run_covariance(&[inner(&inputs), inner(&outputs)], &series).unwrap();
         close(&format!("{name}: sums"), &sums, &table(&case["sums"]).concat(), 1e-7);
     }
 }
 
 /// y′ = −2 y + 2 u with a little noise, in exact steps, and D y = −a y + b u, whatever the run starts from.
-fn first_order() -> (Problem, Sampled) {
+fn first_order() -> (Problem, SampledRuns) {
     let (step, decay) = (0.02, (-0.04_f64).exp());
     let mut random = Random::new(3);
     let (mut y, mut states, mut u) = (0.0, Vec::new(), Vec::new());
@@ -138,18 +139,18 @@ fn first_order() -> (Problem, Sampled) {
 #[test]
 fn another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
+    let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
     let at = |a: f64, b: f64| place(&[], &[a, b]);
-    let stuck = grid.evaluated(&at(1.0, 1.0)).unwrap().unwrap();
-    let (best, there) = freed(&stuck, &grid, &[at(3.0, 1.0)], Loss::Squares).unwrap().unwrap();
+    let stuck = grid.evaluate(&at(1.0, 1.0)).unwrap().unwrap();
+    let (best, there) = best_alternative(&stuck, &grid, &[at(3.0, 1.0)], Loss::Squares).unwrap().unwrap();
     close("coefficients", &best.values(), &[2.0, 2.0], 0.03);
     // Its weights are settled: those of what it leaves.
-    check("level", (there.levels(&best)[0] - 1.0).abs(), 0.01);
+    check("level", (there.residual_root_mean_squares(&best)[0] - 1.0).abs(), 0.01);
     assert_ne!(there.weights, grid.weights);
     // Nobody else: the same one on the same grid. None of those that leave more than it.
-    assert!(freed(&stuck, &grid, &[], Loss::Squares).unwrap().is_none());
-    let ahead = there.evaluated(&best.place).unwrap().unwrap();
-    assert!(freed(&ahead, &there, &[at(1.9, 1.9)], Loss::Squares)
+    assert!(best_alternative(&stuck, &grid, &[], Loss::Squares).unwrap().is_none());
+    let ahead = there.evaluate(&best.iterate).unwrap().unwrap();
+    assert!(best_alternative(&ahead, &there, &[at(1.9, 1.9)], Loss::Squares)
         .unwrap()
         .is_none_or(|(a, _)| a.cost < ahead.cost * 1.0001));
 }
@@ -157,34 +158,39 @@ fn another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less() {
 #[test]
 fn who_grows_takes_no_place_where_that_may_not_be() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let free = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
-    let steady = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), true).unwrap();
-    assert!(problem.grows(&place(&[], &[-2.0, 1.0]).point) && !problem.grows(&place(&[], &[2.0, 1.0]).point));
-    let stuck = steady.evaluated(&place(&[], &[1.0, 1.0])).unwrap().unwrap();
-    let (best, _) = freed(&stuck, &steady, &[place(&[], &[3.0, 1.0])], Loss::Squares).unwrap().unwrap();
+    let free = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
+    let steady = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), true).unwrap();
+    assert!(
+        problem.is_unstable(&place(&[], &[-2.0, 1.0]).point) && !problem.is_unstable(&place(&[], &[2.0, 1.0]).point)
+    );
+    let stuck = steady.evaluate(&place(&[], &[1.0, 1.0])).unwrap().unwrap();
+    let (best, _) = best_alternative(&stuck, &steady, &[place(&[], &[3.0, 1.0])], Loss::Squares).unwrap().unwrap();
     assert!(best.values()[0] > 0.0);
     // On a steady grid a descent from where it dies away stays there.
     let start = place(&[], &[0.01, 1e-9]);
-    let found = steady.descend(&start, 60).unwrap();
-    assert!(!problem.grows(&found.place.point));
-    assert!(free.descend(&start, 60).unwrap().cost <= found.cost * (1.0 + 1e-9));
+    let found = steady.minimize(&start, 60).unwrap();
+    assert!(!problem.is_unstable(&found.iterate.point));
+    assert!(free.minimize(&start, 60).unwrap().cost <= found.cost * (1.0 + 1e-9));
 }
 
 #[test]
 fn a_stop_is_heard_and_what_does_not_fit_is_refused() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
+    let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
     let start = place(&[], &[1.0, 1.0]);
-    let two = Weights { outputs: vec![1.0, 1.0], shares: None };
+    let two = Weights { outputs: vec![1.0, 1.0], robust_weights: None };
     assert!(matches!(
-        Grid::new((&problem, &source, &stop), two, sampling(1, 1), false).map(|_| ()),
+        Objective::new((&problem, &source, &stop), two, sampling(1, 1), false).map(|_| ()),
         Err(Error::Length { .. })
     ));
     assert!(problem.point(&[1.0]).is_err());
-    assert!(
-        Sampled::new(0.1, vec![2], vec![vec![Signal { samples: vec![0.0; 5], between: Intersample::Linear }]]).is_err()
-    );
+    assert!(SampledRuns::new(
+        0.1,
+        vec![2],
+        vec![vec![Signal { samples: vec![0.0; 5], intersample: Intersample::Linear }]]
+    )
+    .is_err());
     assert_eq!(source.spans(), [(0.02, 8.0)]);
     stop.set();
-    assert!(matches!(settled(&start, grid, Loss::Squares).map(|_| ()), Err(Error::Interrupted)));
+    assert!(matches!(fit_reweighted(&start, grid, Loss::Squares).map(|_| ()), Err(Error::Interrupted)));
 }

@@ -2,7 +2,7 @@
 
 use ftlm::error::{Error, Result};
 use ftlm::estimation::optimization::damped_step::Problem;
-use ftlm::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
+use ftlm::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
 
 use crate::common::{check, dense_solve, distance, Random};
 
@@ -32,7 +32,7 @@ where
         Ok((self.jacobian)(point))
     }
 
-    fn moved(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
+    fn apply_step(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
         let next = point.iter().zip(steps).map(|(x, d)| x + d).collect();
         (next, steps.iter().fold(0.0, |a, d| a.max(d.abs())))
     }
@@ -48,7 +48,7 @@ fn the_bottom_of_rosenbrocks_valley_is_found() {
         residuals: |x: &[f64]| Ok(vec![1.0 - x[0], 10.0 * (x[1] - x[0] * x[0])]),
         jacobian: |x: &[f64]| vec![vec![-1.0, -20.0 * x[0]], vec![0.0, 10.0]],
     };
-    let found = minimise(&problem, vec![-1.2, 1.0], settings(200)).unwrap();
+    let found = minimize(&problem, vec![-1.2, 1.0], settings(200)).unwrap();
     assert_eq!(found.status, Status::Converged);
     check("distance from (1, 1)", distance(&found.point, &[1.0, 1.0]), 1e-10);
     check("cost", found.cost, 1e-20);
@@ -66,7 +66,7 @@ fn a_linear_problem_is_solved_like_its_normal_equations() {
         },
         jacobian: |_: &[f64]| columns.clone(),
     };
-    let found = minimise(&problem, vec![0.0; k], settings(50)).unwrap();
+    let found = minimize(&problem, vec![0.0; k], settings(50)).unwrap();
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
     let gram: Vec<f64> = columns.iter().flat_map(|a| columns.iter().map(|b| dot(a, b))).collect();
     let rhs: Vec<f64> = columns.iter().map(|a| dot(a, &target)).collect();
@@ -80,7 +80,7 @@ fn a_problem_whose_slopes_lie_stalls() {
     // The derivative has the wrong sign: every step, however short, raises the cost.
     let problem =
         Closed { residuals: |x: &[f64]| Ok(vec![1.0 + x[0] * x[0] + x[0]]), jacobian: |_: &[f64]| vec![vec![-1.0]] };
-    let found = minimise(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 0.0 }).unwrap();
+    let found = minimize(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 0.0 }).unwrap();
     assert_eq!(found.status, Status::Stalled);
     assert_eq!(found.point, [0.0]);
 }
@@ -97,7 +97,7 @@ fn steps_into_where_nothing_is_defined_are_shortened() {
         },
         jacobian: |x: &[f64]| vec![vec![1.0 / x[0]]],
     };
-    let found = minimise(&problem, vec![24.9], settings(200)).unwrap();
+    let found = minimize(&problem, vec![24.9], settings(200)).unwrap();
     check("e^3", (found.point[0] - 3.0_f64.exp()).abs(), 1e-9);
 }
 
@@ -107,15 +107,15 @@ fn few_evaluations_and_bad_columns_are_said() {
         residuals: |x: &[f64]| Ok(vec![1.0 - x[0], 10.0 * (x[1] - x[0] * x[0])]),
         jacobian: |x: &[f64]| vec![vec![-1.0, -20.0 * x[0]], vec![0.0, 10.0]],
     };
-    let found = minimise(&rosenbrock, vec![-1.2, 1.0], settings(3)).unwrap();
+    let found = minimize(&rosenbrock, vec![-1.2, 1.0], settings(3)).unwrap();
     assert_eq!((found.status, found.evaluations), (Status::Exhausted, 3));
     let short = Closed { residuals: |_: &[f64]| Ok(vec![1.0, 2.0]), jacobian: |_: &[f64]| vec![vec![1.0]] };
-    assert!(matches!(minimise(&short, vec![0.0], settings(3)), Err(Error::Length { .. })));
+    assert!(matches!(minimize(&short, vec![0.0], settings(3)), Err(Error::Length { .. })));
     let nowhere = Closed {
         residuals: |_: &[f64]| Err(Error::Diverged { what: "free run".into(), index: 3 }),
         jacobian: |_: &[f64]| Vec::new(),
     };
-    assert!(matches!(minimise(&nowhere, vec![0.0], settings(3)), Err(Error::Diverged { .. })));
+    assert!(matches!(minimize(&nowhere, vec![0.0], settings(3)), Err(Error::Diverged { .. })));
 }
 
 /// Half of (x − 3)² + (x + 2y − 4)² with x within bounds, a value only up to a wall, and a size for its rounding.
@@ -147,12 +147,12 @@ impl Problem for Boxed {
         Ok(vec![vec![turned, 1.0, 0.0], vec![0.0, 2.0, 0.0]])
     }
 
-    fn moved(&self, x: &[f64; 2], steps: &[f64]) -> ([f64; 2], f64) {
+    fn apply_step(&self, x: &[f64; 2], steps: &[f64]) -> ([f64; 2], f64) {
         let next = [(x[0] + steps[0]).clamp(self.bounds.0, self.bounds.1), x[1] + steps[1]];
         (next, (next[0] - x[0]).abs().max(steps[1].abs()))
     }
 
-    fn room(&self, x: &[f64; 2], parameter: usize) -> (f64, f64) {
+    fn distance_to_bounds(&self, x: &[f64; 2], parameter: usize) -> (f64, f64) {
         if parameter == 0 {
             (x[0] - self.bounds.0, self.bounds.1 - x[0])
         } else {
@@ -160,7 +160,7 @@ impl Problem for Boxed {
         }
     }
 
-    fn kinked(&self, _: &[f64; 2], parameter: usize) -> bool {
+    fn has_kinks(&self, _: &[f64; 2], parameter: usize) -> bool {
         self.corner && parameter == 0
     }
 }
@@ -171,7 +171,7 @@ const OPEN: Boxed = Boxed { bounds: (-10.0, 10.0), wall: 20.0, corner: false };
 fn what_pushes_out_of_a_bound_does_not_keep_the_rest_from_its_minimum() {
     for (bounds, x) in [((-10.0, 10.0), 3.0), ((-10.0, 1.0), 1.0), ((4.0, 10.0), 4.0), ((0.5, 0.5), 0.5)] {
         let start = [0.0_f64.clamp(bounds.0, bounds.1), -7.0];
-        let found = minimise(&Boxed { bounds, ..OPEN }, start, Settings { evaluations: 60, tolerance: 1e-12 }).unwrap();
+        let found = minimize(&Boxed { bounds, ..OPEN }, start, Settings { evaluations: 60, tolerance: 1e-12 }).unwrap();
         assert_eq!((found.status, found.point[0]), (Status::Converged, if x == 3.0 { found.point[0] } else { x }));
         check("minimum within bounds", (found.point[0] - x).abs().max((found.point[1] - 0.5 * (4.0 - x)).abs()), 1e-5);
         assert!(found.evaluations < 20, "{}", found.evaluations);
@@ -180,23 +180,23 @@ fn what_pushes_out_of_a_bound_does_not_keep_the_rest_from_its_minimum() {
 
 #[test]
 fn a_start_on_a_bound_leaves_it_where_the_slope_leads_inside() {
-    let found = minimise(&Boxed { bounds: (-10.0, 5.0), ..OPEN }, [5.0, 0.0], Settings::default()).unwrap();
+    let found = minimize(&Boxed { bounds: (-10.0, 5.0), ..OPEN }, [5.0, 0.0], Settings::default()).unwrap();
     assert_eq!(found.status, Status::Converged);
     check("minimum inside", (found.point[0] - 3.0).abs(), 1e-4);
 }
 
 #[test]
 fn a_minimum_behind_a_wall_is_no_minimum() {
-    let found = minimise(&Boxed { wall: 1.0, ..OPEN }, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 });
+    let found = minimize(&Boxed { wall: 1.0, ..OPEN }, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 });
     let found = found.unwrap();
-    assert_eq!(found.status, Status::Wall);
+    assert_eq!(found.status, Status::DomainLimit);
     assert!(found.point[0] <= 1.0 && found.point[0] > 0.99, "{:?}", found.point);
 }
 
 #[test]
 fn a_corner_of_the_cost_is_a_minimum_where_the_rest_lies_flat() {
     let corner = Boxed { corner: true, ..OPEN };
-    let found = minimise(&corner, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 }).unwrap();
+    let found = minimize(&corner, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 }).unwrap();
     assert_eq!(found.status, Status::Converged);
     check("corner", (found.point[0] - 2.0).abs().max((found.point[1] - 1.0).abs()), 1e-4);
 }
@@ -206,7 +206,7 @@ fn a_short_step_is_no_minimum() {
     // Slopes that lie, and a tolerance that every damped step falls below before the damping ends.
     let problem =
         Closed { residuals: |x: &[f64]| Ok(vec![1.0 + x[0] * x[0] + x[0]]), jacobian: |_: &[f64]| vec![vec![-1.0]] };
-    let found = minimise(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 1e-6 }).unwrap();
+    let found = minimize(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 1e-6 }).unwrap();
     assert_eq!(found.status, Status::Stalled);
 }
 
@@ -239,7 +239,7 @@ fn large_residuals_bend_the_steps() {
         },
     };
     let settings = Settings { evaluations: 40, tolerance: 1e-12 };
-    let found = minimise(&problem, vec![25.0, 5.0, -5.0, -1.0], settings).unwrap();
+    let found = minimize(&problem, vec![25.0, 5.0, -5.0, -1.0], settings).unwrap();
     assert_eq!(found.status, Status::Converged, "{} evaluations, {}", found.evaluations, found.cost);
     check("Brown & Dennis", (2.0 * found.cost / 85_822.201_626_356_3 - 1.0).abs(), 1e-8);
 }
@@ -253,7 +253,7 @@ fn leaps_shorten_the_way_along_a_curved_valley() {
         jacobian: |x: &[f64]| vec![vec![-100.0 * x[0], 0.1, 0.0], vec![50.0, 0.0, 0.0]],
     };
     let settings = Settings { evaluations: 400, tolerance: 1e-12 };
-    let found = minimise(&problem, vec![0.0, 0.0], settings).unwrap();
+    let found = minimize(&problem, vec![0.0, 0.0], settings).unwrap();
     assert_eq!(found.status, Status::Converged, "{} evaluations, {}", found.evaluations, found.cost);
     check("end of the valley", (found.point[0] - 12.0).abs(), 1e-2);
     check("cost", (found.cost / 4.5 - 1.0).abs(), 1e-8);
@@ -274,7 +274,7 @@ fn a_leap_that_leads_nowhere_is_taken_back() {
             vec![vec![-100.0 * x[0], slope, 0.0], vec![50.0, 0.0, 0.0]]
         },
     };
-    let found = minimise(&problem, vec![0.0, 0.0], Settings { evaluations: 600, tolerance: 1e-12 }).unwrap();
+    let found = minimize(&problem, vec![0.0, 0.0], Settings { evaluations: 600, tolerance: 1e-12 }).unwrap();
     assert!(tried.borrow().iter().any(|x| *x > 3.0), "no leap went too far: the test says nothing");
     check("end of the valley", (found.point[0] - 3.0).abs(), 1e-2);
     check("cost", (found.cost / 4.5 - 1.0).abs(), 1e-6);

@@ -3,9 +3,9 @@
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::{
-    self, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, Instant, Monomial, Point, Settings,
+    self, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point, PointValues, Settings,
 };
-use ftlm::friction::{self, FreeLaw, FrictionModel, Law, Start};
+use ftlm::friction::{self, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
 use ftlm::regressors::Record;
 use ftlm::signal::block_pulse::point_samples;
 
@@ -69,7 +69,7 @@ fn linear(law: InputLaw) -> FreeModel {
 fn rubbing(law: InputLaw) -> FrictionModel {
     FrictionModel {
         equations: vec![equation()],
-        frictions: vec![(0, FreeLaw::coulomb(free(2, 1.0)))],
+        frictions: vec![(0, FreeFrictionLaw::coulomb(free(2, 1.0)))],
         inputs: limited(law),
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
@@ -84,7 +84,7 @@ fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error
     let u = command(seed);
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
     let structure = Structure { output: 0, order: 1.8, terms };
-    let body = friction::Body::alone(Equation { structure, coefficients: vec![-1.0, 1.5] }, Law::coulomb(f));
+    let body = friction::Body::single(Equation { structure, coefficients: vec![-1.0, 1.5] }, FrictionLaw::coulomb(f));
     let record = Record::new(STEP, vec![vec![0.0; M], acting(&u, law, limit)], None)?;
     let output = body.run(&record, &[vec![]])?.outputs.swap_remove(0);
     let record = Record::new(STEP, vec![output.clone(), u], None)?;
@@ -100,7 +100,8 @@ fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
         let mut experiment = run(law, limit, 0.0, 3)?;
         // Held inputs act at once at their samples; friction is followed on pulse means alone.
         for held in [false, true] {
-            experiment.instants = vec![Instant::default(), Instant { values: None, held }];
+            experiment.point_values =
+                vec![PointValues::default(), PointValues { values: None, is_zero_order_hold: held }];
             let here = |value: f64| {
                 let start = Point { orders: vec![1.7], coefficients: vec![0.8, 1.4], inputs: vec![value] };
                 output_error::fit(&linear(law), std::slice::from_ref(&experiment), &start, settings)
@@ -110,7 +111,7 @@ fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
             assert!(norm(&slope) > 0.0);
             assert!(relative_distance(&at.jacobian[3], &slope) < 1e-9, "{law:?} {held}");
         }
-        experiment.instants.clear();
+        experiment.point_values.clear();
         let here = |value: f64| {
             let start =
                 Start { orders: vec![1.7], coefficients: vec![0.8, 1.4, 0.3], inputs: vec![value], states: vec![] };

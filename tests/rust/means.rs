@@ -1,7 +1,7 @@
 //! From samples to pulse means: exact integration under both inter-sample behaviours, delays, and back to samples.
 
 use ftlm::error::Error;
-use ftlm::signal::block_pulse::{delayed, point_samples, pulse_means, Intersample};
+use ftlm::signal::block_pulse::{delay_samples, point_samples, pulse_means, Intersample};
 use proptest::prelude::*;
 
 use crate::common::{cases, check, check_between, distance, orders, Random};
@@ -95,15 +95,15 @@ fn too_little_is_refused() {
 #[test]
 fn delays_move_samples() {
     let u = [1.0, 2.0, 4.0, 8.0];
-    assert_eq!(delayed(&u, 0.0, 9.0).unwrap(), u);
-    assert_eq!(delayed(&u, 1.0, 9.0).unwrap(), [9.0, 1.0, 2.0, 4.0]);
-    assert_eq!(delayed(&u, 3.0, 0.0).unwrap(), [0.0, 0.0, 0.0, 1.0]);
-    assert_eq!(delayed(&u, 1.25, 0.0).unwrap(), [0.0, 0.75, 1.75, 3.5]);
-    assert_eq!(delayed(&u, 0.5, 1.0).unwrap(), [1.0, 1.5, 3.0, 6.0]);
-    assert_eq!(delayed(&u, 1e300, -1.0).unwrap(), [-1.0; 4]);
-    assert_eq!(delayed(&[], 2.0, 0.0).unwrap(), [0.0; 0]);
+    assert_eq!(delay_samples(&u, 0.0, 9.0).unwrap(), u);
+    assert_eq!(delay_samples(&u, 1.0, 9.0).unwrap(), [9.0, 1.0, 2.0, 4.0]);
+    assert_eq!(delay_samples(&u, 3.0, 0.0).unwrap(), [0.0, 0.0, 0.0, 1.0]);
+    assert_eq!(delay_samples(&u, 1.25, 0.0).unwrap(), [0.0, 0.75, 1.75, 3.5]);
+    assert_eq!(delay_samples(&u, 0.5, 1.0).unwrap(), [1.0, 1.5, 3.0, 6.0]);
+    assert_eq!(delay_samples(&u, 1e300, -1.0).unwrap(), [-1.0; 4]);
+    assert_eq!(delay_samples(&[], 2.0, 0.0).unwrap(), [0.0; 0]);
     for delay in [-0.1, f64::NAN, f64::INFINITY] {
-        assert!(matches!(delayed(&u, delay, 0.0), Err(Error::OutOfRange { .. })));
+        assert!(matches!(delay_samples(&u, delay, 0.0), Err(Error::OutOfRange { .. })));
     }
 }
 
@@ -114,7 +114,7 @@ fn a_delayed_command_has_the_means_of_the_late_hold() {
     let u = random.signal(40);
     let fine = 1000_usize;
     for delay in [0.25, 1.0, 2.5, 7.125] {
-        let late = pulse_means(&delayed(&u, delay, 0.5).unwrap(), 39, Intersample::Hold).unwrap();
+        let late = pulse_means(&delay_samples(&u, delay, 0.5).unwrap(), 39, Intersample::Hold).unwrap();
         let shift = (delay * fine as f64) as usize;
         let oracle: Vec<f64> = (0..39)
             .map(|k| {

@@ -3,12 +3,12 @@
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::{
-    fit, Coordinate, Experiment, Fit, FreeEquation, FreeInput, FreeModel, InputLaw, Instant, Monomial, Point, Settings,
-    Status,
+    fit, Coordinate, Experiment, Fit, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point, PointValues,
+    Settings, Status,
 };
 use ftlm::regressors::Record;
 use ftlm::series;
-use ftlm::signal::block_pulse::{delayed, point_samples};
+use ftlm::signal::block_pulse::{delay_samples, point_samples};
 use ftlm::simulate;
 
 use crate::common::{
@@ -131,7 +131,7 @@ fn the_jacobian_is_the_slope_of_the_residuals() {
             orders = [0.8, 0.2, 0.85];
         }
         let here = at(&model, &experiments, &orders, &coefficients);
-        let rows: usize = experiments.iter().map(|e| 2 * (e.record.m() / e.every - 1)).sum();
+        let rows: usize = experiments.iter().map(|e| 2 * (e.record.m() / e.pulses_per_sample - 1)).sum();
         assert_eq!((here.residuals.len(), here.jacobian.len()), (rows, 8));
         assert!((here.cost / (0.5 * here.residuals.iter().map(|e| e * e).sum::<f64>()) - 1.0).abs() < 1e-12);
         let projected = model.initial != Initial::Rest;
@@ -325,7 +325,7 @@ fn a_filter_on_the_outputs_is_part_of_the_model() {
 fn late(delay: f64, every: usize, noise: f64, seed: u64) -> Experiment {
     let mut experiment = run(220, every, &[], 0.0, seed);
     let given = experiment.record.clone();
-    let arrived = delayed(given.signal(2), delay / given.step(), 0.0).unwrap();
+    let arrived = delay_samples(given.signal(2), delay / given.step(), 0.0).unwrap();
     let outputs = simulate::respond(&truth(), &with_signal(&given, 2, arrived), &[]).unwrap();
     let mut random = Random::new(seed + 1);
     for (i, means) in outputs.into_iter().enumerate() {
@@ -431,8 +431,13 @@ fn what_feeds_through_has_the_slope_of_its_residuals() {
     ] {
         let mut experiment = run(80, 2, &[], 0.02, 700);
         let held = Random::new(701).signal(81);
-        let instants = experiment.samples.iter().cloned().map(|values| Instant { values: Some(values), held: false });
-        experiment.instants = instants.chain([Instant { values: Some(held), held: true }]).collect();
+        let instants = experiment
+            .samples
+            .iter()
+            .cloned()
+            .map(|values| PointValues { values: Some(values), is_zero_order_hold: false });
+        experiment.point_values =
+            instants.chain([PointValues { values: Some(held), is_zero_order_hold: true }]).collect();
         let at = |c: &[f64], delay: f64| {
             let inputs = model.inputs.iter().map(|_| delay).collect();
             let start = Point { orders: Vec::new(), coefficients: c.to_vec(), inputs };
@@ -470,13 +475,21 @@ fn a_gain_is_the_gain_at_the_instant_of_the_sample() {
     let rows = [(0.7 + 0.4 * 0.5) / determinant, (0.5 - 0.3 * 0.7) / determinant];
     let samples: Vec<Vec<f64>> = rows.iter().map(|g| input.iter().map(|u| g * u).collect()).collect();
     let record = record(0.1, vec![vec![0.0; 40], vec![0.0; 40], input[..40].to_vec()]);
-    let instants = vec![Instant::default(), Instant::default(), Instant { values: Some(input), held: true }];
-    let experiment = Experiment::new(record, 1, samples, vec![1.0, 1.0]).unwrap().with_instants(instants).unwrap();
+    let instants = vec![
+        PointValues::default(),
+        PointValues::default(),
+        PointValues { values: Some(input), is_zero_order_hold: true },
+    ];
+    let experiment = Experiment::new(record, 1, samples, vec![1.0, 1.0]).unwrap().with_point_values(instants).unwrap();
     let found = at(&model, std::slice::from_ref(&experiment), &[], &[1.0, 0.4, 0.7, 1.0, -0.3, 0.5]);
     check("samples that feed through", norm(&found.residuals), 1e-12);
-    let short = vec![Instant::default(), Instant::default(), Instant { values: Some(vec![0.0]), held: true }];
-    assert!(matches!(experiment.clone().with_instants(short), Err(Error::Length { .. })));
-    assert!(matches!(experiment.with_instants(vec![Instant::default()]), Err(Error::Length { .. })));
+    let short = vec![
+        PointValues::default(),
+        PointValues::default(),
+        PointValues { values: Some(vec![0.0]), is_zero_order_hold: true },
+    ];
+    assert!(matches!(experiment.clone().with_point_values(short), Err(Error::Length { .. })));
+    assert!(matches!(experiment.with_point_values(vec![PointValues::default()]), Err(Error::Length { .. })));
 }
 
 #[test]
@@ -501,7 +514,7 @@ fn a_fit_that_its_grid_stops_says_so() {
     };
     let settings = Settings { evaluations: 500, tolerance: 1e-7 };
     let found = fit(&model, &[experiment], &point(&[], &[2.0]), settings).unwrap();
-    assert_eq!(found.status, Status::Wall, "{:?}", found.point);
+    assert_eq!(found.status, Status::DomainLimit, "{:?}", found.point);
 }
 
 #[test]
@@ -523,7 +536,7 @@ fn a_number_that_is_held_stays_and_the_others_are_the_optimum_beside_it() {
     let settings = Settings { evaluations: 200, tolerance: 1e-12 };
     // A coefficient by its coordinate, an order by its bounds.
     let (mut coefficient, mut order) = (free.clone(), free.clone());
-    coefficient.coordinates[3] = Coordinate::Held;
+    coefficient.coordinates[3] = Coordinate::Fixed;
     let mut start = whole.point.clone();
     start.coefficients[3] *= 1.05;
     let there = fit(&coefficient, &experiments, &start, settings).unwrap();
@@ -641,7 +654,7 @@ fn what_drives_is_solved_for_as_dense_least_squares_does() {
     let gram: Vec<f64> = columns.iter().flat_map(|a| columns.iter().map(|b| dot(a, b))).collect();
     let rhs: Vec<f64> = columns.iter().map(|a| -dot(a, &none)).collect();
     let best = dense_solve(&gram, &rhs);
-    model.coordinates[0] = Coordinate::Held;
+    model.coordinates[0] = Coordinate::Fixed;
     for start in [[1.0, 1.0], [-700.0, 2e5]] {
         let settings = Settings { evaluations: 5, ..Settings::default() };
         let found = fit(&model, &experiments, &point(&[], &[-3.0, start[0], start[1]]), settings).unwrap();

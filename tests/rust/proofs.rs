@@ -3,8 +3,10 @@
 use ftlm::equation::{Equation, Initial};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
-use ftlm::order_search::dual_bound::{excluded_along, excluded_by, excluded_in_turn, explodes};
-use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::dual_bound::{
+    excluded_by, excluded_by_linearized_vector, excluded_in_turn, has_unstable_zeros,
+};
+use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Norm, Options};
 use ftlm::regressors::Record;
 use ftlm::simulate::respond;
@@ -66,11 +68,14 @@ fn no_zero_of_a_divisor_proves_more_than_is_true() {
         let norm = if case % 3 == 0 { Norm::L2 } else { Norm::L1 };
         let exact = score(&record, &equation, norm);
         if exact.is_finite() {
-            assert!(!explodes(&record, &equation, norm, exact * (1.0 + 1e-9)).unwrap(), "case {case}: {exact:e}");
+            assert!(
+                !has_unstable_zeros(&record, &equation, norm, exact * (1.0 + 1e-9)).unwrap(),
+                "case {case}: {exact:e}"
+            );
         }
         let size = score(&record, &equation_of_nothing(), norm);
         let beyond = exact > 1e4 * size;
-        let told = explodes(&record, &equation, norm, size).unwrap();
+        let told = has_unstable_zeros(&record, &equation, norm, size).unwrap();
         proved += usize::from(told && beyond);
         large += usize::from(beyond);
         stable += usize::from(exact <= size);
@@ -86,16 +91,20 @@ fn a_limit_that_is_no_number_and_coefficients_beyond_all_prove_nothing() {
     let record = unruly(&mut random, 300);
     for huge in [1e160, 1e300, f64::MAX, f64::NAN, f64::INFINITY] {
         let equation = |c: f64| equation(0, 1.5, &[(0, 0.5, c), (0, 0.0, -c), (1, 0.0, c)]);
-        let _ = explodes(&record, &equation(huge), Norm::L1, 1.0).unwrap();
-        assert!(!explodes(&record, &equation(huge), Norm::L1, f64::INFINITY).unwrap());
-        assert!(!explodes(&record, &equation(2.0), Norm::L1, f64::NAN).unwrap());
-        assert!(!excluded_along(&record, &equation(1.0), &equation(huge), Norm::L1, f64::INFINITY).unwrap());
-        assert!(!excluded_along(&record, &equation(huge), &equation(1.0), Norm::L1, f64::INFINITY).unwrap());
-        assert!(!excluded_along(&record, &equation(1.0), &equation(1.1), Norm::L1, f64::NAN).unwrap());
+        let _ = has_unstable_zeros(&record, &equation(huge), Norm::L1, 1.0).unwrap();
+        assert!(!has_unstable_zeros(&record, &equation(huge), Norm::L1, f64::INFINITY).unwrap());
+        assert!(!has_unstable_zeros(&record, &equation(2.0), Norm::L1, f64::NAN).unwrap());
+        assert!(
+            !excluded_by_linearized_vector(&record, &equation(1.0), &equation(huge), Norm::L1, f64::INFINITY).unwrap()
+        );
+        assert!(
+            !excluded_by_linearized_vector(&record, &equation(huge), &equation(1.0), Norm::L1, f64::INFINITY).unwrap()
+        );
+        assert!(!excluded_by_linearized_vector(&record, &equation(1.0), &equation(1.1), Norm::L1, f64::NAN).unwrap());
     }
     let other = equation(0, 1.5, &[(0, 0.4, 1.0), (1, 0.0, 1.0)]);
     let one = equation(0, 1.5, &[(0, 0.5, 1.0), (1, 0.0, 1.0)]);
-    let error = excluded_along(&record, &one, &other, Norm::L1, 1.0).unwrap_err();
+    let error = excluded_by_linearized_vector(&record, &one, &other, Norm::L1, 1.0).unwrap_err();
     assert!(error.to_string().contains("own terms"), "{error}");
 }
 
@@ -117,7 +126,7 @@ fn no_test_vector_that_follows_coefficients_proves_more_than_is_true() {
             if !exact.is_finite() {
                 continue;
             }
-            let proves = |limit: f64| excluded_along(&record, &made_for, &other, norm, limit).unwrap();
+            let proves = |limit: f64| excluded_by_linearized_vector(&record, &made_for, &other, norm, limit).unwrap();
             assert!(!proves(exact * (1.0 + 1e-9)), "case {case}: {exact:e} at {size:e}");
             asked += 1;
             close += usize::from(size < 0.1 && proves(0.99 * exact));
@@ -176,10 +185,10 @@ fn proofs_keep_the_table_of_brute_force() {
     let axis = |signal: usize, values: Vec<f64>| TermAxis { signal, values, interchangeable: true };
     let axes = [axis(0, orders(36)), axis(0, orders(36)), axis(1, orders(40)), axis(2, vec![0.0])];
     let alphas: Vec<f64> = (0..20).map(|i| 1.05 + i as f64 * step).collect();
-    let lattice = Lattice::new(0, &alphas, &axes, |s| s != 0).unwrap();
+    let lattice = OrderGrid::new(0, &alphas, &axes, |s| s != 0).unwrap();
     assert!(lattice.count() > 1 << 18, "{}", lattice.count());
     let of = |early_stopping: bool, threads: usize| {
-        let options = Options { early_stopping, threads, initial: Initial::Rest, ..Options::default() };
+        let options = Options { pruning: early_stopping, threads, initial: Initial::Rest, ..Options::default() };
         search(std::slice::from_ref(&record), &lattice, &[None; 4], &options, &Control::default()).unwrap()
     };
     let (whole, proved) = (of(false, 2), of(true, 2));
@@ -188,8 +197,8 @@ fn proofs_keep_the_table_of_brute_force() {
     let counts = proved.counts;
     println!("{counts:?}");
     assert_eq!(
-        counts.kept + counts.beaten + counts.bounded + counts.stopped + counts.singular + counts.diverged,
+        counts.kept + counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged,
         lattice.count()
     );
-    assert!(counts.bounded > lattice.count() / 4);
+    assert!(counts.excluded_by_bound > lattice.count() / 4);
 }

@@ -14,7 +14,7 @@ use ftlm::linalg::small::{self, Recursion};
 use ftlm::rig::arm_model::{Arm, Parameters};
 use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
 use ftlm::series;
-use ftlm::signal::block_pulse::{delayed, pulse_means, Intersample};
+use ftlm::signal::block_pulse::{delay_samples, pulse_means, Intersample};
 use ftlm::signal::metrics;
 use ftlm::simulate::{self, OutputFilter};
 
@@ -37,7 +37,7 @@ fn lengths_beyond_memory() {
         refused(check_dense(m));
         refused(pulse_means(&[0.0, 1.0], m, Intersample::Hold));
         refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(m, 0.1));
-        refused(operational_matrices::matrix(m));
+        refused(operational_matrices::haar_matrix(m));
         refused(operational_matrices::block_pulse_matrix(0.5, m, 0.1));
         refused(operational_matrices::operational_matrix(0.5, m, 0.1));
     }
@@ -147,8 +147,8 @@ fn experiments_that_cannot_be_compared() {
 #[test]
 fn numbers_that_are_none() {
     refused(pulse_means(&[0.0, f64::NAN], 2, Intersample::Linear));
-    refused(delayed(&[0.0, f64::NAN], 1.0, 0.0));
-    refused(delayed(&[0.0, 1.0], 1.0, f64::NAN));
+    refused(delay_samples(&[0.0, f64::NAN], 1.0, 0.0));
+    refused(delay_samples(&[0.0, 1.0], 1.0, f64::NAN));
     refused(metrics::metrics(&[f64::NAN], &[0.0]));
     refused(metrics::correlation(&[vec![f64::NAN; 9]], &[vec![0.0; 9]], 2));
     refused(Filter { numerator: vec![(f64::NAN, 0.0)], denominator: vec![(1.0, 1.0)] }.series(9, 0.1));
@@ -269,5 +269,5 @@ fn an_arm_that_would_never_end() {
 #[should_panic(expected = "a transform of 10 points")]
 fn a_transform_of_another_length_does_not_return_zeros() {
     let plan = fft::plan(10);
-    plan.forward(&mut [0.0; 8], &mut vec![fft::Complex::default(); plan.bins()], &mut fft::Workspace::new());
+    plan.transform(&mut [0.0; 8], &mut vec![fft::Complex::default(); plan.bins()], &mut fft::Workspace::new());
 }

@@ -7,11 +7,11 @@ use ftlm::equation::{Equation, Initial, Structure};
 use ftlm::error::{Error, Kind};
 use ftlm::estimation::instrumental_variables::Settings;
 use ftlm::estimation::least_squares::{self, Estimate};
-use ftlm::estimation::multi_innovation::{closed_form, Innovation, Rows};
+use ftlm::estimation::multi_innovation::{closed_form, Innovation, RowBasis};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
-use ftlm::order_search::dual_bound::{excluded_by, lower_bounds, out_of_reach};
-use ftlm::order_search::grid::{Lattice, TermAxis, MAX_CANDIDATES};
+use ftlm::order_search::dual_bound::{excluded_by, is_infeasible, lower_bounds};
+use ftlm::order_search::grid::{OrderGrid, TermAxis, MAX_CANDIDATES};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::order_search::result::{Counts, Failure, Outcome};
 use ftlm::parallel::MAX_THREADS;
@@ -36,15 +36,15 @@ fn options() -> Options {
         norm: Norm::L1,
         estimator: Estimator::LeastSquares,
         initial: Initial::Rest,
-        keep: 10,
+        top: 10,
         threads: 2,
-        early_stopping: true,
+        pruning: true,
         memory: 2 << 30,
     }
 }
 
 fn total(counts: &Counts) -> u64 {
-    counts.kept + counts.beaten + counts.bounded + counts.stopped + counts.singular + counts.diverged
+    counts.kept + counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged
 }
 
 // ---------------------------------------------------------------------------------------------------------- lattices
@@ -54,7 +54,7 @@ fn the_first_lattice_of_the_paper_has_its_size() {
     // P1: one deflection equation, two free orders of its own, one of the hub angle, the current at order 0.
     let all = range(0.0, 2.0, 0.05);
     let axes = [axis(0, &all, true), axis(0, &all, true), axis(1, &all, false), axis(2, &[0.0], false)];
-    let lattice = Lattice::new(0, &range(1.05, 2.0, 0.05), &axes, |s| s == 2).unwrap();
+    let lattice = OrderGrid::new(0, &range(1.05, 2.0, 0.05), &axes, |s| s == 2).unwrap();
     assert_eq!(lattice.count(), 313_845);
     assert_eq!(lattice.output(), 0);
     // Written out: for each alpha the pairs of its own orders below it, times the hub's orders up to it.
@@ -109,7 +109,7 @@ fn lattices_hold_every_structure_once() {
         // Values out of range for the smaller alpha, in no particular order and given twice.
         (vec![1.8, 0.6, 0.6], vec![axis(0, &[1.5, 0.3, 0.9, 0.3, -0.3], false), axis(1, &[1.8, 0.0], false)]),
     ] {
-        let lattice = Lattice::new(0, &alphas, &axes, |s| s == 2).unwrap();
+        let lattice = OrderGrid::new(0, &alphas, &axes, |s| s == 2).unwrap();
         let keys: Vec<Vec<i64>> = (0..lattice.count())
             .map(|i| {
                 let s = lattice.structure(i);
@@ -130,17 +130,17 @@ fn lattices_hold_every_structure_once() {
 fn terms_with_different_axes_swap_only_where_both_may() {
     // (0.3, 0.6) and (0.6, 0.3) are one candidate, (0.0, 0.6) has no twin.
     let axes = [axis(0, &[0.0, 0.3, 0.6], true), axis(0, &[0.3, 0.6], true)];
-    let lattice = Lattice::new(0, &[1.0], &axes, |_| false).unwrap();
+    let lattice = OrderGrid::new(0, &[1.0], &axes, |_| false).unwrap();
     assert_eq!(lattice.count(), 3);
     // A fixed coefficient ties a term to its place: not interchangeable.
     let axes = [axis(0, &[0.3, 0.6], false), axis(0, &[0.3, 0.6], true)];
-    assert_eq!(Lattice::new(0, &[1.0], &axes, |_| false).unwrap().count(), 2);
+    assert_eq!(OrderGrid::new(0, &[1.0], &axes, |_| false).unwrap().count(), 2);
 }
 
 #[test]
 fn empty_and_oversized_lattices_say_why() {
-    let why = |alphas: &[f64], axes: &[TermAxis]| match Lattice::new(0, alphas, axes, |_| false) {
-        Err(Error::EmptyLattice { why }) => why,
+    let why = |alphas: &[f64], axes: &[TermAxis]| match OrderGrid::new(0, alphas, axes, |_| false) {
+        Err(Error::EmptyOrderGrid { why }) => why,
         other => panic!("{other:?}"),
     };
     assert_eq!(why(&[], &[axis(0, &[0.0], false)]), "no value of alpha");
@@ -152,27 +152,27 @@ fn empty_and_oversized_lattices_say_why() {
     );
     for alpha in [0.0, -1.0, 10.05] {
         assert!(
-            matches!(Lattice::new(0, &[1.0, alpha], &[], |_| false), Err(Error::OutOfRange { value, .. }) if value == alpha)
+            matches!(OrderGrid::new(0, &[1.0, alpha], &[], |_| false), Err(Error::OutOfRange { value, .. }) if value == alpha)
         );
     }
     // Too many, within one signal and as a product of signals: refused from the lengths alone, at once.
     let many = range(0.0, 3.0, 0.0005);
     for signals in [[1, 1, 1, 1], [1, 1, 2, 2], [1, 2, 3, 4]] {
         let axes: Vec<TermAxis> = signals.iter().map(|&s| axis(s, &many, true)).collect();
-        let found = Lattice::new(0, &range(0.001, 3.0, 0.001), &axes, |_| false).map(|l| l.count());
-        assert!(matches!(found, Err(Error::LatticeTooLarge { count, limit: MAX_CANDIDATES }) if count > 1 << 50));
+        let found = OrderGrid::new(0, &range(0.001, 3.0, 0.001), &axes, |_| false).map(|l| l.count());
+        assert!(matches!(found, Err(Error::OrderGridTooLarge { count, limit: MAX_CANDIDATES }) if count > 1 << 50));
         assert_eq!(found.unwrap_err().kind(), Kind::Model);
     }
     // Past the limit only once it is counted.
     let some = range(0.0, 0.16, 0.001);
     let mut axes: Vec<TermAxis> = (0..3).map(|_| axis(1, &some, true)).collect();
     let alphas = range(1.0, 1.5, 0.01);
-    assert_eq!(Lattice::new(0, &alphas, &axes, |_| false).unwrap().count(), 51 * (161 * 160 * 159 / 6));
+    assert_eq!(OrderGrid::new(0, &alphas, &axes, |_| false).unwrap().count(), 51 * (161 * 160 * 159 / 6));
     axes.push(axis(2, &range(0.0, 0.6, 0.002), false));
-    let found = Lattice::new(0, &alphas, &axes, |_| false).map(|l| l.count());
-    assert!(matches!(found, Err(Error::LatticeTooLarge { count, .. }) if count < 2 * MAX_CANDIDATES));
+    let found = OrderGrid::new(0, &alphas, &axes, |_| false).map(|l| l.count());
+    assert!(matches!(found, Err(Error::OrderGridTooLarge { count, .. }) if count < 2 * MAX_CANDIDATES));
     // An equation without terms is its alphas.
-    assert_eq!(Lattice::new(0, &[1.0, 2.0], &[], |_| false).unwrap().count(), 2);
+    assert_eq!(OrderGrid::new(0, &[1.0, 2.0], &[], |_| false).unwrap().count(), 2);
 }
 
 // ---------------------------------------------------------------------------------------------------------- problems
@@ -180,7 +180,7 @@ fn empty_and_oversized_lattices_say_why() {
 /// A small search: signal 0 is the output, 1 another output, 2 an input.
 struct Problem {
     records: Vec<Record>,
-    lattice: Lattice,
+    lattice: OrderGrid,
     fixed: Vec<Option<f64>>,
     options: Options,
 }
@@ -240,14 +240,14 @@ fn random_problem(seed: u64) -> Problem {
     if random.chance(0.3) {
         fixed[axes.len() - 1] = Some(6.0);
     }
-    let lattice = Lattice::new(0, &range(1.0, 1.8, 2.0 * grain), &axes, |s| s == 2).unwrap();
+    let lattice = OrderGrid::new(0, &range(1.0, 1.8, 2.0 * grain), &axes, |s| s == 2).unwrap();
     let options = Options {
         criterion: if random.chance(0.7) { Criterion::OutputError } else { Criterion::EquationError },
         norm: if random.chance(0.5) { Norm::L1 } else { Norm::L2 },
         estimator: if haar || random.chance(0.2) {
-            let rows = if haar { Rows::Haar } else { Rows::Time };
+            let rows = if haar { RowBasis::Haar } else { RowBasis::Time };
             let prior_covariance = 10.0_f64.powf(random.uniform(0.0, 6.0));
-            Estimator::MultiInnovation(Innovation { length: 1 + random.below(9), prior_covariance, rows })
+            Estimator::MultiInnovation(Innovation { length: 1 + random.below(9), prior_covariance, row_basis: rows })
         } else {
             Estimator::LeastSquares
         },
@@ -256,9 +256,9 @@ fn random_problem(seed: u64) -> Problem {
             1 => Initial::Caputo,
             _ => Initial::Powers(vec![0.0, 1.0]),
         },
-        keep: 1 + random.below(8),
+        top: 1 + random.below(8),
         threads: 1,
-        early_stopping: true,
+        pruning: true,
         memory: 2 << 30,
     };
     Problem { records, lattice, fixed, options }
@@ -323,7 +323,7 @@ fn early_stopping_and_threads_change_nothing() {
     let (mut bounded, mut stopped, mut candidates) = (0, 0, 0);
     for seed in 100..140 {
         let problem = random_problem(seed);
-        let brute = problem.run(|o| o.early_stopping = false);
+        let brute = problem.run(|o| o.pruning = false);
         assert_eq!(brute.counts.stopped, 0);
         let one = problem.run(|_| {});
         assert_eq!(one.rows.len(), brute.rows.len(), "seed {seed}");
@@ -336,8 +336,8 @@ fn early_stopping_and_threads_change_nothing() {
         for threads in [2, 3, 8] {
             assert_eq!(problem.run(|o| o.threads = threads), one, "seed {seed}, {threads} threads");
         }
-        assert_eq!(problem.run(|o| (o.threads, o.early_stopping) = (3, false)), brute);
-        bounded += one.counts.bounded;
+        assert_eq!(problem.run(|o| (o.threads, o.pruning) = (3, false)), brute);
+        bounded += one.counts.excluded_by_bound;
         stopped += one.counts.stopped;
         candidates += one.counts.candidates;
     }
@@ -356,17 +356,17 @@ fn stretches_of_one_term_rank_as_brute_force_does() {
         let others = [axis(1, &range(0.0, 40.0 * grain, grain), false), axis(2, &[-0.3, 0.0], false)];
         // What changes last is the only term of its signal, or the second of two of one, where some pairs are left out.
         let axes = if random.chance(0.5) { [&own[..], &others[..]] } else { [&others[1..], &own[..]] }.concat();
-        problem.lattice = Lattice::new(0, &[1.0, 1.4, 1.75], &axes, |s| s == 2).unwrap();
+        problem.lattice = OrderGrid::new(0, &[1.0, 1.4, 1.75], &axes, |s| s == 2).unwrap();
         problem.fixed = vec![None; axes.len()];
         let options = &mut problem.options;
         (options.criterion, options.norm, options.initial) = (Criterion::EquationError, Norm::L2, Initial::Rest);
-        let brute = problem.run(|o| o.early_stopping = false);
+        let brute = problem.run(|o| o.pruning = false);
         let one = problem.run(|_| {});
         assert_eq!(one.rows, brute.rows, "seed {seed}");
         assert_eq!(one.counts.singular, brute.counts.singular, "seed {seed}");
         assert_eq!(one.failures, brute.failures, "seed {seed}");
         assert_eq!(problem.run(|o| o.threads = 3), one, "seed {seed}");
-        bounded += one.counts.bounded;
+        bounded += one.counts.excluded_by_bound;
         candidates += one.counts.candidates;
     }
     println!("of {candidates} candidates {bounded} excluded");
@@ -385,9 +385,9 @@ fn every_candidate_matches_its_naive_evaluation() {
             axis(1, &[0.0, 0.3, 1.0], false),
             axis(2, &[-0.3, 0.0], false),
         ];
-        problem.lattice = Lattice::new(0, &[1.2, 1.6, 1.9], &axes, |s| s == 2).unwrap();
+        problem.lattice = OrderGrid::new(0, &[1.2, 1.6, 1.9], &axes, |s| s == 2).unwrap();
         problem.fixed = (0..4).map(|k| if k == 3 && seed % 3 == 0 { Some(6.0) } else { None }).collect();
-        let found = problem.run(|o| (o.keep, o.early_stopping) = (1000, false));
+        let found = problem.run(|o| (o.top, o.pruning) = (1000, false));
         let mut singular = 0;
         let mut diverged = 0;
         for index in 0..problem.lattice.count() {
@@ -434,7 +434,7 @@ fn a_search_finds_the_truth_among_its_neighbours() {
         axis(1, &range(0.0, 2.0, 0.1), false),
         axis(2, &[0.0], false),
     ];
-    let lattice = Lattice::new(0, &range(1.1, 2.0, 0.1), &axes, |s| s == 2).unwrap();
+    let lattice = OrderGrid::new(0, &range(1.1, 2.0, 0.1), &axes, |s| s == 2).unwrap();
     let problem = Problem { records, lattice, fixed: vec![None; 4], options: options() };
     let found = problem.run(|_| {});
     let best = problem.lattice.structure(found.rows[0].index);
@@ -443,7 +443,7 @@ fn a_search_finds_the_truth_among_its_neighbours() {
     check("error at the truth", found.rows[0].score, 1e-6);
     assert!(relative_distance(&found.rows[0].coefficients, &truth().coefficients) < 1e-6);
     assert!(found.rows[1].score > 1e4 * found.rows[0].score);
-    assert!(found.counts.bounded + found.counts.stopped > found.counts.candidates * 9 / 10);
+    assert!(found.counts.excluded_by_bound + found.counts.stopped > found.counts.candidates * 9 / 10);
 }
 
 #[test]
@@ -452,12 +452,12 @@ fn ties_go_to_the_smaller_index() {
     let mut random = Random::new(241);
     let records = vec![data(&mut random, 100, 0.02, 0.0)];
     let axes = [axis(0, &range(0.0, 1.0, 0.02), false), axis(1, &range(0.0, 1.0, 0.05), false)];
-    let lattice = Lattice::new(0, &[1.5, 1.7], &axes, |_| false).unwrap();
+    let lattice = OrderGrid::new(0, &[1.5, 1.7], &axes, |_| false).unwrap();
     assert_eq!(lattice.count(), 2 * 51 * 21);
     let problem = Problem { records, lattice, fixed: vec![Some(0.0); 2], options: options() };
     for threads in [1, 2, 3, 8] {
         for early_stopping in [true, false] {
-            let found = problem.run(|o| (o.threads, o.early_stopping, o.keep) = (threads, early_stopping, 7));
+            let found = problem.run(|o| (o.threads, o.pruning, o.top) = (threads, early_stopping, 7));
             assert_eq!(found.rows.iter().map(|r| r.index).collect::<Vec<_>>(), (0..7).collect::<Vec<_>>());
             assert_eq!((found.counts.stopped, found.counts.beaten), (0, problem.lattice.count() - 7));
             assert!(found.rows.iter().all(|r| r.score.to_bits() == found.rows[0].score.to_bits()));
@@ -473,7 +473,7 @@ fn singular_and_diverged_candidates_are_counted_and_listed() {
     let copied = with_signal(&base, 1, base.signal(0).to_vec());
     let values = range(0.0, 1.4, 0.2);
     let axes = [axis(0, &values, false), axis(1, &values, false), axis(2, &[0.0], false)];
-    let lattice = Lattice::new(0, &[1.6], &axes, |s| s == 2).unwrap();
+    let lattice = OrderGrid::new(0, &[1.6], &axes, |s| s == 2).unwrap();
     let problem = Problem { records: vec![copied], lattice, fixed: vec![None; 3], options: options() };
     for threads in [1, 3] {
         let found = problem.run(|o| o.threads = threads);
@@ -491,7 +491,7 @@ fn singular_and_diverged_candidates_are_counted_and_listed() {
     // A coefficient fixed where every run explodes; more failures than are listed one by one.
     let many = range(0.0, 0.6, 0.005);
     let axes = [axis(0, &many, false), axis(2, &[0.0], false)];
-    let lattice = Lattice::new(0, &[1.6], &axes, |s| s == 2).unwrap();
+    let lattice = OrderGrid::new(0, &[1.6], &axes, |s| s == 2).unwrap();
     let long = vec![data(&mut random, 2000, 0.05, 0.01)];
     let problem = Problem { records: long, lattice, fixed: vec![Some(45.0), None], options: options() };
     for threads in [1, 2, 8] {
@@ -509,7 +509,7 @@ fn a_leading_zero_makes_a_candidate_singular() {
     // An own term whose coefficient is exactly the inverse of its kernel's first value.
     let mut random = Random::new(243);
     let record = data(&mut random, 50, 0.5, 0.0);
-    let lattice = Lattice::new(0, &[1.0], &[axis(0, &[0.0], false)], |_| false).unwrap();
+    let lattice = OrderGrid::new(0, &[1.0], &[axis(0, &[0.0], false)], |_| false).unwrap();
     // Order 1 at step 1/2: the kernel begins with 1/4.
     let problem = Problem { records: vec![record], lattice, fixed: vec![Some(4.0)], options: options() };
     let found = problem.run(|_| {});
@@ -520,28 +520,28 @@ fn a_leading_zero_makes_a_candidate_singular() {
 fn settings_out_of_range_are_refused() {
     let mut random = Random::new(244);
     let records = vec![data(&mut random, 100, 0.02, 0.0)];
-    let lattice = Lattice::new(0, &[1.0], &[axis(0, &[0.0], false)], |_| false).unwrap();
+    let lattice = OrderGrid::new(0, &[1.0], &[axis(0, &[0.0], false)], |_| false).unwrap();
     let run = |records: &[Record], fixed: &[Option<f64>], options: &Options| {
         search(records, &lattice, fixed, options, &Control::default()).unwrap_err()
     };
     assert!(matches!(run(&records, &[], &options()), Error::Length { .. }));
     assert!(matches!(run(&[], &[None], &options()), Error::Length { .. }));
-    assert!(matches!(run(&records, &[None], &Options { keep: 0, ..options() }), Error::OutOfRange { .. }));
+    assert!(matches!(run(&records, &[None], &Options { top: 0, ..options() }), Error::OutOfRange { .. }));
     for threads in [0, MAX_THREADS + 1, 10_000] {
         assert!(matches!(run(&records, &[None], &Options { threads, ..options() }), Error::OutOfRange { .. }));
     }
-    let innovation = Innovation { length: 3, prior_covariance: 1.0, rows: Rows::Haar };
+    let innovation = Innovation { length: 3, prior_covariance: 1.0, row_basis: RowBasis::Haar };
     let haar = Options { estimator: Estimator::MultiInnovation(innovation), ..options() };
     assert_eq!(run(&records, &[None], &haar), Error::NotPowerOfTwo { m: 100, below: 64, above: 128 });
     let none = Innovation { length: 0, ..innovation };
     let none = Options { estimator: Estimator::MultiInnovation(none), ..options() };
     assert!(matches!(run(&records, &[None], &none), Error::OutOfRange { .. }));
     // A lattice whose regressors fit but whose products would not: refused before any of them is made.
-    let many = Lattice::new(0, &[3.0], &[axis(1, &range(0.0, 3.0, 2e-4), false)], |_| false).unwrap();
+    let many = OrderGrid::new(0, &[3.0], &[axis(1, &range(0.0, 3.0, 2e-4), false)], |_| false).unwrap();
     let found = search(&records, &many, &[None], &options(), &Control::default());
     let Err(Error::Memory { what, bytes, limit: 0x8000_0000 }) = found else { panic!("{found:?}") };
     assert!(what.starts_with("15001 regressors") && bytes > 8 * 15_001 * 15_001, "{what} {bytes}");
-    let missing = Lattice::new(0, &[1.0], &[axis(5, &[0.0], false)], |_| false).unwrap();
+    let missing = OrderGrid::new(0, &[1.0], &[axis(5, &[0.0], false)], |_| false).unwrap();
     let found = search(&records, &missing, &[None], &options(), &Control::default());
     assert!(matches!(found, Err(Error::Structure { .. })));
 }
@@ -552,11 +552,11 @@ fn kernels_that_overflow_are_a_reason_on_every_row() {
     // h^2 is beyond floating point.
     let record = record(1e200, vec![random.signal(64), random.signal(64)]);
     let terms = [axis(0, &[0.0, 0.5], false), axis(1, &[0.0], false)];
-    let lattice = Lattice::new(0, &[1.8, 2.0], &terms, |s| s == 1).unwrap();
+    let lattice = OrderGrid::new(0, &[1.8, 2.0], &terms, |s| s == 1).unwrap();
     let settings = Settings { iterations: 3, tolerance: 1e-4 };
     for estimator in [Estimator::LeastSquares, Estimator::InstrumentalVariables(settings)] {
         for early_stopping in [false, true] {
-            let options = Options { estimator, early_stopping, ..options() };
+            let options = Options { estimator, pruning: early_stopping, ..options() };
             let records = std::slice::from_ref(&record);
             match search(records, &lattice, &[None; 2], &options, &Control::default()) {
                 Ok(found) => {
@@ -576,11 +576,11 @@ fn candidates_that_explode_in_their_first_block_are_a_reason_on_their_rows() {
     let mut random = Random::new(63);
     let record = record(0.1, vec![random.signal(64), random.signal(64)]);
     let terms = [axis(0, &[0.0], false), axis(1, &[0.0, 0.1, 0.2], false)];
-    let lattice = Lattice::new(0, &[2.0], &terms, |s| s == 1).unwrap();
+    let lattice = OrderGrid::new(0, &[2.0], &terms, |s| s == 1).unwrap();
     // F starts with h^2/6: what is left of D's first term makes a run grow by 1e9 a pulse, and one block is all there is.
     let fixed = [Some(600.0 * (1.0 - 1e-9)), None];
     for early_stopping in [false, true] {
-        let options = Options { early_stopping, ..options() };
+        let options = Options { pruning: early_stopping, ..options() };
         let found = search(std::slice::from_ref(&record), &lattice, &fixed, &options, &Control::default()).unwrap();
         assert_eq!((found.counts.diverged, found.rows.len()), (3, 0));
         assert!(found.failures.iter().all(|f| f.1 == Failure::Diverged));
@@ -592,8 +592,8 @@ fn long_problem(last: f64) -> Problem {
     let mut random = Random::new(245);
     let all = range(0.0, 2.0, 0.05);
     let axes = [axis(0, &all, true), axis(0, &all, true), axis(1, &all, false), axis(2, &[0.0], false)];
-    let lattice = Lattice::new(0, &range(1.05, last, 0.05), &axes, |s| s == 2).unwrap();
-    let options = Options { early_stopping: false, ..options() };
+    let lattice = OrderGrid::new(0, &range(1.05, last, 0.05), &axes, |s| s == 2).unwrap();
+    let options = Options { pruning: false, ..options() };
     Problem { records: vec![data(&mut random, 2048, 0.005, 0.1)], lattice, fixed: vec![None; 4], options }
 }
 
@@ -744,7 +744,7 @@ fn no_score_within_reach_is_excluded() {
             }
             finite += 1;
             for start in [coefficients, &elsewhere] {
-                let asked = |limit: f64| out_of_reach(&record, structure, &fixed, start, norm, limit).unwrap();
+                let asked = |limit: f64| is_infeasible(&record, structure, &fixed, start, norm, limit).unwrap();
                 assert!(!asked(error), "{error:e} is reached by {equation:?}");
                 assert!(!asked(2.0 * error));
                 excluded += usize::from(asked(1e-3 * error));
@@ -781,9 +781,9 @@ proptest! {
     #[test]
     fn the_bounded_search_is_brute_force(seed in 10_000u64..1_000_000, keep in 1usize..25, threads in 1usize..9) {
         let problem = random_problem(seed);
-        let brute = problem.run(|o| (o.early_stopping, o.keep, o.threads) = (false, keep, 1));
-        let found = problem.run(|o| (o.keep, o.threads) = (keep, threads));
-        prop_assert_eq!(brute.counts.bounded + brute.counts.stopped, 0);
+        let brute = problem.run(|o| (o.pruning, o.top, o.threads) = (false, keep, 1));
+        let found = problem.run(|o| (o.top, o.threads) = (keep, threads));
+        prop_assert_eq!(brute.counts.excluded_by_bound + brute.counts.stopped, 0);
         prop_assert_eq!(found.rows.len(), brute.rows.len());
         for (a, b) in found.rows.iter().zip(&brute.rows) {
             prop_assert_eq!(a.index, b.index);
@@ -791,7 +791,7 @@ proptest! {
             prop_assert_eq!(bits(&a.coefficients), bits(&b.coefficients));
             prop_assert_eq!(&a.initial, &b.initial);
         }
-        prop_assert_eq!(problem.run(|o| (o.keep, o.threads) = (keep, 1)), found);
+        prop_assert_eq!(problem.run(|o| (o.top, o.threads) = (keep, 1)), found);
     }
 }
 
@@ -801,8 +801,8 @@ proptest! {
     #[test]
     fn keeping_more_rows_keeps_the_fewer(seed in 300u64..10_000, fewer in 1usize..10) {
         let problem = random_problem(seed);
-        let few = problem.run(|o| o.keep = fewer);
-        let many = problem.run(|o| o.keep = fewer + 15);
+        let few = problem.run(|o| o.top = fewer);
+        let many = problem.run(|o| o.top = fewer + 15);
         prop_assert!(many.rows.len() >= few.rows.len());
         prop_assert_eq!(&many.rows[..few.rows.len()], &few.rows[..]);
     }
@@ -814,7 +814,7 @@ proptest! {
         let values = range(0.0, 2.0, 0.2);
         let make = |alphas: &[f64]| {
             let axes = [axis(0, &values, true), axis(0, &values, true), axis(1, &values, false), axis(2, &[0.0], false)];
-            Lattice::new(0, alphas, &axes, |s| s == 2).unwrap()
+            OrderGrid::new(0, alphas, &axes, |s| s == 2).unwrap()
         };
         let best = |lattice| {
             let problem = Problem { records: records.clone(), lattice, fixed: vec![None; 4], options: options() };
@@ -827,7 +827,7 @@ proptest! {
 
 #[test]
 fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
-    use ftlm::order_search::batches::Search;
+    use ftlm::order_search::batches::BatchEvaluator;
     use ftlm::order_search::control::Checkpoint;
     use ftlm::order_search::result::Part;
     use std::borrow::Cow;
@@ -838,12 +838,15 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
         // Fewer than are proved closely: every stop screens the round again.
         let problem = long_problem(1.6);
         let lattice = &problem.lattice;
-        let options = Options { early_stopping, keep: 7, ..problem.options.clone() };
+        let options = Options { pruning: early_stopping, top: 7, ..problem.options.clone() };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-        let run = |ready: &Search<'_>, from, control: &Control| ready.rounds(0, 1, &[], from, &pool, control);
+        let run = |ready: &BatchEvaluator<'_>, from, control: &Control| {
+            ready.evaluate_batches(0, 1, &[], from, &pool, control)
+        };
         let control = Control::default();
         let fixed = vec![None; lattice.width()];
-        let ready = Search::new(&problem.records, Cow::Borrowed(lattice), &fixed, &options, &pool, &control).unwrap();
+        let ready =
+            BatchEvaluator::new(&problem.records, Cow::Borrowed(lattice), &fixed, &options, &pool, &control).unwrap();
         let whole = run(&ready, None, &control).unwrap();
         let mut random = Random::new(seed);
         {
@@ -852,7 +855,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
             let part: Part = loop {
                 let control = Control::default();
                 control.saving.store(true, Relaxed);
-                let base = from.as_ref().map_or(0, |c: &Checkpoint| c.part.counts.done());
+                let base = from.as_ref().map_or(0, |c: &Checkpoint| c.part.counts.processed_count());
                 let end = base + 1 + random.below(6000) as u64;
                 let finished = std::sync::atomic::AtomicBool::new(false);
                 let (finished, watched) = (&finished, &control);
@@ -872,7 +875,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                     Err(error) => assert_eq!(error, ftlm::error::Error::Interrupted),
                 }
                 stopped += 1;
-                if let Some(mut checkpoint) = control.take() {
+                if let Some(mut checkpoint) = control.take_checkpoint() {
                     rows.append(&mut checkpoint.part.rows);
                     checkpoint.part.rows.clone_from(&rows);
                     if stopped == 1 {
@@ -882,10 +885,10 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                         let control = Control::default();
                         control.saving.store(true, Relaxed);
                         assert_eq!(run(&ready, Some(other), &control).unwrap(), whole);
-                        assert_eq!(control.done.load(Relaxed), whole.counts.done());
-                        assert!(control.take().is_some_and(|first| first.anew));
+                        assert_eq!(control.done.load(Relaxed), whole.counts.processed_count());
+                        assert!(control.take_checkpoint().is_some_and(|first| first.replaces_previous));
                     }
-                    assert_eq!(checkpoint.anew, from.is_none());
+                    assert_eq!(checkpoint.replaces_previous, from.is_none());
                     from = Some(checkpoint);
                 }
             };

@@ -4,7 +4,7 @@
 use ftlm::error::Error;
 use ftlm::fft;
 use ftlm::fractional::kernels::{block_pulse_kernel, power_means};
-use ftlm::series::{self, Buffers, Division, Kernel, Recursion, Solver, Source, SumOfProducts, BLOCK, MAX_SUMS};
+use ftlm::series::{self, Buffers, Division, Kernel, Recursion, Solver, Source, SumOfProducts, BLOCK_TERMS, MAX_SUMS};
 use proptest::prelude::*;
 
 use crate::common::{
@@ -21,7 +21,7 @@ fn lengths() -> impl Iterator<Item = usize> {
 fn block_distance(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
     let (mut worst, mut size) = (0.0_f64, f64::MIN_POSITIVE);
-    for (a, b) in a.chunks(BLOCK).zip(b.chunks(BLOCK)) {
+    for (a, b) in a.chunks(BLOCK_TERMS).zip(b.chunks(BLOCK_TERMS)) {
         size = size.max(largest(b));
         worst = worst.max(distance(a, b) / size);
     }
@@ -133,8 +133,8 @@ fn quotients_past_the_range_of_floating_point_are_not_finite_and_not_wrong_befor
     let d = divisor(&[(1e5, 2.0)], m, 0.004);
     let n = power_means(0.0, m, 0.004);
     let (fast, naive) = (series::divide(&n, &d).unwrap(), series::divide_naive(&n, &d).unwrap());
-    let end = naive.iter().position(|v| !v.is_finite()).unwrap() / BLOCK * BLOCK;
-    assert!(end > 3 * BLOCK && !fast[m - 1].is_finite());
+    let end = naive.iter().position(|v| !v.is_finite()).unwrap() / BLOCK_TERMS * BLOCK_TERMS;
+    assert!(end > 3 * BLOCK_TERMS && !fast[m - 1].is_finite());
     check("error before the overflow", block_distance(&fast[..end], &naive[..end]), 5e-12);
 }
 
@@ -367,14 +367,14 @@ fn a_division_under_way_gives_the_quotient_block_by_block() {
             division.reset();
             let (n, d) = (random.signal(m), divisor(&[(-5.0, 1.7), (1.0, 0.6)], m, 0.01));
             let whole = series::divide(&n, &d).unwrap();
-            assert_eq!((division.terms(), division.solved()), (m, 0));
+            assert_eq!((division.terms(), division.solved_terms()), (m, 0));
             let inverse = [1.0 / d[0]];
             if pass == 0 {
                 division.add(0, 0, &n);
             }
-            while division.solved() < m {
-                let (start, reads) = (division.solved(), division.reads());
-                let end = (start + BLOCK).min(m);
+            while division.solved_terms() < m {
+                let (start, reads) = (division.solved_terms(), division.reads());
+                let end = (start + BLOCK_TERMS).min(m);
                 let series = |_: usize, _: usize, len: usize| {
                     assert!(len <= reads, "{len} terms read, {reads} announced");
                     &d[..len]
@@ -388,7 +388,7 @@ fn a_division_under_way_gives_the_quotient_block_by_block() {
                     assert!(distance(division.quotient(0), &whole[..end]) <= 1e-13 * largest(&whole[..end]));
                     division.join(series);
                 }
-                assert_eq!(division.solved(), end);
+                assert_eq!(division.solved_terms(), end);
             }
             if pass == 0 {
                 assert_eq!(bits(division.quotient(0)), bits(&whole));
@@ -449,7 +449,7 @@ fn transforms_return_the_signal() {
         let signal = random.signal(len);
         let mut time = signal.clone();
         let mut spectrum = vec![fft::Bin::new(0.0, 0.0); plan.bins()];
-        plan.forward(&mut time, &mut spectrum, &mut workspace);
+        plan.transform(&mut time, &mut spectrum, &mut workspace);
         assert!((spectrum[0].re - signal.iter().sum::<f64>()).abs() < 1e-13 * norm(&signal) * (len as f64).sqrt());
         plan.inverse(&mut spectrum, &mut time, &mut workspace);
         assert!(distance(&time, &signal) < 1e-15 * norm(&signal));

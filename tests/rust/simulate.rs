@@ -525,7 +525,7 @@ fn a_derivative_above_its_equations_order_is_of_what_a_signal_is_above_its_level
     let input: Vec<f64> = random.signal(m).iter().map(|v| level + 0.3 * v).collect();
     let above: Vec<f64> = input.iter().map(|v| v - level).collect();
     let run = |input: &[f64]| record(step, vec![vec![0.0; m], input.to_vec()]);
-    let begun = run(&input).begun(vec![false; 2], &[0.0, level], Vec::new()).unwrap();
+    let begun = run(&input).with_initial_state(vec![false; 2], &[0.0, level], Vec::new()).unwrap();
     for (order, expected) in [(1.3, &above), (0.9, &input), (0.2, &input)] {
         let model = equation(0, 0.9, &[(0, 0.0, -3.0), (1, order, 2.0)]);
         let (found, told) = (respond(one(&model), &begun, &[]), respond(one(&model), &run(expected), &[]));
@@ -534,17 +534,27 @@ fn a_derivative_above_its_equations_order_is_of_what_a_signal_is_above_its_level
     // Behind a filter the level is what the filter makes of it.
     let lag =
         Filter { numerator: vec![(4.0, 0.0)], denominator: vec![(1.0, 1.0), (4.0, 0.0)] }.series(m, step).unwrap();
-    let through = begun.through(&lag).unwrap();
-    assert!(distance(through.moving(1), &series::multiply_naive(&lag, &above, m)) < 1e-12);
-    let unit = record(step, vec![vec![1.0; m]]).through(&lag).unwrap();
-    let late = run(&input).through(&lag).unwrap().begun(vec![false; 2], &[0.0, level], Vec::new()).unwrap();
+    let through = begun.with_filter(&lag).unwrap();
+    assert!(distance(through.deviation_signal(1), &series::multiply_naive(&lag, &above, m)) < 1e-12);
+    let unit = record(step, vec![vec![1.0; m]]).with_filter(&lag).unwrap();
+    let late =
+        run(&input).with_filter(&lag).unwrap().with_initial_state(vec![false; 2], &[0.0, level], Vec::new()).unwrap();
     let expected: Vec<f64> = late.signal(1).iter().zip(unit.signal(0)).map(|(v, one)| v - level * one).collect();
-    assert!(distance(late.moving(1), &expected) < 1e-12);
-    assert_eq!(late.moving(0), late.signal(0));
-    assert!(matches!(run(&input).begun(vec![false], &[0.0, level], Vec::new()), Err(Error::Length { .. })));
-    assert!(matches!(run(&input).begun(vec![false; 2], &[0.0], Vec::new()), Err(Error::Length { .. })));
-    assert!(matches!(run(&input).begun(vec![false; 2], &[0.0, f64::NAN], Vec::new()), Err(Error::NotFinite { .. })));
-    assert!(matches!(run(&input).begun(vec![false; 2], &[0.0; 2], vec![vec![0.0; 3]]), Err(Error::Length { .. })));
+    assert!(distance(late.deviation_signal(1), &expected) < 1e-12);
+    assert_eq!(late.deviation_signal(0), late.signal(0));
+    assert!(matches!(
+        run(&input).with_initial_state(vec![false], &[0.0, level], Vec::new()),
+        Err(Error::Length { .. })
+    ));
+    assert!(matches!(run(&input).with_initial_state(vec![false; 2], &[0.0], Vec::new()), Err(Error::Length { .. })));
+    assert!(matches!(
+        run(&input).with_initial_state(vec![false; 2], &[0.0, f64::NAN], Vec::new()),
+        Err(Error::NotFinite { .. })
+    ));
+    assert!(matches!(
+        run(&input).with_initial_state(vec![false; 2], &[0.0; 2], vec![vec![0.0; 3]]),
+        Err(Error::Length { .. })
+    ));
 }
 
 #[test]
@@ -553,10 +563,10 @@ fn what_a_sensor_held_moves_its_output_alone() {
     let lag = Filter { numerator: vec![(4.0, 0.0)], denominator: vec![(1.0, 2.0), (3.0, 1.0), (4.0, 0.0)] }
         .series(m, step)
         .unwrap();
-    let run = record(step, vec![vec![0.0; m], vec![0.0; m]]).through(&lag).unwrap();
+    let run = record(step, vec![vec![0.0; m], vec![0.0; m]]).with_filter(&lag).unwrap();
     let model = equation(0, 1.4, &[(0, 0.6, -1.0), (0, 0.0, -5.0), (1, 0.0, 1.0)]);
     let answers: Vec<Vec<f64>> = (1..=2).map(|k| vec![f64::from(k); m]).collect();
-    let held = run.clone().begun(vec![true, false], &[0.0; 2], answers.clone()).unwrap();
+    let held = run.clone().with_initial_state(vec![true, false], &[0.0; 2], answers.clone()).unwrap();
     let units = [(0, -1.0), (0, -2.0), (0, 0.4)];
     let (_, found) = respond_and_units(one(&model), &held, &units).unwrap();
     let (_, moved) = respond_and_units(one(&model), &run, &units).unwrap();

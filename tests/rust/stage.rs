@@ -6,9 +6,9 @@ use std::sync::atomic::Ordering;
 use ftlm::equation::{grains, AffineOrder, Equation, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::least_squares;
-use ftlm::estimation::multi_innovation::{Innovation, Rows};
+use ftlm::estimation::multi_innovation::{Innovation, RowBasis};
 use ftlm::order_search::control::Control;
-use ftlm::order_search::grid::{LawEquation, LawLattice, MAX_TUPLES};
+use ftlm::order_search::grid::{LawEquation, OrderLawGrid, MAX_TUPLES};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::order_search::result::Failure;
 use ftlm::order_search::stage_join::{search, Span, Stage, StageOutcome};
@@ -82,9 +82,9 @@ fn options() -> Options {
         norm: Norm::L1,
         estimator: Estimator::LeastSquares,
         initial: Initial::Rest,
-        keep: 12,
+        top: 12,
         threads: 2,
-        early_stopping: true,
+        pruning: true,
         memory: 2 << 30,
     }
 }
@@ -98,11 +98,12 @@ fn scales(records: &[Record]) -> Vec<f64> {
     (0..2).map(|i| m * deviation(records[0].signal(i))).collect()
 }
 
-fn run(records: &[Record], lattice: &LawLattice, options: &Options) -> StageOutcome {
+fn run(records: &[Record], lattice: &OrderLawGrid, options: &Options) -> StageOutcome {
     let control = Control::default();
     let found = search(records, lattice, &free(), &scales(records), options, &control).unwrap();
     let counts = found.counts;
-    let sum = counts.kept + counts.beaten + counts.bounded + counts.stopped + counts.singular + counts.diverged;
+    let sum =
+        counts.kept + counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged;
     assert_eq!(sum, counts.candidates);
     assert_eq!(counts.kept, found.rows.len() as u64);
     // One that was left early may have been followed further.
@@ -113,7 +114,7 @@ fn run(records: &[Record], lattice: &LawLattice, options: &Options) -> StageOutc
 
 #[test]
 fn the_law_lattice_is_the_product_of_its_axes() {
-    let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     assert_eq!(lattice.product(), 2 * 2 * 3 * 3 * 3);
     assert_eq!(lattice.free(0), [1.9, 1.9, 0.9, 0.0, 0.8]);
     assert_eq!(lattice.free(1), [1.9, 1.9, 0.9, 0.0, 0.85]);
@@ -128,12 +129,12 @@ fn the_law_lattice_is_the_product_of_its_axes() {
     // Axes in any order and with repetitions are the same lattice.
     let mut shuffled = axes();
     shuffled[2] = vec![1.0, 0.9, 0.95, 0.9];
-    assert_eq!(LawLattice::new(&shuffled, &two_link(), &INPUTS).unwrap().free(107), lattice.free(107));
+    assert_eq!(OrderLawGrid::new(&shuffled, &two_link(), &INPUTS).unwrap().free(107), lattice.free(107));
 }
 
 #[test]
 fn tuples_that_make_no_equation_are_left_out() {
-    let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let accepted = (0..lattice.product()).filter(|&i| lattice.structures(i).is_some()).count();
     // By hand: beta1 = a1 - a2 - g1 + b2 + m2 may not be negative; all else is in range on these axes.
     let by_hand = (0..lattice.product())
@@ -146,27 +147,27 @@ fn tuples_that_make_no_equation_are_left_out() {
     assert_eq!(accepted, by_hand);
     // Two orders of one signal that coincide: beta2 = mu2.
     let narrow = vec![vec![2.0], vec![2.0], vec![0.5], vec![0.8], vec![0.8]];
-    let lattice = LawLattice::new(&narrow, &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&narrow, &two_link(), &INPUTS).unwrap();
     assert_eq!(lattice.structures(0), None);
     let found = search(&[data(50, 0.0, 1)], &lattice, &free(), &[1.0; 2], &options(), &Control::default());
-    assert!(matches!(found, Err(Error::EmptyLattice { .. })));
+    assert!(matches!(found, Err(Error::EmptyOrderGrid { .. })));
 }
 
 #[test]
 fn empty_and_oversized_law_lattices_are_refused() {
     let mut none = axes();
     none[3].clear();
-    match LawLattice::new(&none, &two_link(), &INPUTS) {
-        Err(Error::EmptyLattice { why }) => assert_eq!(why, "free order 3 has no value"),
+    match OrderLawGrid::new(&none, &two_link(), &INPUTS) {
+        Err(Error::EmptyOrderGrid { why }) => assert_eq!(why, "free order 3 has no value"),
         other => panic!("{other:?}"),
     }
     let fine: Vec<f64> = (0..100).map(|i| 0.01 * f64::from(i)).collect();
-    let found = LawLattice::new(&vec![fine; 5], &two_link(), &INPUTS);
-    assert_eq!(found.err(), Some(Error::LatticeTooLarge { count: 10_000_000_000, limit: MAX_TUPLES }));
+    let found = OrderLawGrid::new(&vec![fine; 5], &two_link(), &INPUTS);
+    assert_eq!(found.err(), Some(Error::OrderGridTooLarge { count: 10_000_000_000, limit: MAX_TUPLES }));
 }
 
 /// Every tuple by the plain way: each equation fitted and run on its own.
-fn enumerated(records: &[Record], lattice: &LawLattice, options: &Options) -> Vec<(f64, u64)> {
+fn enumerated(records: &[Record], lattice: &OrderLawGrid, options: &Options) -> Vec<(f64, u64)> {
     let scales = scales(records);
     let mut all = Vec::new();
     for index in 0..lattice.product() {
@@ -206,7 +207,7 @@ fn enumerated(records: &[Record], lattice: &LawLattice, options: &Options) -> Ve
 
 #[test]
 fn the_joined_tables_are_the_enumeration() {
-    let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let one = vec![data(400, 0.01, 50)];
     let two = vec![data(300, 0.01, 51), data(200, 0.02, 52)];
     let mut worst = 0.0_f64;
@@ -276,19 +277,18 @@ fn any_law_is_joined_as_it_is_enumerated() {
         let axes: Vec<Vec<f64>> =
             (0..free).map(|_| (0..1 + random.below(4)).map(|_| 0.8 + 0.1 * random.below(5) as f64).collect()).collect();
         let outputs: &[usize] = if round % 3 == 0 { &[1] } else { &[0, 1] };
-        let lattice = LawLattice::new(&axes, &random_laws(&mut random, free, outputs), &INPUTS).unwrap();
+        let lattice = OrderLawGrid::new(&axes, &random_laws(&mut random, free, outputs), &INPUTS).unwrap();
         let records = [data(120, 0.02, 81 + round)];
         let fixed = vec![vec![None; 3]; outputs.len()];
         let scales = &scales(&records)[..outputs.len()];
-        let options = Options { keep: 1 + random.below(9), threads: 1 + random.below(3), ..options() };
+        let options = Options { top: 1 + random.below(9), threads: 1 + random.below(3), ..options() };
         let of = |o: &Options| search(&records, &lattice, &fixed, scales, o, &Control::default());
         let valid = (0..lattice.product()).filter(|&i| lattice.structures(i).is_some()).count() as u64;
         if valid == 0 {
-            assert!(matches!(of(&options), Err(Error::EmptyLattice { .. })));
+            assert!(matches!(of(&options), Err(Error::EmptyOrderGrid { .. })));
             continue;
         }
-        let (found, brute) =
-            (of(&options).unwrap(), of(&Options { early_stopping: false, ..options.clone() }).unwrap());
+        let (found, brute) = (of(&options).unwrap(), of(&Options { pruning: false, ..options.clone() }).unwrap());
         assert_eq!(found.counts.candidates, valid);
         assert_eq!(found.rows, brute.rows);
         let naive = enumerated(&records, &lattice, &options);
@@ -310,7 +310,7 @@ fn any_law_is_joined_as_it_is_enumerated() {
 
 #[test]
 fn distinct_orders_are_evaluated_once() {
-    let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let found = run(&[data(200, 0.01, 53)], &lattice, &options());
     let mut distinct = [HashSet::new(), HashSet::new()];
     for structures in (0..lattice.product()).filter_map(|i| lattice.structures(i)) {
@@ -325,22 +325,22 @@ fn distinct_orders_are_evaluated_once() {
 
 #[test]
 fn early_stopping_and_threads_change_nothing() {
-    let lattice = LawLattice::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
-    let innovation = Innovation { length: 5, prior_covariance: 100.0, rows: Rows::Haar };
+    let lattice = OrderLawGrid::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
+    let innovation = Innovation { length: 5, prior_covariance: 100.0, row_basis: RowBasis::Haar };
     let mut stopped = 0;
     for (seed, change) in [
         (60, options()),
-        (61, Options { keep: 1, ..options() }),
-        (62, Options { norm: Norm::L2, keep: 3, ..options() }),
+        (61, Options { top: 1, ..options() }),
+        (62, Options { norm: Norm::L2, top: 3, ..options() }),
         // More rows than tuples: nothing may be left early for good.
-        (63, Options { keep: 100_000, ..options() }),
+        (63, Options { top: 100_000, ..options() }),
         (64, Options { estimator: Estimator::MultiInnovation(innovation), ..options() }),
-        (65, Options { criterion: Criterion::EquationError, keep: 5, ..options() }),
-        (66, Options { initial: Initial::Caputo, keep: 4, ..options() }),
+        (65, Options { criterion: Criterion::EquationError, top: 5, ..options() }),
+        (66, Options { initial: Initial::Caputo, top: 4, ..options() }),
     ] {
         let records = [data(256, 0.02, seed)];
         let one = run(&records, &lattice, &Options { threads: 1, ..change.clone() });
-        let brute = run(&records, &lattice, &Options { early_stopping: false, ..change.clone() });
+        let brute = run(&records, &lattice, &Options { pruning: false, ..change.clone() });
         assert_eq!(brute.counts.stopped, 0);
         assert_eq!(one.rows, brute.rows, "seed {seed}");
         for (a, b) in one.rows.iter().zip(&brute.rows) {
@@ -361,7 +361,7 @@ fn early_stopping_and_threads_change_nothing() {
 #[test]
 fn candidates_may_be_followed_in_any_pieces_and_order() {
     let records = [data(128, 0.02, 6)];
-    let lattice = LawLattice::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
     let (options, control) = (options(), Control::default());
     let expected = run(&records, &lattice, &options);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
@@ -371,11 +371,11 @@ fn candidates_may_be_followed_in_any_pieces_and_order() {
     };
     let ((stage, mut course), (elsewhere, _)) = (make(), make());
     let (mut waves, mut followed) = (0, 0);
-    while !course.wanted().is_empty() {
+    while !course.pending_spans().is_empty() {
         assert!(stage.outcome(&course, &control).is_err());
         // Each candidate by itself, the last first, by turns in two places.
         let mut verdicts = Vec::new();
-        for span in course.wanted().iter().rev() {
+        for span in course.pending_spans().iter().rev() {
             for first in (span.first..span.last).rev() {
                 let one = Span { first, last: first + 1, ..*span };
                 let place = if verdicts.len() % 2 == 0 { &stage } else { &elsewhere };
@@ -383,9 +383,9 @@ fn candidates_may_be_followed_in_any_pieces_and_order() {
             }
         }
         verdicts.reverse();
-        assert!(course.take(&stage, &verdicts[1..], &pool, &control).is_err());
+        assert!(course.record_verdicts(&stage, &verdicts[1..], &pool, &control).is_err());
         followed += verdicts.len() as u64;
-        course.take(&stage, &verdicts, &pool, &control).unwrap();
+        course.record_verdicts(&stage, &verdicts, &pool, &control).unwrap();
         waves += 1;
     }
     assert!(waves > 3);
@@ -400,7 +400,7 @@ fn candidates_may_be_followed_in_any_pieces_and_order() {
 
 #[test]
 fn the_truth_is_found_under_its_law() {
-    let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let found = run(&[data(600, 0.0, 70)], &lattice, &options());
     assert_eq!(found.rows[0].free, [2.0, 2.0, 0.95, 0.1, 0.85]);
     assert!(found.rows[1].score > 1e3 * found.rows[0].score);
@@ -410,13 +410,13 @@ fn the_truth_is_found_under_its_law() {
 #[test]
 fn equations_of_very_different_weight_are_joined() {
     // One equation weighs so little that its score is lost in the rounding of the sum.
-    let lattice = LawLattice::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
     let records = [data(200, 1e-4, 71)];
     for scales in [[1e20, 1.0], [1.0, 1e20], [1e-20, 1.0]] {
         for keep in [1, 5] {
-            let change = Options { keep, ..options() };
+            let change = Options { top: keep, ..options() };
             let of = |o: &Options| search(&records, &lattice, &free(), &scales, o, &Control::default()).unwrap();
-            let brute = of(&Options { early_stopping: false, ..change.clone() });
+            let brute = of(&Options { pruning: false, ..change.clone() });
             assert_eq!(of(&change).rows, brute.rows, "scales {scales:?}");
         }
     }
@@ -424,7 +424,7 @@ fn equations_of_very_different_weight_are_joined() {
 
 #[test]
 fn singular_and_diverged_tuples_are_counted() {
-    let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let tuples = (0..lattice.product()).filter(|&i| lattice.structures(i).is_some()).count() as u64;
     let base = data(2000, 0.01, 72);
     // A current that never flows.
@@ -435,7 +435,7 @@ fn singular_and_diverged_tuples_are_counted() {
     let listed: Vec<(u64, Failure)> = accepted.iter().map(|&i| (i, Failure::Singular)).collect();
     assert_eq!(found.failures, listed);
     // More than are listed one by one.
-    let fine = LawLattice::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
+    let fine = OrderLawGrid::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
     for threads in [1, 3] {
         let options = Options { threads, ..options() };
         let found =
@@ -454,7 +454,7 @@ fn singular_and_diverged_tuples_are_counted() {
 
 #[test]
 fn a_stage_search_ends_when_told_to_and_checks_its_arguments() {
-    let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
+    let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let records = [data(100, 0.01, 73)];
     let control = Control::default();
     control.stop.set();
@@ -467,7 +467,7 @@ fn a_stage_search_ends_when_told_to_and_checks_its_arguments() {
     assert!(matches!(run(&[vec![None; 4], vec![None; 3]], &[1.0; 2], &options()), Error::Length { .. }));
     assert!(matches!(run(&free(), &[1.0], &options()), Error::Length { .. }));
     assert!(matches!(run(&free(), &[1.0; 2], &Options { threads: 0, ..options() }), Error::OutOfRange { .. }));
-    assert!(matches!(run(&free(), &[1.0; 2], &Options { keep: 0, ..options() }), Error::OutOfRange { .. }));
+    assert!(matches!(run(&free(), &[1.0; 2], &Options { top: 0, ..options() }), Error::OutOfRange { .. }));
     let none = search(&[], &lattice, &free(), &[1.0; 2], &options(), &Control::default());
     assert!(matches!(none, Err(Error::Length { .. })));
 }

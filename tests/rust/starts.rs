@@ -4,18 +4,18 @@ use std::f64::consts::PI;
 
 use ftlm::equation::{self, Initial};
 use ftlm::error::{Error, Result};
-use ftlm::estimation::joint_fit::initial_guesses::{power_frequency, Lattices};
-use ftlm::estimation::joint_fit::parameter_set::Free;
+use ftlm::estimation::joint_fit::initial_guesses::{power_frequency, OrderGrids};
+use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Order, Structure, Term};
-use ftlm::estimation::joint_fit::{Recordings, Runner, Sampled, Sampling, Signal, Source};
+use ftlm::estimation::joint_fit::{Candidate, Recordings, SampledRuns, Sampling, Signal, Source};
 use ftlm::estimation::output_error::{Experiment, FreeInput, InputLaw};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
-use ftlm::order_search::grid::{Lattice, TermAxis};
+use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::Options;
 use ftlm::parallel::Stop;
 use ftlm::regressors::{Record, BANK_LIMIT};
-use ftlm::signal::block_pulse::{delayed, point_samples, Intersample};
+use ftlm::signal::block_pulse::{delay_samples, point_samples, Intersample};
 use ftlm::simulate::respond;
 
 use crate::common::{bits, check, deviation, Random};
@@ -37,15 +37,15 @@ fn plant() -> Vec<Signal> {
     let size = 0.01 * deviation(&y);
     y.iter_mut().for_each(|v| *v += size * random.normal());
     y.truncate(800);
-    let signal = |samples, between| Signal { samples, between };
+    let signal = |samples, between| Signal { samples, intersample: between };
     vec![signal(y, Intersample::Linear), signal(input, Intersample::Hold)]
 }
 
-fn runs() -> Sampled {
+fn runs() -> SampledRuns {
     let mut run = plant();
     let rows = run.iter().map(|s| s.samples.len()).min().unwrap();
     run.iter_mut().for_each(|s| s.samples.truncate(rows));
-    Sampled::new(STEP, vec![0], vec![run]).unwrap()
+    SampledRuns::new(STEP, vec![0], vec![run]).unwrap()
 }
 
 fn term(signal: usize, order: Order, name: &str) -> Term {
@@ -70,8 +70,8 @@ fn structure(alpha: Order, beta: f64) -> Structure {
     }
 }
 
-fn found(structure: Structure, source: &dyn Recordings, threads: usize) -> Result<Vec<Runner>> {
-    Lattices::new(source, threads, BANK_LIMIT, &Stop::default()).starts(&Free::of(structure)?)
+fn found(structure: Structure, source: &dyn Recordings, threads: usize) -> Result<Vec<Candidate>> {
+    OrderGrids::new(source, threads, BANK_LIMIT, &Stop::default()).candidates(&ParameterSet::from_structure(structure)?)
 }
 
 #[test]
@@ -110,11 +110,11 @@ fn starts_of_a_known_plant_hold_one_near_the_truth_whatever_the_threads() {
     let source = runs();
     let one = found(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
     let two = found(structure(Order::free("alpha"), 0.0), &source, 2).unwrap();
-    let values = |all: &[Runner]| all.iter().flat_map(|r| bits(&r.attempt.values())).collect::<Vec<_>>();
+    let values = |all: &[Candidate]| all.iter().flat_map(|r| bits(&r.result.values())).collect::<Vec<_>>();
     assert_eq!(values(&one), values(&two));
     assert!(one.iter().zip(&two).all(|(a, b)| a.origin == b.origin));
-    let distance = |r: &Runner| {
-        let orders = &r.attempt.place.point.orders;
+    let distance = |r: &Candidate| {
+        let orders = &r.result.iterate.point.orders;
         (orders[0] - ALPHA).abs().max((orders[1] - NU).abs())
     };
     check("distance from the truth", one.iter().map(distance).fold(f64::INFINITY, f64::min), 0.15);
@@ -126,20 +126,20 @@ fn starts_of_a_known_plant_hold_one_near_the_truth_whatever_the_threads() {
 fn the_best_row_is_followed_to_where_no_neighbour_is_better() {
     let source = runs();
     let all = found(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
-    let best = &all.iter().find(|r| r.origin == "no prefilter").unwrap().attempt.place.point.orders;
+    let best = &all.iter().find(|r| r.origin == "no prefilter").unwrap().result.iterate.point.orders;
     let records = source.records(799.min(source.samples(0).unwrap()[0].len() - 1), &[]).unwrap();
     let axis = |signal, values| TermAxis { signal, values, interchangeable: false };
     let around = |v: f64| vec![v - 0.05, v, v + 0.05];
     let terms = [axis(0, around(best[1])), axis(0, vec![0.0]), axis(1, vec![0.0])];
-    let lattice = Lattice::new(0, &around(best[0]), &terms, |s| s == 1).unwrap();
-    let options = Options { keep: 1, early_stopping: false, ..Options::default() };
+    let lattice = OrderGrid::new(0, &around(best[0]), &terms, |s| s == 1).unwrap();
+    let options = Options { top: 1, pruning: false, ..Options::default() };
     let table = search(&records, &lattice, &[None; 3], &options, &Control::default()).unwrap();
     let at = lattice.structure(table.rows[0].index);
     assert!((at.order - best[0]).abs() < 1e-9 && (at.terms[0].order - best[1]).abs() < 1e-9);
 }
 
 /// Runs whose input acts later, or no further than a limit.
-struct Acting(Sampled, Vec<Signal>, Input);
+struct Acting(SampledRuns, Vec<Signal>, Input);
 
 impl Source for Acting {
     fn spans(&self) -> Vec<(f64, f64)> {
@@ -164,10 +164,10 @@ impl Recordings for Acting {
         let mut run = self.1.clone();
         let input = &mut run[1].samples;
         *input = match self.2.free.law {
-            InputLaw::Delay => delayed(input, inputs[0] / STEP, 0.0)?,
+            InputLaw::Delay => delay_samples(input, inputs[0] / STEP, 0.0)?,
             _ => input.iter().map(|v| v.clamp(-inputs[0], inputs[0])).collect(),
         };
-        Sampled::new(STEP, vec![0], vec![run])?.records(m, &[])
+        SampledRuns::new(STEP, vec![0], vec![run])?.records(m, &[])
     }
 }
 
@@ -187,10 +187,10 @@ fn delays_and_limits_are_tried() {
             .into_iter()
             .chain(source.samples(1).unwrap())
             .zip([Intersample::Linear, Intersample::Hold])
-            .map(|(samples, between)| Signal { samples, between })
+            .map(|(samples, between)| Signal { samples, intersample: between })
             .collect();
         let all = found(free, &Acting(source, run, input), 1).unwrap();
-        let mut tried: Vec<f64> = all.iter().map(|r| r.attempt.place.point.inputs[0]).collect();
+        let mut tried: Vec<f64> = all.iter().map(|r| r.result.iterate.point.inputs[0]).collect();
         tried.dedup();
         assert!(all[0].origin.contains(words), "{}", all[0].origin);
         assert!(tried.len() >= 2 && tried.iter().all(|v| (bounds.0..=bounds.1).contains(v)), "{tried:?}");
@@ -211,6 +211,6 @@ fn what_makes_no_start_is_refused() {
     assert!(empty.to_string().contains("no orders of signal 'y' fit below alpha = 1"), "{empty}");
     let stop = Stop::default();
     stop.set();
-    let free = Free::of(structure(Order::free("alpha"), 0.0)).unwrap();
-    assert_eq!(Lattices::new(&source, 1, BANK_LIMIT, &stop).starts(&free), Err(Error::Interrupted));
+    let free = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
+    assert_eq!(OrderGrids::new(&source, 1, BANK_LIMIT, &stop).candidates(&free), Err(Error::Interrupted));
 }

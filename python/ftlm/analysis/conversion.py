@@ -18,6 +18,7 @@ from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats
 
 
@@ -165,9 +166,12 @@ def export_text(
     if to == "matlab":
         return matlab_text(model)
     if to != "control":
-        raise ModelError(f"to = {to!r} is not known; use 'control', 'matlab' or 'json'")
+        raise ModelError(f"{setting('to')} {to!r} is not known; use 'control', 'matlab' or 'json'")
     if band is None:
-        raise ModelError("python-control has no fractional orders: give the band of frequencies, as in --band 0.1:100")
+        raise ModelError(
+            "python-control has no fractional orders: give the band of frequencies, as in "
+            f"{parameter('band', (0.1, 100))}"
+        )
     return control_text(model, band=band, order=order)
 
 
@@ -195,7 +199,10 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     results = _names("outputs", outputs, getattr(system, "output_labels", None), len(parts))
     twice = sorted(set(signals) & set(results))
     if twice:
-        raise ModelError(f"{', '.join(twice)}: input and output at once; pass inputs= and outputs= with other names")
+        raise ModelError(
+            f"{', '.join(twice)}: input and output at once; pass {parameter('inputs')} and {parameter('outputs')} "
+            "with other names"
+        )
     rows = zip(results, parts, strict=True)
     return equation("\n".join(_equation_text(name, signals, *part) for name, part in rows), coupling="measured")
 

@@ -19,6 +19,7 @@ from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, check_choice
 
 #: A sum of coefficient * s^power, by power.
@@ -282,8 +283,8 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None:
         raise ModelError(
-            "this model has no covariance, so its response has no uncertainty; identify it with method='output-error', "
-            "and without a term whose interval is infinite"
+            "this model has no covariance, so its response has no uncertainty; identify it with "
+            f"{parameter('method', 'output-error')}, and without a term whose interval is infinite"
         )
     centre = frequency_response(model, w, coupling=coupling)
     values = parameter_vector(model)

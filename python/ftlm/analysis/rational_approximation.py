@@ -18,6 +18,7 @@ from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, real_number, short_repr, whole_number
 
 #: Maximum errors of the approximation without a warning.
@@ -222,12 +223,14 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
-        raise ModelError(f"band = {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+        raise ModelError(
+            f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
+        ) from None
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval; give 0 < low < high")
     count = whole_number(order)
     if count is None or not 1 <= count <= LARGEST_ORDER:
-        raise ModelError(f"order = {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
+        raise ModelError(f"{setting('order')} {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     inputs, outputs = response_inputs(model, coupled=True), model.outputs

@@ -22,6 +22,7 @@ from ftlm.app import views as view
 from ftlm.app.forms import parse_fields
 from ftlm.app.session import STATE_MADE, Session
 from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.utils.parameters import setting, use_interface
 
 if TYPE_CHECKING:
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -423,7 +424,7 @@ def open_socket(port: int | None) -> tuple[socket.socket, str]:
         A port that is taken or not allowed.
     """
     if port is not None and not 0 <= port <= 65535:
-        raise ModelError(f"--port {port} is none; take one from 1024 to 65535, or 0 for any")
+        raise ModelError(f"{setting('port')} {port} is none; take one from 1024 to 65535, or 0 for any")
     wanted = DEFAULT_PORT if port is None else port
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     if sys.platform != "win32":
@@ -440,7 +441,7 @@ def open_socket(port: int | None) -> tuple[socket.socket, str]:
                 0
             ], f"port {DEFAULT_PORT} is taken, perhaps by another ftlm app; this one has a port of its own"
         why = "is taken, perhaps by another ftlm app" if taken else f"cannot be used ({error.strerror})"
-        raise DataError(f"--port {wanted} {why}; take another one, or leave it out") from None
+        raise DataError(f"{setting('port')} {wanted} {why}; take another one, or leave it out") from None
     return sock, ""
 
 
@@ -471,7 +472,8 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     sock, note = open_socket(port)
     if note:
         print(f"ftlm: {note}", file=sys.stderr)
-    with sock, contextlib.suppress(KeyboardInterrupt):
+    # The page turns parameters of Python into labels of its fields.
+    with sock, use_interface("python"), contextlib.suppress(KeyboardInterrupt):
         asyncio.run(_serve(sock, paths, browser))
     print("\nftlm app has ended; its files are removed", file=sys.stderr)
 

@@ -14,6 +14,7 @@ from ftlm.structure.equation import Equation, Friction, Stribeck, Term
 from ftlm.structure.order import Order
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Hints, Structure, check_offset
+from ftlm.utils.parameters import choose_text, parameter, setting
 from ftlm.utils.validation import short_repr
 
 
@@ -128,15 +129,15 @@ def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Fo
     if form is None:
         form = "lagrange" if input_order is None else "published"
     if form not in ("lagrange", "published"):
-        raise ModelError(f"form = {form!r} is not known; use 'lagrange' or 'published'")
+        raise ModelError(f"{setting('form')} {form!r} is not known; use 'lagrange' or 'published'")
     if form == "lagrange" and input_order is not None:
         raise ModelError(
-            f"input_order = {input_order!r} is not used by form='lagrange', whose deflection does not see the current; "
-            "leave it out, or use form='published'"
+            f"{setting('input_order')} {input_order!r} is not used by {parameter('form', 'lagrange')}, whose "
+            f"deflection does not see the current; leave it out, or use {parameter('form', 'published')}"
         )
     input_order = input_order or "published"
     if input_order not in ("published", "derived"):
-        raise ModelError(f"input_order = {input_order!r} is not known; use 'published' or 'derived'")
+        raise ModelError(f"{setting('input_order')} {input_order!r} is not known; use 'published' or 'derived'")
     return form, input_order
 
 
@@ -173,7 +174,7 @@ def order_law(
         A stage that is neither 1 nor 2, a form or an input order that is not known or not of that form.
     """
     if stage not in (1, 2):
-        raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
+        raise ModelError(f"{setting('stage')} {stage!r} is not known; use 1, 2 or 'both'")
     form, input_order = _resolve_form(form, input_order)
     h, d = 2 * stage - 1, 2 * stage
     law = {
@@ -299,23 +300,32 @@ def flexible_link(
     Under ``"velocities"`` the unit does not matter.
     """
     if stage not in (1, 2, "both"):
-        raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
+        raise ModelError(f"{setting('stage')} {stage!r} is not known; use 1, 2 or 'both'")
     form, input_order = _resolve_form(form, input_order)
     for law in laws:
         if law not in LAW_NAMES:
             raise ModelError(f"law {law!r} is not known; use 'orders', 'coefficients', both or ()")
     if "velocities" in laws and (form != "lagrange" or "orders" not in laws):
+        both = choose_text("laws=('orders', …)", "--laws orders")
         raise ModelError(
-            "law 'velocities' ties two orders of form='lagrange' under the order law; use it with laws=('orders', …)"
+            f"law 'velocities' ties two orders of {parameter('form', 'lagrange')} under the order law; use it with "
+            f"{both}"
         )
     if cross_stage not in (False, True, "torques", "inertial"):
-        raise ModelError(f"cross_stage = {cross_stage!r} is not known; use False, 'torques' or 'inertial'")
+        raise ModelError(f"{setting('cross_stage')} {cross_stage!r} is not known; use False, 'torques' or 'inertial'")
     if cross_stage == "inertial" and form != "lagrange":
-        raise ModelError("cross_stage='inertial' follows from the energies, as form='lagrange' does; use that form")
+        raise ModelError(
+            f"{parameter('cross_stage', 'inertial')} follows from the energies, as {parameter('form', 'lagrange')} "
+            "does; use that form"
+        )
     if parameters not in PARAMETER_SETS:
-        raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETER_SETS))}")
+        raise ModelError(
+            f"{setting('parameters')} {parameters!r} is not known; use {' or '.join(map(repr, PARAMETER_SETS))}"
+        )
     if not (isinstance(friction, bool) or friction in ("coulomb", "stribeck")):
-        raise ModelError(f"friction = {short_repr(friction)} is not known; use False, 'coulomb' or 'stribeck'")
+        raise ModelError(
+            f"{setting('friction')} {short_repr(friction)} is not known; use False, 'coulomb' or 'stribeck'"
+        )
     flags = {"cross_sensitivity": cross_sensitivity, "cross_damping": cross_damping, "hub": hub}
     for name, flag in flags.items():
         if not isinstance(flag, bool):
@@ -324,24 +334,25 @@ def flexible_link(
         coupling = "measured" if form == "lagrange" else "simulated"
     if friction == "stribeck" and coupling != "simulated":
         raise ModelError(
-            "friction='stribeck' is of the velocity that the model gives; use coupling='simulated', or "
-            "friction='coulomb'"
+            f"{parameter('friction', 'stribeck')} is of the velocity that the model gives; use "
+            f"{parameter('coupling', 'simulated')}, or {parameter('friction', 'coulomb')}"
         )
     if friction and coupling == "simulated" and form != "lagrange":
         raise ModelError(
-            "friction=True with coupling='simulated' follows hubs of form='lagrange', where it does not enter the "
-            "links' equations; use that form, or coupling='measured', whose friction has the sign of the measured "
-            "velocity"
+            f"{parameter('friction', True)} with {parameter('coupling', 'simulated')} follows hubs of "
+            f"{parameter('form', 'lagrange')}, where it does not enter the links' equations; use that form, or "
+            f"{parameter('coupling', 'measured')}, whose friction has the sign of the measured velocity"
         )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(
-            "hub=False leaves the deflection to the measured hub: it needs form='lagrange' and coupling='measured', "
-            "and knows no friction=True"
+            f"{parameter('hub', False)} leaves the deflection to the measured hub: it needs "
+            f"{parameter('form', 'lagrange')} and {parameter('coupling', 'measured')}, and knows no "
+            f"{parameter('friction', True)}"
         )
     if cross_damping and (cross_stage != "inertial" or coupling == "simulated"):
         raise ModelError(
-            "cross_damping=True follows the other deflection as it was measured; use it with cross_stage='inertial' "
-            "and coupling='measured'"
+            f"{parameter('cross_damping', True)} follows the other deflection as it was measured; use it with "
+            f"{parameter('cross_stage', 'inertial')} and {parameter('coupling', 'measured')}"
         )
     stages: tuple[int, ...] = (1, 2) if stage == "both" else (stage,)
     equations: list[Equation] = []
@@ -381,7 +392,7 @@ def flexible_link(
         seen = {s for e in equations for s in e.signals}
         sensor_filter = SensorFilter.low_pass([s for s in ("theta12", "theta22") if s in seen])
     if not (sensor_filter is None or isinstance(sensor_filter, SensorFilter)):
-        raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or a SensorFilter")
+        raise ModelError(f"{setting('sensor_filter')} {sensor_filter!r} is not known; use 'stock' or a SensorFilter")
     structure = Structure(
         equations=tuple(equations),
         coupling=coupling,

@@ -17,7 +17,7 @@ from typer import Argument, Option
 from ftlm import _core
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.cli.framework import command, numbers, parse_numbers, print_text, show
-from ftlm.cli.options import Files, Force, Json, Number, ReadingOptions, Text, Texts
+from ftlm.cli.options import Files, Force, Json, Number, ReadingOptions, Text, Texts, given_fields
 from ftlm.errors import ModelError
 from ftlm.estimation.linear import Streaming
 from ftlm.progress import Progress
@@ -25,6 +25,7 @@ from ftlm.rig import recording as experiment
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.quanser import driver_state
 from ftlm.structure.parser import equation
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import available_threads
 from ftlm.validation.data_advice import inspect_run
 
@@ -40,7 +41,7 @@ _READER_PACKAGES = {
 @command
 def open_(
     *,
-    file: Annotated[str, Argument(metavar="FILE", help="Any measured file.")],
+    file: Annotated[str, Argument(metavar="FILE", help="Measured file.")],
     reading: ReadingOptions,
     as_json: Json = False,
 ) -> None:
@@ -94,24 +95,21 @@ def _installed_version(package: str) -> str | None:
 class LiveOptions:
     """Options of the identification during a recording."""
 
-    live: Annotated[Text, Option(metavar="STRUCTURE", help="Identify meanwhile: flexible-link:1, :2, an equation.")] = (
-        None
-    )
-    orders: Annotated[
-        Texts, Option("--order", metavar="NAME=VALUE", help="Orders of --live; default the arm's own.")
+    live: Annotated[
+        Text, Option(metavar="STRUCTURE", help="Identify while recording: flexible-link:1, :2, an equation.")
     ] = None
-    p: Annotated[int | None, Option(help="Innovation length of --live; default 7.")] = None
-    k0: Annotated[Number, Option(help="Prior covariance of --live; default 1.")] = None
+    orders: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix an order of --live; default the arm's.")] = None
+    innovation_length: Annotated[int | None, Option(help="Innovation length of --live; default 7.")] = None
+    prior_covariance: Annotated[Number, Option(help="Prior covariance of --live; default 1.")] = None
 
     def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
         """Return the streaming estimator for a rate [Hz] and a longest run [s]; None if not requested."""
         if self.live is None:
-            given = {"--order": bool(self.orders), "--p": self.p is not None, "--k0": self.k0 is not None}
-            useless = [option for option, is_given in given.items() if is_given]
+            useless = [parameter(name) for name in given_fields(self)]
             if useless:
                 raise ModelError(f"{', '.join(useless)}: of --live, which is not given; leave out, or give --live")
             return None
-        free = numbers("--order", self.orders)
+        free = numbers("--orders", self.orders)
         if self.live.startswith("flexible-link:"):
             stages: dict[str, Literal[1, 2]] = {"1": 1, "2": 2}
             stage = stages.get(self.live.removeprefix("flexible-link:"))
@@ -130,39 +128,41 @@ class LiveOptions:
             structure.with_orders(free),
             step=1.0 / rate,
             longest=limit + 1.0,
-            innovation_length=7 if self.p is None else self.p,
-            prior_covariance=1.0 if self.k0 is None else self.k0,
+            innovation_length=7 if self.innovation_length is None else self.innovation_length,
+            prior_covariance=1.0 if self.prior_covariance is None else self.prior_covariance,
         )
 
 
 @command
 def record(
     *,
-    out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Run to write, .csv or .parquet.")],
-    rig: Annotated[str, Option(help="virtual or q8.")] = "virtual",
+    out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Write the run to this .csv or .parquet file.")],
+    rig: Annotated[str, Option(help="Rig: virtual or q8.")] = "virtual",
     shape: Annotated[str, Option("--input", help="square, sine, chirp, multisine, prbs, doublet or csv.")] = "square",
     amplitude: Annotated[
-        str, Option(metavar="A or A1:A2", help="Largest current [A] of both motors, or of each.")
+        str, Option(metavar="A or A1:A2", help="Amplitude of the current [A], of both motors or each.")
     ] = "0.3",
-    period: Annotated[Number, Option(help="Period [s]; of a prbs its clock.")] = None,
-    band: Annotated[str, Option(metavar="LOW:HIGH", help="Of chirp and multisine [Hz].")] = "0.1:20",
+    period: Annotated[Number, Option(help="Period, or clock of a prbs [s].")] = None,
+    band: Annotated[str, Option(metavar="LOW:HIGH", help="Frequency band of chirp and multisine [Hz].")] = "0.1:20",
     ramp: Annotated[float, Option(help="Time over which the amplitude grows [s].")] = 0.0,
     file: Annotated[Text, Option(help="Currents I1, I2 [A] for --input csv.")] = None,
     duration: Annotated[float, Option(help="Length of the run [s].")] = 10.0,
-    limit: Annotated[float, Option(help="Longest run that is allowed [s], at most 600.")] = 30.0,
-    rate: Annotated[float, Option(help="Samples per second.")] = 500.0,
-    seed: Annotated[int, Option(min=0, help="Of noise and random inputs.")] = 0,
+    limit: Annotated[float, Option(help="Longest permitted run, at most 600 [s].")] = 30.0,
+    rate: Annotated[float, Option(help="Sampling rate [Hz].")] = 500.0,
+    seed: Annotated[int, Option(min=0, help="Seed of noise and random inputs.")] = 0,
     parameters: Annotated[
-        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, measured-lqr, linear or a file.")
+        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, measured-lqr, linear.")
     ] = "effective",
     offset: Annotated[
-        Text, Option(metavar="A1:A2", help="Virtual arm: current that drives each motor besides its command.")
+        Text, Option(metavar="A1:A2", help="Virtual arm: current in addition to the command [A].")
     ] = None,
-    paced: Annotated[bool, Option("--real-time", help="Pace the virtual rig.")] = False,
-    stock_filter: Annotated[bool, Option("--stock-filter", help="Record behind the stock 2 Hz low-pass.")] = False,
+    real_time: Annotated[bool, Option("--real-time", help="Run the virtual rig in real time.")] = False,
+    sensor_filter: Annotated[
+        Literal["stock"] | None, Option(help="Record behind the stock 2 Hz low-pass filter; default none.")
+    ] = None,
     watchdog: Annotated[float, Option(help="Time after which the motors are stopped [s].")] = 0.1,
-    arm: Annotated[bool, Option("--arm", help="Real hardware: yes, the arm may move.")] = False,
-    card: Annotated[str, Option(help="Which Q8-USB board.")] = "0",
+    arm: Annotated[bool, Option("--arm", help="Confirm that a real arm may move.")] = False,
+    board: Annotated[str, Option(help="Identifier of the Q8-USB board.")] = "0",
     live: LiveOptions,
     force: Force = False,
     as_json: Json = False,
@@ -188,11 +188,11 @@ def record(
                 seed=seed,
                 parameters=parameters,
                 offset=None if shift is None else (shift[0], shift[1]),
-                real_time=paced,
-                sensor_filter="stock" if stock_filter else None,
+                real_time=real_time,
+                sensor_filter=sensor_filter,
                 watchdog=watchdog,
                 arm=arm,
-                board=card,
+                board=board,
                 out=out,
                 force=force,
                 live=stream,

@@ -30,10 +30,11 @@ from ftlm.model.serialization import load_model
 from ftlm.plot import matplotlib_figures as design_plots
 from ftlm.progress import Progress
 from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically
+from ftlm.utils.parameters import parameter
 
 #: Options of one design only.
 PID_OPTIONS = ("crossover", "phase_margin")
-LQG_OPTIONS = ("allowed", "effort", "drift", "noise", "measured", "band", "poles")
+LQG_OPTIONS = ("max_deviation", "max_input", "process_noise", "noise", "measured", "band", "poles")
 
 
 @command
@@ -41,61 +42,58 @@ def control(
     *,
     model: SavedModel,
     design: Annotated[
-        Literal["pid", "lqg"], Option(help="A fractional PID, or LQG: an observer (of --noise) and state feedback.")
+        Literal["pid", "lqg"], Option(help="Fractional PID, or LQG: observer and state feedback.")
     ] = "pid",
-    signal: Annotated[
-        Text, Option("--input", metavar="NAME", help="What is controlled with, if there are several.")
+    input: Annotated[Text, Option(metavar="NAME", help="Input of the loop, if the model has several.")] = None,
+    output: Annotated[
+        Text, Option(metavar="OUTPUT", help="Output that follows; with --path also a sum such as a+b.")
     ] = None,
-    output: Annotated[Text, Option(metavar="NAME", help="What follows the reference, if there are several.")] = None,
-    crossover: Annotated[Number, Option(help="Of the PID: where the loop's gain is 1 [rad/s].")] = None,
-    phase_margin: Annotated[Number, Option(help="Of the PID: there [degrees]; default 60.")] = None,
-    allowed: Annotated[
-        Texts, Option(metavar="OUTPUT=A", help="Of LQG: a deviation as dear as --effort; sums such as a+b, too.")
+    crossover: Annotated[Number, Option(help="PID: gain crossover frequency [rad/s].")] = None,
+    phase_margin: Annotated[Number, Option(help="PID: phase margin [degrees]; default 60.")] = None,
+    max_deviation: Annotated[
+        Texts, Option(metavar="OUTPUT=A", help="LQG: acceptable deviation of an output or a sum such as a+b.")
     ] = None,
-    effort: Annotated[Number, Option(help="Of LQG: of the input, in its unit.")] = None,
-    drift: Annotated[
-        Number, Option(help="Of LQG: what is unknown of the input walks so far in a second; default effort/5.")
+    max_input: Annotated[Number, Option(help="LQG: acceptable input, in its unit.")] = None,
+    process_noise: Annotated[
+        Number, Option(help="LQG: drift of the unknown input per second; default max-input/5.")
     ] = None,
     noise: Noise = None,
-    measured: Annotated[Texts, Option(metavar="OUTPUT", help="Of LQG: an output it reads; default all.")] = None,
+    measured: Annotated[Texts, Option(metavar="OUTPUT", help="LQG: measured output; default all.")] = None,
     band: Annotated[
-        Text, Option(metavar="LOW:HIGH", help="Of LQG: where its poles stand for the model [rad/s].")
+        Text, Option(metavar="LOW:HIGH", help="LQG: band in which its poles match the model [rad/s].")
     ] = None,
-    poles: Annotated[int | None, Option(help="Of LQG: their number; default what makes them good.")] = None,
-    rate: Annotated[float, Option(help="Of the loop [Hz].")] = 500.0,
-    limit: Annotated[Number, Option(help="Largest command.")] = None,
-    move: Annotated[
-        Text, Option(metavar="SIZE:SECONDS", help="Plan a smooth move of --of along which the loop leads it.")
+    poles: Annotated[int | None, Option(help="LQG: number of poles; default chosen by accuracy.")] = None,
+    rate: Annotated[float, Option(help="Sampling rate of the loop [Hz].")] = 500.0,
+    limit: Annotated[Number, Option(help="Largest command; default none.")] = None,
+    path: Annotated[Text, Option(metavar="SIZE:SECONDS", help="Plan a smooth move of --output of this size.")] = None,
+    trajectory: Annotated[
+        Text, Option(metavar="FILE", help="Write reference, command and path to this .csv file.")
     ] = None,
-    of: Annotated[
-        Text, Option(metavar="OUTPUTS", help="What moves so, such as theta11+theta12; default --output.")
-    ] = None,
-    plan: Annotated[
-        Text, Option(metavar="FILE", help="Its reference, row by row, with command and path, .csv.")
-    ] = None,
-    samples: Annotated[int, Option(help="Of the model's numbers, from their covariance, to be judged.")] = 100,
-    seed: Annotated[int, Option(min=0, help="Of these samples.")] = 0,
-    out: Annotated[Text, Option("-o", "--out", metavar="FILE", help="Controller to write, .json.")] = None,
+    samples: Annotated[int, Option(help="Parameter samples on which the design is checked.")] = 100,
+    seed: Annotated[int, Option(min=0, help="Seed of these samples.")] = 0,
+    out: Annotated[Text, Option("-o", "--out", metavar="FILE", help="Write the controller to this .json file.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Design a controller on a model: margins, their ranges over the model's uncertainty, controller file."""
     given = dict(locals())
-    check_free(out, plan, force=force, words=COMMAND_MESSAGES)
+    check_free(out, trajectory, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".json")
-    check_ending(plan, ".csv")
-    if plan is not None and move is None:
-        raise ModelError("--plan is of a move; give --move SIZE:SECONDS")
-    if of is not None and move is None:
-        raise ModelError("--of is of a move; give --move SIZE:SECONDS")
+    check_ending(trajectory, ".csv")
+    if trajectory is not None and path is None:
+        raise ModelError("--trajectory is of a move; give --path SIZE:SECONDS")
     wrong = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if given[n] not in (None, [])]
     if wrong:
         other = "lqg" if design == "pid" else "pid"
-        shown = ", ".join("--" + n.replace("_", "-") for n in wrong)
+        shown = ", ".join(map(parameter, wrong))
         raise ModelError(f"{shown}: of --design {other}, not used with {design}; leave out what is not meant")
     loaded = load_model(model)
     most = np.inf if limit is None else limit
-    common: dict[str, Any] = {"input": signal, "output": output, "rate": rate, "samples": samples, "seed": seed}
+    # A sum moves along the path; the loop itself has one output.
+    followed = output
+    if path is not None and output is not None and "+" in output:
+        followed = output.partition("+")[0].strip() if design == "pid" else None
+    common: dict[str, Any] = {"input": input, "output": followed, "rate": rate, "samples": samples, "seed": seed}
     found: designs.PidDesign | designs.LqgDesign
     running: designs.DiscretePid | designs.Lqg
     if design == "pid":
@@ -107,17 +105,17 @@ def control(
         )
         running = designs.DiscretePid(found.pid, rate, limit=most)
     else:
-        if effort is None or not allowed:
+        if max_input is None or not max_deviation:
             raise ModelError(
-                "--allowed OUTPUT=A and --effort A are missing: which deviations are as dear as which input"
+                "--max-deviation OUTPUT=A and --max-input A are missing: which deviations weigh as much as which input"
             )
         low_high = None if band is None else parse_numbers("--band", band, 2)
         announce_design(design, samples)
         found = designs.lqg(
             loaded,
-            max_deviation=numbers("--allowed", allowed),
-            max_input=effort,
-            process_noise=drift,
+            max_deviation=numbers("--max-deviation", max_deviation),
+            max_input=max_input,
+            process_noise=process_noise,
             noise=numbers("--noise", noise) or None,
             measured=measured or None,
             limit=most,
@@ -127,37 +125,41 @@ def control(
         )
         running = found.controller
     planned = None
-    if move is not None:
-        size, seconds = parse_numbers("--move", move, 2)
-        path = designs.point_to_point(size, seconds, rate)
+    if path is not None:
+        size, seconds = parse_numbers("--path", path, 2)
         told = found.plants[0].output if design == "pid" else running.tracked  # type: ignore[union-attr]
         planned = designs.inverse_dynamics(
-            found, path, output=of or told, limit=most, samples=min(samples, 40), seed=seed
+            found,
+            designs.point_to_point(size, seconds, rate),
+            output=output or told,
+            limit=most,
+            samples=min(samples, 40),
+            seed=seed,
         )
     if out is not None:
         designs.save_controller(running, out, model=f"{loaded.structure.name} ({Path(model).name})", force=force)
-    if plan is not None and planned is not None:
-        _write_trajectory(planned, rate, plan, force=force)
+    if trajectory is not None and planned is not None:
+        _write_trajectory(planned, rate, trajectory, force=force)
     if as_json:
         show_json(found.to_dict() | {"planned": None if planned is None else planned.to_dict()})
         return
     for line in (found, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
         print_text(str(line))
-    say_written(out, plan)
+    say_written(out, trajectory)
 
 
 @command
-def shape(
+def input_shaper(
     *,
     model: SavedModel,
-    kind: Annotated[Literal["zv", "zvd"], Option(help="zvd bears an error of the pole, at twice the delay.")] = "zv",
-    modes: Annotated[int, Option(help="How many modes, the least damped first.")] = 1,
+    kind: Annotated[Literal["zv", "zvd"], Option(help="zvd tolerates pole errors, at twice the delay.")] = "zv",
+    modes: Annotated[int, Option(help="Number of modes, the least damped first.")] = 1,
     coupling: Annotated[
         Literal["simulated", "measured"], Option(help="Poles of the equations together, or of each alone.")
     ] = "simulated",
-    rate: Annotated[float, Option(help="Of the reference [Hz].")] = 500.0,
+    rate: Annotated[float, Option(help="Sampling rate of the reference [Hz].")] = 500.0,
     out: Annotated[
-        Text, Option("-o", "--out", metavar="FILE", help="Its samples to write, .csv: convolve a reference with them.")
+        Text, Option("-o", "--out", metavar="FILE", help="Write its impulse response to this .csv file.")
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -195,52 +197,52 @@ def _write_table(rows: np.ndarray[Any, Any], names: tuple[str, ...], path: str, 
 def design_input(
     *,
     model: SavedModel,
-    like: Annotated[
-        Text, Option(metavar="FILE", help="A run that the machine bore: what is not said is as in it.")
+    reference_run: Annotated[
+        Text, Option(metavar="FILE", help="Admissible run, whose limits and step are the defaults.")
     ] = None,
     reading: ReadingOptions,
     duration: Annotated[Number, Option(help="Length of the run [s].")] = None,
     peak: Annotated[
-        Texts, Option(metavar="A or INPUT=A", help="Largest size of each input, or of one of several.")
+        Texts, Option(metavar="A or INPUT=A", help="Largest absolute value of each input, or of one.")
     ] = None,
     slew: Annotated[
-        Texts, Option(metavar="A or INPUT=A", help="Fastest change of an input, a second; default none.")
+        Texts, Option(metavar="A or INPUT=A", help="Largest rate of change of an input [1/s]; default none.")
     ] = None,
-    limits: Annotated[
-        Texts, Option("--limit", metavar="OUTPUT=A", help="Largest size of an output, in the model's units; or inf.")
-    ] = None,
-    names: Annotated[
-        Texts, Option("--for", metavar="NAME", help="A number to be told; default every free order.")
+    limits: Annotated[Texts, Option(metavar="OUTPUT=A", help="Largest absolute value of an output, or inf.")] = None,
+    parameters: Annotated[
+        Texts, Option(metavar="NAME", help="Parameter of interest; default every free order.")
     ] = None,
     criterion: Annotated[
-        Literal["D", "E"], Option(help="D: all their intervals together; E: the widest of them.")
+        Literal["D", "E"], Option(help="Criterion: D (all intervals together) or E (the widest).")
     ] = "D",
     noise: Noise = None,
-    period: Annotated[Number, Option(help="Of the square set beside it [s]; default a fifth of the duration.")] = None,
-    seed: Annotated[int, Option(min=0, help="Of random inputs to begin with.")] = 0,
-    out: Annotated[
-        Text, Option("-o", "--out", metavar="FILE", help="Run to write, .csv: ftlm record --input csv takes it.")
+    period: Annotated[
+        Number, Option(help="Period of the reference square wave [s]; default a fifth of the duration.")
     ] = None,
-    picture: Annotated[Text, Option("--plot", metavar="FILE", help="Figure to write: .png, .pdf or .svg.")] = None,
+    seed: Annotated[int, Option(min=0, help="Seed of random initial inputs.")] = 0,
+    out: Annotated[
+        Text, Option("-o", "--out", metavar="FILE", help="Write the run to this .csv file for ftlm record.")
+    ] = None,
+    plot: Annotated[Text, Option(metavar="FILE", help="Write a figure to this .png, .pdf or .svg file.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Design the input that determines the parameters best within the limits of the machine."""
-    check_free(out, picture, force=force, words=COMMAND_MESSAGES)
+    check_free(out, plot, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".csv", ", as a run for a rig does")
-    figure_kind(picture)
+    figure_kind(plot)
     loaded = load_model(model)
-    run = None if like is None else reading.runs([like])[0]
+    run = None if reference_run is None else reading.runs([reference_run])[0]
     with Progress("designing", quiet=as_json) as progress:
         found = experiment.design_input(
             loaded,
             reference_run=run,
             duration=duration,
-            step=None if like is not None else reading.sampling,
+            step=None if reference_run is not None else reading.step,
             peak=_sizes("--peak", peak),
             slew=_sizes("--slew", slew),
-            limits=numbers("--limit", limits) or None,
-            parameters=names,
+            limits=numbers("--limits", limits) or None,
+            parameters=parameters,
             criterion=criterion,
             noise=numbers("--noise", noise) or None,
             period=period,
@@ -249,11 +251,11 @@ def design_input(
         )
     if out is not None:
         found.save(out, force=force)
-    if picture is not None:
-        write_figure(design_plots.design(found), picture, force=force)
+    if plot is not None:
+        write_figure(design_plots.design(found), plot, force=force)
     show(found, as_json=as_json)
     if not as_json:
-        say_written(out, picture)
+        say_written(out, plot)
 
 
 def _sizes(option: str, given: list[str] | None) -> float | dict[str, float] | None:

@@ -7,27 +7,40 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import typer
 from typer import Argument, Option
 
 from ftlm.cli.framework import EXIT_INTERRUPTED, command, numbers, pairs, print_text, ranges, show, show_json
 from ftlm.cli.options import (
+    FILE,
+    METHOD,
+    OUTPUT,
+    STRUCTURE,
+    BlockPulses,
     CandidateTexts,
     Decimal,
+    Delay,
     Files,
+    Fixed,
     Force,
     GeneticOptions,
     HeaderLines,
     Json,
+    Loss,
+    MultiInnovationOptions,
     Number,
+    OrderGridOptions,
     Out,
+    OutputErrorOptions,
+    RankingOptions,
     ReadingOptions,
-    SearchOptions,
+    Report,
     Separator,
     Sheet,
     SkippedLines,
+    StoreFile,
     StructureOptions,
     StructureText,
     Text,
@@ -35,6 +48,7 @@ from ftlm.cli.options import (
     Thousands,
     Threads,
     Verbose,
+    given_fields,
     layout_options,
 )
 from ftlm.data.frequency_data import FrequencyData
@@ -46,7 +60,7 @@ from ftlm.estimation.frequency_domain import identify_frequency as frequency_est
 from ftlm.estimation.methods import OutputError, method_with_options
 from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
-from ftlm.order_search.certificate import certify_job, check_certifiable
+from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult
@@ -62,7 +76,7 @@ from ftlm.utils.validation import check_threads
 
 Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
 Estimator = Literal["instrumental-variables", "multi-innovation", "least-squares"]
-StoreFile = Annotated[str, Argument(metavar="STORE", help="A file written with --store.")]
+SavedStore = Annotated[str, Argument(metavar="STORE", help="Checkpoint file, written with --store.")]
 
 
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
@@ -77,32 +91,21 @@ def identify(
     *,
     files: Files,
     structure: StructureText,
-    method: Annotated[Method, Option(help="How numbers are estimated.")] = "output-error",
+    method: Annotated[Method, Option(rich_help_panel=METHOD, help="Estimation method.")] = "output-error",
     reading: ReadingOptions,
     shape: StructureOptions,
-    search: SearchOptions,
+    fit: OutputErrorOptions,
+    grid: OrderGridOptions,
+    ranking: RankingOptions,
+    weighting: MultiInnovationOptions,
     genetic: GeneticOptions,
-    loss: Annotated[
-        Literal["squares", "huber"] | None,
-        Option(help="Of output error: huber, so that outliers decide nothing; default squares."),
-    ] = None,
-    intervals: Annotated[
-        Literal["auto", "quadratic", "profile"] | None,
-        Option(help="Of output error: by profile likelihood for all numbers, or (default) where it matters."),
-    ] = None,
-    start: Annotated[
-        Text, Option(metavar="MODEL", help="Of output error: a saved model, simpler or not, to start from as well.")
-    ] = None,
+    m: BlockPulses = None,
     threads: Threads = None,
-    reference: Annotated[
-        Text, Option(metavar="SIGNAL", help="What drives a closed loop from outside; also name it with -u.")
-    ] = None,
-    store: Annotated[
-        Text, Option(metavar="FILE", help="Keep finished order searches there; the same command goes on.")
-    ] = None,
     out: Out = None,
-    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
-    validation: Annotated[Text, Option(metavar="FILE", help="Another run, to judge the model on.")] = None,
+    report: Report = None,
+    validation: Annotated[
+        Text, Option(metavar="FILE", rich_help_panel=OUTPUT, help="Validate the model on this run.")
+    ] = None,
     force: Force = False,
     verbose: Verbose = False,
     as_json: Json = False,
@@ -110,31 +113,23 @@ def identify(
     """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
     check_free(out, report, force=force, words=COMMAND_MESSAGES)
     shape.structure(structure)
-    given = {
-        "order_grid": search.lattice(),
-        "store": store,
-        "loss": loss,
-        "intervals": intervals,
-        "reference": reference,
-        "start": None if start is None else load_model(start),
-        **search.settings(),
-        **genetic.settings(),
-    }
-    options = {name: value for name, value in given.items() if value is not None}
-    chosen = method_with_options(method, options)
+    given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
+    given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
+    given |= {} if fit.start is None else {"start": load_model(fit.start)}
+    chosen = method_with_options(method, given)
     runs = reading.runs(files)
     wanted = shape.structure_for_runs(structure, runs)
-    # The slice is of the runs that are identified from.
-    others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
+    # The window is of the runs that are identified from.
+    others = replace(reading, window=None).runs([validation]) if validation is not None else []
     label = "fitting" if method == "output-error" else "searching orders"
-    with resumable(store, "the same command"), Progress(label, quiet=as_json) as progress:
+    with resumable(ranking.store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
             progress.expect("the fit", *duration_bounds(fit_seconds(runs, wanted, threads)))
         result = estimation.identify(
             runs,
             wanted,
             method=chosen,
-            m=search.m,
+            m=m,
             threads=threads,
             progress=progress,
         )
@@ -148,8 +143,7 @@ def identify(
         judged = {"verdict": result.verdict(checked).to_dict()}
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
-    # What Python has as a method, the command line has as an option.
-    print_text(result.summary(checked).replace("print(result.details())", "--verbose shows all"))
+    print_text(result.summary(checked))
     if verbose:
         print_text(f"\n{result.details()}")
     if verbose and checked is not None:
@@ -164,20 +158,16 @@ def search(
     *,
     files: Files,
     structure: StructureText,
-    coefficients: Annotated[Estimator, Option(help="How coefficients are estimated.")] = "multi-innovation",
+    coefficients: Annotated[
+        Estimator, Option(rich_help_panel=METHOD, help="Estimation method of the coefficients.")
+    ] = "multi-innovation",
     reading: ReadingOptions,
     shape: StructureOptions,
-    options: SearchOptions,
+    grid: OrderGridOptions,
+    ranking: RankingOptions,
+    weighting: MultiInnovationOptions,
+    m: BlockPulses = None,
     threads: Threads = None,
-    store: Annotated[Text, Option(metavar="FILE", help="Keep finished work there; go on with ftlm resume.")] = None,
-    certify: Annotated[
-        Number,
-        Option(
-            metavar="SHARE",
-            help="Prove of orders between those of the lattice, too, that none is better by more than this share; of "
-            "squared equation errors at rest.",
-        ),
-    ] = None,
     as_json: Json = False,
 ) -> None:
     """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
@@ -185,53 +175,103 @@ def search(
     runs = reading.runs(files)
     wanted = shape.structure_for_runs(structure, runs)
     parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
-    lattice = options.lattice() or OrderGrid()
-    check_order_names(lattice, wanted)
-    settings = SearchSettings(coefficients=coefficients, **options.settings())
+    every = grid.grid() or OrderGrid()
+    check_order_names(every, wanted)
+    given = given_fields(replace(grid, order_grid=None, increment=None), replace(ranking, store=None), weighting)
+    settings = SearchSettings(coefficients=coefficients, **given)
     results = {}
-    with resumable(store), contextlib.ExitStack() as stack:
+    with resumable(ranking.store), contextlib.ExitStack() as stack:
         jobs = {
             name: make_job(
                 runs,
                 part,
-                restrict_grid(lattice, part),
+                restrict_grid(every, part),
                 settings,
-                m=options.m,
+                m=m,
                 threads=threads,
             )
             for name, part in parts.items()
         }
-        if certify is not None:
-            for job in jobs.values():
-                check_certifiable(job, certify)
         kept = None
-        if store is not None:
-            kept = stack.enter_context(Store(store, [job.request(name) for name, job in jobs.items()]))
+        if ranking.store is not None:
+            kept = stack.enter_context(Store(ranking.store, [job.request(name) for name, job in jobs.items()]))
             show_notes(kept)
         announce_time(Progress("", quiet=as_json), list(jobs.values()), kept)
         for number, (name, job) in enumerate(jobs.items()):
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
-            if certify is not None:
-                with Progress(f"proving what lies between of {name}", quiet=as_json) as progress:
-                    proved = certify_job(
-                        job, tolerance=certify, min_separation=lattice.increment, progress=progress.so_far
-                    )
-                results[name] = replace(results[name], certificate=proved)
     show_searches(results, as_json=as_json)
 
 
-def check_order_names(lattice: OrderGrid, structure: Structure) -> None:
+@command
+def certify(
+    *,
+    files: Files,
+    structure: StructureText,
+    reading: ReadingOptions,
+    shape: StructureOptions,
+    order_grid: Annotated[
+        Texts,
+        Option(metavar="NAME=LOW:HIGH:STEP", rich_help_panel=METHOD, help="Interval of an order; alpha: every alpha."),
+    ] = None,
+    increment: Annotated[
+        Number, Option(rich_help_panel=METHOD, help="Increment of the order grid; default 0.05.")
+    ] = None,
+    tolerance: Annotated[
+        float, Option(rich_help_panel=METHOD, help="How much smaller other errors may be, as a fraction.")
+    ] = DEFAULT_TOLERANCE,
+    min_separation: Annotated[
+        Number, Option(rich_help_panel=METHOD, help="Minimum distance of orders; default the increment.")
+    ] = None,
+    max_term_ratio: Annotated[
+        float, Option(rich_help_panel=METHOD, help="Maximum RMS of an equation's terms per RMS of its output.")
+    ] = DEFAULT_MAX_TERM_RATIO,
+    max_cells: Annotated[
+        int, Option(rich_help_panel=METHOD, help="Maximum number of boxes of orders.")
+    ] = DEFAULT_MAX_CELLS,
+    m: BlockPulses = None,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Prove a lower bound of the squared equation error of each equation at rest, over all orders in intervals."""
+    shape.structure(structure)
+    runs = reading.runs(files)
+    wanted = shape.structure_for_runs(structure, runs)
+    every = OrderGridOptions(order_grid=order_grid, increment=increment).grid() or OrderGrid()
+    check_order_names(every, wanted)
+    results = {}
+    for item in wanted.equations:
+        part = wanted.equation(item.output)
+        with Progress(f"certifying orders of {item.output}", quiet=as_json) as progress:
+            results[item.output] = certify_orders(
+                runs,
+                part,
+                restrict_grid(every, part),
+                tolerance=tolerance,
+                min_separation=min_separation,
+                max_term_ratio=max_term_ratio,
+                max_cells=max_cells,
+                m=m,
+                threads=threads,
+                progress=progress.so_far,
+            )
+    if as_json:
+        show_json({name: result.to_dict() for name, result in results.items()})
+    else:
+        print_text("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
+
+
+def check_order_names(grid: OrderGrid, structure: Structure) -> None:
     """Raise for an order of the grid that is not free in any equation."""
-    for name in lattice.orders:
+    for name in grid.orders:
         if name not in {"alpha", *structure.order_names}:
             free = ", ".join(structure.order_names) or "none"
-            raise ModelError(f"--lattice {name!r} is no free order; free are {free}")
+            raise ModelError(f"--order-grid {name!r} is no free order; free are {free}")
 
 
-def restrict_grid(lattice: OrderGrid, part: Structure) -> OrderGrid:
+def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:
     """Return the part of an order grid that concerns one structure."""
-    return replace(lattice, orders={n: v for n, v in lattice.orders.items() if n == "alpha" or n in part.order_names})
+    return replace(grid, orders={n: v for n, v in grid.orders.items() if n == "alpha" or n in part.order_names})
 
 
 def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None:
@@ -263,16 +303,16 @@ def show_notes(store: Store) -> None:
 @command
 def resume(
     *,
-    store: StoreFile,
-    salvage: Annotated[
-        bool, Option("--salvage", help="Go on with a damaged store; the damaged file is kept beside it.")
+    store: SavedStore,
+    recover: Annotated[
+        bool, Option("--recover", help="Continue a corrupt file; the corrupt one is kept beside it.")
     ] = False,
     threads: Threads = None,
     as_json: Json = False,
 ) -> None:
     """Resume the searches of a checkpoint file and print them; no other file is needed."""
     results = {}
-    with resumable(store), Store(store, recover=salvage) as kept:
+    with resumable(store), Store(store, recover=recover) as kept:
         show_notes(kept)
         told = Progress("", quiet=as_json)
         if not told.quiet:
@@ -284,7 +324,7 @@ def resume(
 
 
 @command
-def status(*, store: StoreFile, as_json: Json = False) -> None:
+def status(*, store: SavedStore, as_json: Json = False) -> None:
     """Print the progress of the searches of a checkpoint file, which may be in use."""
     states = search_status(store)
     if as_json:
@@ -297,29 +337,26 @@ def status(*, store: StoreFile, as_json: Json = False) -> None:
 class ResponseOptions:
     """Options for reading frequency responses; None for an option that is not given."""
 
+    panel: ClassVar[str] = FILE
+
     columns: Annotated[
-        Texts,
-        Option(
-            "--column",
-            metavar="PART=COLUMN",
-            help="Column of frequency, real, imag, magnitude, phase or deviation; default by their names.",
-        ),
+        Texts, Option(metavar="PART=COLUMN", help="Column of frequency, real, imag, magnitude, phase, deviation.")
     ] = None
-    frequency_unit: Annotated[
-        Text, Option("--frequency-unit", metavar="UNIT", help="Hz, kHz, MHz, mHz or rad/s; default what is stated.")
-    ] = None
+    frequency_unit: Annotated[Text, Option(metavar="UNIT", help="Hz, kHz, MHz, mHz or rad/s; default the file's.")] = (
+        None
+    )
     magnitude_unit: Annotated[
-        Literal["dB", "abs"] | None, Option("--magnitude-unit", help="Of sizes; default what is stated, or abs.")
+        Literal["dB", "abs"] | None, Option(help="Unit of magnitudes; default the file's, or abs.")
     ] = None
-    phase_unit: Annotated[
-        Literal["deg", "rad"] | None, Option("--phase-unit", help="Of phases; default what is stated, or deg.")
-    ] = None
+    phase_unit: Annotated[Literal["deg", "rad"] | None, Option(help="Unit of phases; default the file's, or deg.")] = (
+        None
+    )
     negated: Annotated[
         bool | None,
         Option("--negated/--not-negated", help="Whether the imaginary column holds -Z''; default by its name."),
     ] = None
-    output: Annotated[Text, Option("-y", "--output", metavar="NAME", help="What the response is of.")] = None
-    input: Annotated[Text, Option("-u", "--input", metavar="NAME", help="What it is from.")] = None
+    output: Annotated[Text, Option("-y", "--output", metavar="NAME", help="Output of the response.")] = None
+    input: Annotated[Text, Option("-u", "--input", metavar="NAME", help="Input of the response.")] = None
     separator: Separator = None
     decimal: Decimal = None
     thousands: Thousands = None
@@ -329,7 +366,7 @@ class ResponseOptions:
 
     def load(self, file: str) -> FrequencyData:
         """Load one file."""
-        columns: dict[str, Any] | None = pairs("--column", self.columns) or None
+        columns: dict[str, Any] | None = pairs("--columns", self.columns) or None
         return load_frequency(
             file,
             columns=columns,
@@ -347,21 +384,32 @@ class ResponseOptions:
 def identify_frequency(
     *,
     files: Annotated[list[str], Argument(metavar="FILE...", help="Frequency responses or impedance spectra.")],
-    structure: Annotated[str, Option(metavar="EQUATION", help="Equation in words, such as D^alpha y = a0 y + b0 u.")],
+    structure: Annotated[
+        str,
+        Option(
+            metavar="EQUATION", rich_help_panel=STRUCTURE, help="Equation in words, such as D^alpha y = a0 y + b0 u."
+        ),
+    ],
     weights: Annotated[
         Literal["auto", "relative", "uniform", "deviation"],
-        Option(help="relative to the size, uniform, or by stated deviations; auto: those where there are some."),
+        Option(rich_help_panel=METHOD, help="Weights; auto: deviations if the file has them."),
     ] = "auto",
     reading: ResponseOptions,
-    orders: Annotated[Texts, Option("--order", metavar="NAME=VALUE", help="Fix an order, or LOW:HIGH:STEP.")] = None,
-    fixed: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix a coefficient.")] = None,
-    delay: Annotated[Texts, Option(metavar="INPUT=SECONDS", help="Delay of an input; LEAST:LARGEST is estimated.")] = (
-        None
-    ),
-    start: Annotated[Texts, Option(metavar="NAME=VALUE", help="Value of a free number to start from besides.")] = None,
+    orders: Annotated[
+        Texts,
+        Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE, help="Fix an order, or give LOW:HIGH:STEP."),
+    ] = None,
+    fixed: Fixed = None,
+    delay: Delay = None,
+    start: Annotated[
+        Texts,
+        Option(metavar="NAME=VALUE", rich_help_panel=METHOD, help="Additional initial guess of a free parameter."),
+    ] = None,
     out: Out = None,
-    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
-    validation: Annotated[Text, Option(metavar="FILE", help="Another response, to judge the model on.")] = None,
+    report: Report = None,
+    validation: Annotated[
+        Text, Option(metavar="FILE", rich_help_panel=OUTPUT, help="Validate the model on this response.")
+    ] = None,
     force: Force = False,
     verbose: Verbose = False,
     as_json: Json = False,
@@ -376,7 +424,7 @@ def identify_frequency(
             records,
             structure,
             weights=weights,
-            orders=dict(pairs("--order", orders)),
+            orders=dict(pairs("--orders", orders)),
             fixed=numbers("--fixed", fixed),
             delay=ranges("--delay", delay),
             start=numbers("--start", start) or None,
@@ -391,7 +439,7 @@ def identify_frequency(
         judged = {"verdict": result.verdict(checked).to_dict()}
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
-    print_text(result.summary(checked).replace("result.warnings", "--verbose shows all"))
+    print_text(result.summary(checked))
     if verbose:
         print_text("\n".join(f"warning: {w}" for w in result.warnings))
 
@@ -411,15 +459,14 @@ def select(
         Text,
         Option(
             metavar="runs|blocks|FILE",
-            help="Judge each run, or each quarter of every run, by the others; or by a run that nothing is fitted to.",
+            rich_help_panel=METHOD,
+            help="Cross-validate over runs or quarters, or on another run.",
         ),
     ] = None,
     threads: Threads = None,
-    store: Annotated[
-        Text, Option(metavar="FILE", help="Keep every fit there; the same command goes on with it.")
-    ] = None,
+    store: StoreFile = None,
     out: Out = None,
-    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
+    report: Report = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -439,9 +486,9 @@ def select(
     if structures != ["auto"]:
         made = [shape.structure_for_runs(text, runs) for text in structures]
         candidates = made[0] if len(made) == 1 else made
-    # The slice is of the runs that are fitted to.
+    # The window is of the runs that are fitted to.
     of_its_own = validation not in (None, "runs", "blocks")
-    judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation
+    judges = replace(reading, window=None).runs([str(validation)]) if of_its_own else validation
     with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
         tried = [candidates] if isinstance(candidates, Structure) else candidates
         grown = automatic_structures(runs) if isinstance(tried, str) else tried
@@ -459,20 +506,18 @@ def select(
 
 
 @command
-def agreement(
+def consistency(
     *,
     files: Files,
     structure: StructureText,
     reading: ReadingOptions,
     shape: StructureOptions,
-    parts: Annotated[
-        int | None, Option(help="Parts that one run is cut into, by default 2; several runs are parts by themselves.")
+    segments: Annotated[
+        int | None, Option(rich_help_panel=METHOD, help="Segments of one run; several runs are segments; default 2.")
     ] = None,
-    loss: Annotated[
-        Literal["squares", "huber"] | None, Option(help="huber, so that outliers decide nothing; default squares.")
-    ] = None,
+    loss: Loss = None,
     threads: Threads = None,
-    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
+    report: Report = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -482,10 +527,12 @@ def agreement(
     runs = reading.runs(files)
     wanted = shape.structure_for_runs(structure, runs)
     method = OutputError() if loss is None else OutputError(loss=loss)
-    with Progress("fitting parts", quiet=as_json) as progress:
-        count = max(parts or 0, 2) if len(runs) == 1 else len(runs)
-        progress.expect("fitting all parts", *duration_bounds(fit_seconds(runs, wanted, threads, count)))
-        found = parts_of_runs.consistency(runs, wanted, parts=parts, method=method, threads=threads, progress=progress)
+    with Progress("fitting segments", quiet=as_json) as progress:
+        count = max(segments or 0, 2) if len(runs) == 1 else len(runs)
+        progress.expect("fitting all segments", *duration_bounds(fit_seconds(runs, wanted, threads, count)))
+        found = parts_of_runs.consistency(
+            runs, wanted, segments=segments, method=method, threads=threads, progress=progress
+        )
     if report is not None:
         found.report(report, force=force)
     show(found, as_json=as_json)

@@ -1,8 +1,9 @@
-"""Compound option values: NAME=VALUE, FROM:TO, numbers joined by a colon."""
+"""Commands from functions: options from records, help in panels, compound values, errors and exit codes."""
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import inspect
 import io
@@ -13,7 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -23,125 +24,8 @@ from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.progress import Progress
 from ftlm.utils.files import write_atomically
 from ftlm.utils.formatting import columns, wrap_text
+from ftlm.utils.parameters import use_interface
 from ftlm.utils.resources import duration_bounds, estimate_duration
-
-#: Option of each Python argument, for messages.
-OPTION_BY_ARGUMENT = {
-    "method": "--method",
-    "coefficients": "--coefficients",
-    "criterion": "--criterion",
-    "norm": "--norm",
-    "order_grid": "--lattice or --step",
-    "innovation_length": "--p",
-    "prior_covariance": "--k0",
-    "row_basis": "--rows",
-    "m": "--m",
-    "top": "--keep",
-    "threads": "--threads",
-    "store": "--store",
-    "seeds": "--seed",
-    "evaluations": "--evaluations",
-    "window": "--slice",
-    "resample": "--resample",
-    "step": "--sampling",
-    "time": "--time",
-    "time_unit": "--time-unit",
-    "units": "--unit",
-    "columns": "--columns",
-    "intersample": "--intersample",
-    "inputs": "-u",
-    "outputs": "-y",
-    "coupling": "--coupling",
-    "initial": "--initial",
-    "laws": "--laws",
-    "form": "--form",
-    "input_order": "--input-order",
-    "friction": "--friction",
-    "cross_stage": "--cross-stage",
-    "cross_sensitivity": "--cross-sensitivity",
-    "cross_damping": "--cross-damping",
-    "tolerance": "--tolerance",
-    "lags": "--lags",
-    "delay": "--delay",
-    "force": "--force",
-    "offset": "--offset",
-    "reference": "--reference",
-    "start": "--start",
-    "validation": "--validation",
-    "loss": "--loss",
-    "intervals": "--intervals",
-    "missing": "--missing",
-    "encoding": "--encoding",
-    "separator": "--separator",
-    "decimal": "--decimal",
-    "skip": "--skip",
-    "thousands": "--thousands",
-    "weights": "--weights",
-    "frequency_unit": "--frequency-unit",
-    "magnitude_unit": "--magnitude-unit",
-    "phase_unit": "--phase-unit",
-    "negated": "--negated",
-    "duration": "--duration",
-    "peak": "--peak",
-    "slew": "--slew",
-    "limits": "--limit",
-    "names": "--for",
-    "noise": "--noise",
-    "period": "--period",
-    "like": "--like",
-    "crossover": "--crossover",
-    "phase_margin": "--phase-margin",
-    "effort": "--effort",
-    "drift": "--drift",
-    "allowed": "--allowed",
-    "band": "--band",
-    "poles": "--poles",
-    "samples": "--samples",
-    "rate": "--rate",
-    "measured": "--measured",
-    "limit": "--limit",
-    "input": "--input",
-    "output": "--output",
-    "of": "--of",
-    "kind": "--kind",
-    "modes_shaped": "--modes",
-    "header": "--header",
-    "dates": "--dates",
-    "sheet": "--sheet",
-}
-#: Python argument followed by its option, such as ``force=True (--force)``.
-_OPTION_HINT_PATTERN = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
-#: Call of ``slice``, whose ends an option takes joined by a colon.
-_SLICE_PATTERN = re.compile(r"\bwindow\((\S+), (?:None|(\S+?))\)")
-#: Layout argument of Python, whose keys are options.
-_LAYOUT_PATTERN = re.compile(r"layout=dict\(([^()]*)\)")
-_COMMAND_HINT_PATTERN = re.compile(r" \(commands: [^)]*\)")
-#: Python argument; ``-u m=3`` is a signal name of the user.
-_ARGUMENT_PATTERN = re.compile(
-    r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTION_BY_ARGUMENT) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])"
-)
-_BARE_ARGUMENT_PATTERN = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
-
-
-def in_options(text: str) -> str:
-    """Replace Python arguments in a message by options of the command line."""
-    text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
-    text = text.replace("columns={part: column}", "--column PART=COLUMN")
-    text = _LAYOUT_PATTERN.sub(lambda found: found[1].replace(", ", " "), text).replace("layout=: ", "")
-    text = text.replace("in a columns file", "in a file for --columns")
-    text = _SLICE_PATTERN.sub(lambda found: f"--slice {found[1]}:{found[2] or ''}", text)
-    text = _OPTION_HINT_PATTERN.sub(r"\1", _COMMAND_HINT_PATTERN.sub("", text))
-    return _BARE_ARGUMENT_PATTERN.sub(
-        lambda found: OPTION_BY_ARGUMENT[found[1]], _ARGUMENT_PATTERN.sub(_as_option, text)
-    )
-
-
-def _as_option(found: re.Match[str]) -> str:
-    before, name, quoted, bare = found.groups()
-    if before:
-        return found[0]
-    value = quoted or bare or ""
-    return OPTION_BY_ARGUMENT[name] if value in ("", "True") else f"{OPTION_BY_ARGUMENT[name]} {value}"
 
 
 def pairs(option: str, given: list[str] | None) -> dict[str, str]:
@@ -175,13 +59,13 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
 
 
 def ranges(option: str, given: list[str] | None) -> dict[str, float | tuple[float, float]]:
-    """Parse INPUT=NUMBER options, or INPUT=LEAST:LARGEST for a number to estimate."""
+    """Parse INPUT=NUMBER options, or INPUT=LOW:HIGH for a number to estimate."""
     what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, given).items():
         ends = split_numbers(value)
         if len(ends) not in (1, 2):
-            raise ModelError(f"{option} {name}={value}: {value!r} is neither {what} nor LEAST:LARGEST, as in {example}")
+            raise ModelError(f"{option} {name}={value}: {value!r} is neither {what} nor LOW:HIGH, as in {example}")
         values[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
     return values
 
@@ -235,8 +119,15 @@ TYPE_LABELS = {
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 
 
+#: Options whose value is the method that a command uses, and flag for the options of all methods.
+METHOD_FLAGS, HELP_ALL_FLAG = ("--method", "--coefficients"), "--help-all"
+#: Order of the panels in a help text; options of no panel come last.
+PANELS = ("File", "Structure", "Method", "Output")
+OTHER_PANEL = "Options"
+
+
 class Command(TyperCommand):
-    """Command that suggests the right option for a common alias, and names types in plain words."""
+    """Command with help in panels, which suggests the right option for a common alias."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
@@ -247,13 +138,56 @@ class Command(TyperCommand):
                 _type_label, told.display_type_rich, argument=told.param_type_name == "argument"
             )
 
+    @property
+    def methods_by_field(self) -> dict[str, tuple[str, ...]]:
+        """Methods that use an option, by its name; options that are not listed apply to all."""
+        return getattr(self.callback, "methods_by_field", {})
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse options; raise for an alias with the option that is meant."""
         known = {name for parameter in self.params for name in parameter.opts}
         for given in (a.partition("=")[0] for a in args):
             if given not in known and OPTION_ALIASES.get(given) in known:
                 ctx.fail(f"No such option: {given}; {OPTION_ALIASES[given]} takes equations in words, too.")
+        ctx.meta["method"] = self._chosen_method(args)
+        if HELP_ALL_FLAG in args:
+            ctx.meta["method"] = None
+            args = ["--help"]
         return super().parse_args(ctx, args)
+
+    def _chosen_method(self, args: Sequence[str]) -> str | None:
+        """Return the method of a command line, or the default one; None if the command has none."""
+        option: Any = next((p for p in self.params if not set(METHOD_FLAGS).isdisjoint(p.opts)), None)
+        if option is None:
+            return None
+        chosen = option.default
+        for word, following in zip(args, [*args[1:], ""], strict=True):
+            flag, equals, value = word.partition("=")
+            if flag in option.opts:
+                chosen = value if equals else following
+        return str(chosen)
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments and options by panel; of the options of methods those of the chosen one."""
+        method = ctx.meta.get("method")
+        panels: dict[str, list[tuple[str, str]]] = {"Arguments": [], **{name: [] for name in (*PANELS, OTHER_PANEL)}}
+        hidden = False
+        for parameter in self.get_params(ctx):
+            told: Any = parameter
+            record = told.get_help_record(ctx)
+            methods = self.methods_by_field.get(told.name)
+            if methods is not None and method is not None and method not in methods:
+                hidden = True
+            elif record is not None and told.param_type_name == "argument":
+                panels["Arguments"].append(record)
+            elif record is not None:
+                panels[getattr(told, "rich_help_panel", None) or OTHER_PANEL].append(record)
+        if self.methods_by_field:
+            panels[OTHER_PANEL].append((HELP_ALL_FLAG, "Show the options of all methods and exit."))
+        for name, records in panels.items():
+            if records:
+                with formatter.section(f"{name} of {method}" if name == "Method" and hidden else name):
+                    formatter.write_dl(records)
 
 
 def _type_label(kind: Callable[..., str], *, ctx: Any, argument: bool) -> str:
@@ -265,20 +199,28 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     """Turn a function into a command.
 
     A dataclass parameter expands to its fields: each becomes an option at that place, and the function receives the
-    dataclass. Errors become one line on standard error and an exit code.
+    dataclass. Its `panel` is that of the options in the help, its `methods` those that use them. Errors become one
+    line on standard error and an exit code.
     """
     records: dict[str, type[Any]] = {}
     options: list[inspect.Parameter] = []
+    methods_by_field: dict[str, tuple[str, ...]] = {}
     for parameter in inspect.signature(work, eval_str=True).parameters.values():
         kind = parameter.annotation
         if isinstance(kind, type) and is_dataclass(kind):
             records[parameter.name] = kind
             options += _options_of(kind)
+            if hasattr(kind, "methods"):
+                methods_by_field |= dict.fromkeys((f.name for f in fields(kind)), kind.methods)
         else:
             options.append(parameter)
 
     @functools.wraps(work)
     def run(**given: Any) -> None:
+        with use_interface("command line"):
+            execute(**given)
+
+    def execute(**given: Any) -> None:
         made = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in records.items()}
         try:
             work(**given, **made)
@@ -291,7 +233,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
         except FtlmError as error:
-            print(f"ftlm: {in_options(str(error))}", file=sys.stderr)
+            print(f"ftlm: {error}", file=sys.stderr)
             raise typer.Exit(exit_code(error)) from None
         except OSError as error:
             # Of what is printed, or of a working folder that is gone; files have sentences of their own.
@@ -308,16 +250,28 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     # What typer reads.
     run.__annotations__ = {option.name: option.annotation for option in options}
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    run.methods_by_field = methods_by_field  # type: ignore[attr-defined]
     return run
 
 
 def _options_of(record: type[Any]) -> list[inspect.Parameter]:
-    """Return the fields of a dataclass as parameters of a function."""
+    """Return the fields of a dataclass as parameters of a function, in the panel of the dataclass."""
     hints = get_type_hints(record, include_extras=True)
+    panel = getattr(record, "panel", None)
     return [
-        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+        inspect.Parameter(
+            f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=_in_panel(hints[f.name], panel)
+        )
         for f in fields(record)
     ]
+
+
+def _in_panel(hint: Any, panel: str | None) -> Any:
+    """Return an annotated type whose option stands in a panel of the help; an option may state its own."""
+    kind, option = get_args(hint)
+    placed = copy.copy(option)
+    placed.rich_help_panel = panel
+    return Annotated[kind, placed]
 
 
 def exit_code(error: FtlmError) -> int:
@@ -342,7 +296,6 @@ def print_text(text: str, end: str = "\n") -> None:
 
     Table rows and commands to copy are not wrapped.
     """
-    text = in_options(text)
     if sys.stdout.isatty():
         text = "\n".join(broken for line in text.split("\n") for broken in broken_line(line))
     print(text, end=end)
@@ -402,7 +355,7 @@ def say_written(*paths: str | None) -> None:
     """Print the paths of written files; None is skipped."""
     for path in paths:
         if path is not None:
-            print(in_options(f"written: {path}"))
+            print(f"written: {path}")
 
 
 #: Time to read a byte and to simulate a sample of an output on the reference machine [s], and range of the actual

@@ -11,8 +11,17 @@ import typer
 
 from ftlm import _core
 from ftlm.cli.data_commands import doctor, inspect, open_, record
-from ftlm.cli.design_commands import control, design_input, shape
-from ftlm.cli.estimation_commands import agreement, identify, identify_frequency, resume, search, select, status
+from ftlm.cli.design_commands import control, design_input, input_shaper
+from ftlm.cli.estimation_commands import (
+    certify,
+    consistency,
+    identify,
+    identify_frequency,
+    resume,
+    search,
+    select,
+    status,
+)
 from ftlm.cli.framework import Command
 from ftlm.cli.model_commands import compare, export, plot, report, resid, simulate
 from ftlm.cli.other_commands import app as page
@@ -50,8 +59,9 @@ COMMAND_HELP = {
     identify: "Identify a model from runs, with a verdict.",
     identify_frequency: "The same from frequency responses, impedances.",
     select: "Choose the structure that predicts.",
-    agreement: "Tell whether parts of runs are one model.",
-    search: "Rank all orders on a lattice.",
+    consistency: "Test whether segments of runs are one model.",
+    search: "Rank all orders of an order grid.",
+    certify: "Prove a bound over all orders in intervals.",
     resume: "Go on with the searches of a store.",
     status: "Show how far the searches of a store are.",
     compare: "Judge a saved model on measured runs.",
@@ -59,7 +69,7 @@ COMMAND_HELP = {
     simulate: "Run a saved model on a run's inputs.",
     design_input: "Lay out the experiment that tells most.",
     control: "Design a controller on a saved model.",
-    shape: "Make an input shaper of a saved model's poles.",
+    input_shaper: "Make an input shaper of a saved model's poles.",
     report: "Write the report of a saved model.",
     reproduce: "Recompute the paper's tables and figures.",
     orders: "Judge whole and fractional orders on a real arm.",

@@ -45,7 +45,7 @@ def compare(
     *,
     model: SavedModel,
     files: Files,
-    min_fit: Annotated[Number, Option(help="Exit with 4 where a free run fits less than this percentage.")] = None,
+    min_fit: Annotated[Number, Option(help="Exit with 4 if the simulation fits less [%].")] = None,
     reading: ReadingOptions,
     m: BlockPulses = None,
     as_json: Json = False,
@@ -84,10 +84,10 @@ def resid(
 def simulate(
     *,
     model: SavedModel,
-    file: Annotated[str, Argument(metavar="FILE", help="A run whose inputs drive the model.")],
-    out: Annotated[str, Option("-o", "--out", metavar="CSV", help="Where to write the simulated run.")],
+    file: Annotated[str, Argument(metavar="FILE", help="Run with the inputs of the simulation.")],
+    out: Annotated[str, Option("-o", "--out", metavar="CSV", help="Write the simulated run to this file.")],
     reading: ReadingOptions,
-    tolerance: Annotated[float, Option(help="Relative change at which refinement ends.")] = 1e-6,
+    tolerance: Annotated[float, Option(help="Relative tolerance of the step refinement.")] = 1e-6,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -105,7 +105,7 @@ def report(
     *,
     model: SavedModel,
     out: Page,
-    validation: Annotated[Texts, Option(metavar="FILE", help="A run that the model has not seen.")] = None,
+    validation: Annotated[Texts, Option(metavar="FILE", help="Run to validate the model on.")] = None,
     reading: ReadingOptions,
     force: Force = False,
     as_json: Json = False,
@@ -121,11 +121,13 @@ def report(
 def plot(
     *,
     model: SavedModel,
-    out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Figure to write: .png, .pdf or .svg.")],
+    out: Annotated[
+        str, Option("-o", "--out", metavar="FILE", help="Write the figure to this .png, .pdf or .svg file.")
+    ],
     files: Annotated[Texts, Argument(metavar="[RUN]...", help="Runs, for fit, residuals and series.")] = None,
     kind: Annotated[
         Literal["fit", "residuals", "series", "bode", "poles", "step", "impulse"],
-        Option(help="What to draw; series: residuals over time and how often."),
+        Option(help="Kind of figure; series: residuals over time."),
     ] = "fit",
     reading: ReadingOptions,
     force: Force = False,
@@ -156,11 +158,13 @@ def export(
     model: SavedModel,
     to: Annotated[
         Literal["control", "matlab", "json"],
-        Option(help="control: Python script; matlab: script for FOMCON; json."),
+        Option(help="control: Python; matlab: FOMCON script; json."),
     ],
-    band: Annotated[Text, Option(metavar="LOW:HIGH", help="Frequencies [rad/s] that control needs.")] = None,
+    band: Annotated[Text, Option(metavar="LOW:HIGH", help="Frequency band for control [rad/s].")] = None,
     order: Annotated[int, Option(help="Order of Oustaloup's filter, for control.")] = 5,
-    out: Annotated[Text, Option("-o", "--out", metavar="FILE", help="Where to write; default standard output.")] = None,
+    out: Annotated[
+        Text, Option("-o", "--out", metavar="FILE", help="Write to this file; default standard output.")
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:

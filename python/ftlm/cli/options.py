@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from typer import Argument, Option
 
@@ -14,6 +14,7 @@ from ftlm.arm.flexible_link import Law, flexible_link
 from ftlm.cli.framework import announce_reading, interval, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
+from ftlm.estimation.methods import METHODS
 from ftlm.io.dialect import Layout
 from ftlm.io.load import load
 from ftlm.io.preview import OpenedFile, open_file
@@ -22,52 +23,76 @@ from ftlm.structure.order_grid import OrderGrid, order_grid
 from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import INITIAL_CHOICES, Structure, check_initial
+from ftlm.utils.parameters import parameter
 
+#: Panels of options in a command's help.
+FILE, STRUCTURE, METHOD, OUTPUT = "File", "Structure", "Method", "Output"
 #: Types of optional options.
 Text = str | None
 Number = float | None
 Texts = list[str] | None
 
 Files = Annotated[list[str], Argument(metavar="FILE...", help="Measured files; several files are several runs.")]
-SavedModel = Annotated[str, Argument(metavar="MODEL", help="A saved model.")]
+SavedModel = Annotated[str, Argument(metavar="MODEL", help="Saved model.")]
 StructureText = Annotated[
     str,
     Option(
-        "--structure",
-        help="flexible-link:1, :2 or :both; arm:1, :2 or :both (deflections of a real arm); or an equation in words.",
+        "--structure", rich_help_panel=STRUCTURE, help="flexible-link:1|2|both, arm:1|2|both or an equation in words."
     ),
 ]
 CandidateTexts = Annotated[
     list[str],
-    Option(
-        "--structure",
-        help="One, whose inside is searched, or several to compare: as of identify; or auto, one output, any inputs.",
-    ),
+    Option("--structure", rich_help_panel=STRUCTURE, help="Largest structure, several to compare, or auto."),
 ]
-GridIncrement = Annotated[float, Option("--step", help="Step of the order lattice.")]
-BlockPulses = Annotated[int | None, Option("--m", help="Block pulses a run; default 2048, or what the runs carry.")]
-Threads = Annotated[int | None, Option("--threads", help="Threads; default FTLM_THREADS, or all cores.")]
-Out = Annotated[Text, Option("-o", "--out", metavar="FILE", help="Model to write, .json.")]
-Page = Annotated[str, Option("-o", "--out", metavar="HTML", help="Page to write.")]
-Force = Annotated[bool, Option("--force", help="Overwrite files.")]
-Json = Annotated[bool, Option("--json", help="Results as JSON.")]
-Verbose = Annotated[bool, Option("-v", "--verbose", help="Also all else that is known, and all warnings.")]
-Noise = Annotated[Texts, Option(metavar="OUTPUT=A", help="Deviation of an output's noise; default what the fit left.")]
+GridIncrement = Annotated[float, Option("--increment", help="Increment of the order grid.")]
+BlockPulses = Annotated[
+    int | None, Option("--m", rich_help_panel=METHOD, help="Block pulses per run; default 2048, or as many as fit.")
+]
+Threads = Annotated[
+    int | None, Option("--threads", rich_help_panel=METHOD, help="Threads; default FTLM_THREADS, or all cores.")
+]
+StoreFile = Annotated[
+    Text, Option(metavar="FILE", rich_help_panel=OUTPUT, help="Checkpoint file; the same command resumes from it.")
+]
+Out = Annotated[
+    Text, Option("-o", "--out", metavar="FILE", rich_help_panel=OUTPUT, help="Write the model to this .json file.")
+]
+Page = Annotated[
+    str, Option("-o", "--out", metavar="HTML", rich_help_panel=OUTPUT, help="Write the page to this file.")
+]
+Report = Annotated[
+    Text, Option("--report", metavar="HTML", rich_help_panel=OUTPUT, help="Write an HTML report to this file.")
+]
+Force = Annotated[bool, Option("--force", rich_help_panel=OUTPUT, help="Overwrite existing files.")]
+Json = Annotated[bool, Option("--json", rich_help_panel=OUTPUT, help="Print the result as JSON.")]
+Verbose = Annotated[bool, Option("-v", "--verbose", rich_help_panel=OUTPUT, help="Print all details and all warnings.")]
+Loss = Annotated[
+    Literal["squares", "huber"] | None,
+    Option(rich_help_panel=METHOD, help="Loss of residuals; huber resists outliers; default squares."),
+]
+Noise = Annotated[
+    Texts, Option(metavar="OUTPUT=A", help="Noise standard deviation of an output; default the fit's residual.")
+]
 #: Options of a text file's layout; `layout_options` collects them from a dataclass.
 Separator = Annotated[
     Literal["comma", "semicolon", "tab", "space"] | None,
-    Option(help="Between cells of text; default what is there."),
+    Option(help="Separator of cells; default detected."),
 ]
-Decimal = Annotated[Literal["point", "comma"] | None, Option(help="Mark of decimals in text; default what is there.")]
+Decimal = Annotated[Literal["point", "comma"] | None, Option(help="Decimal mark; default detected.")]
 Thousands = Annotated[
     Literal["none", "point", "comma", "space", "apostrophe"] | None,
-    Option(help="What groups thousands of numbers in text; default what is there."),
+    Option(help="Mark between groups of thousands; default detected."),
 ]
-SkippedLines = Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")]
+SkippedLines = Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default detected.")]
 HeaderLines = Annotated[
-    int | None, Option(metavar="0|1|2", help="Lines of header: none, names, names and units; default what is there.")
+    int | None, Option(metavar="0|1|2", help="Header lines: none, names, names and units; default detected.")
 ]
-Sheet = Annotated[Text, Option(help="Sheet of a workbook that has several.")]
+Sheet = Annotated[Text, Option(help="Sheet of a workbook.")]
+Orders = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE, help="Fix an order.")]
+Fixed = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE, help="Fix a coefficient.")]
+Delay = Annotated[
+    Texts, Option(metavar="INPUT=SECONDS", rich_help_panel=STRUCTURE, help="Delay of an input; LOW:HIGH is estimated.")
+]
 
 
 def layout_options(record: object) -> dict[str, Any]:
@@ -76,49 +101,53 @@ def layout_options(record: object) -> dict[str, Any]:
     return {name: value for name, value in said.items() if value is not None}
 
 
+def methods_with(*options: str) -> tuple[str, ...]:
+    """Return the names of the methods of estimation that have these options."""
+    return tuple(name for name, method in METHODS.items() if set(options) <= {f.name for f in fields(method)})
+
+
 @dataclass(frozen=True)
 class ReadingOptions:
     """Options for reading files."""
 
-    time: Annotated[Text, Option(help="Column of time; default by its name.")] = None
+    panel: ClassVar[str] = FILE
+
+    time: Annotated[Text, Option(help="Time column; default found by its name.")] = None
     time_unit: Annotated[
-        Literal["s", "ms", "us", "min", "h"] | None,
-        Option("--time-unit", help="Unit of that column; default what its header says, as in time [ms], or s."),
+        Literal["s", "ms", "us", "min", "h"] | None, Option(help="Unit of the time column; default its header's, or s.")
     ] = None
-    sampling: Annotated[Number, Option(help="Sampling step [s] of files without a time column.")] = None
+    step: Annotated[Number, Option(help="Sampling interval [s] of files without a time column.")] = None
     inputs: Annotated[
-        Texts, Option("-u", "--input", metavar="NAME=COLUMN", help="An input; NAME alone where it is its column's.")
+        Texts, Option("-u", "--inputs", metavar="NAME=COLUMN", help="Input; NAME alone if the column has that name.")
     ] = None
-    outputs: Annotated[Texts, Option("-y", "--output", metavar="NAME=COLUMN", help="An output, as -u.")] = None
-    units: Annotated[Texts, Option("--unit", metavar="NAME=UNIT", help="Unit of a signal, such as deg.")] = None
+    outputs: Annotated[
+        Texts, Option("-y", "--outputs", metavar="NAME=COLUMN", help="Output; NAME alone if the column has that name.")
+    ] = None
+    units: Annotated[Texts, Option(metavar="NAME=UNIT", help="Unit of a signal, such as deg.")] = None
     columns: Annotated[Text, Option(metavar="TOML", help="File that names columns and units.")] = None
-    between: Annotated[
-        Texts, Option("--intersample", metavar="NAME=zoh|foh", help="foh for a measured input; a command is zoh.")
+    intersample: Annotated[
+        Texts, Option(metavar="NAME=zoh|foh", help="Hold of an input between samples; default zoh.")
     ] = None
-    sliced: Annotated[Text, Option("--slice", metavar="FROM:TO", help="Seconds since the first row.")] = None
-    resample: Annotated[
-        Number,
-        Option(
-            metavar="STEP", help="Put irregular rows on this step [s]; output error compares when outputs were read."
-        ),
-    ] = None
+    window: Annotated[Text, Option(metavar="FROM:TO", help="Part of the run, in seconds [s] since its first row.")] = (
+        None
+    )
+    resample: Annotated[Number, Option(metavar="STEP", help="Resample irregular rows to this step [s].")] = None
     missing: Annotated[
         Literal["refuse", "weight", "hold"] | None,
-        Option(help="weight: outputs that are not there weigh nothing; hold: inputs hold their last value besides."),
+        Option(help="Missing outputs get no weight; hold: inputs are held, too."),
     ] = None
-    encoding: Annotated[Text, Option(help="Encoding of text, such as cp1252; default what its bytes show.")] = None
+    encoding: Annotated[Text, Option(help="Text encoding, such as cp1252; default detected.")] = None
     separator: Separator = None
     decimal: Decimal = None
     thousands: Thousands = None
     skip: SkippedLines = None
     header: HeaderLines = None
-    dates: Annotated[
-        Literal["ymd", "dmy", "mdy"] | None, Option(help="Order of day and month where dates leave it open.")
-    ] = None
+    dates: Annotated[Literal["ymd", "dmy", "mdy"] | None, Option(help="Order of day and month in ambiguous dates.")] = (
+        None
+    )
     sheet: Sheet = None
     detrend: Annotated[
-        Literal["constant", "linear"] | None,
-        Option(help="Subtract the mean or the straight line of every signal; --offset estimates it instead."),
+        Literal["constant", "linear"] | None, Option(help="Subtract the mean or a straight line from every signal.")
     ] = None
 
     def runs(self, files: Sequence[str] | None, *, apart: bool = False) -> list[Run]:
@@ -130,13 +159,13 @@ class ReadingOptions:
         """Load each file as a run; .mat files with one signal each form one run unless ``apart``."""
         given: dict[str, Any] = {
             "time": self.time,
-            "step": self.sampling,
+            "step": self.step,
             "inputs": pairs("-u", self.inputs),
             "outputs": pairs("-y", self.outputs),
-            "units": pairs("--unit", self.units),
+            "units": pairs("--units", self.units),
             "columns": self.columns,
             "time_unit": self.time_unit,
-            "intersample": pairs("--intersample", self.between),
+            "intersample": pairs("--intersample", self.intersample),
             "resample": self.resample,
             "missing": self.missing,
             "layout": layout_options(self),
@@ -145,8 +174,8 @@ class ReadingOptions:
             return []
         announce_reading(files)
         options = {name: value for name, value in given.items() if value not in (None, {}, "")}
-        if self.sliced is not None:
-            options["window"] = interval(self.sliced, "--slice", "1.1:19.5")
+        if self.window is not None:
+            options["window"] = interval(self.window, "--window", "1.1:19.5")
         if not apart and len(files) > 1 and all(f.lower().endswith(".mat") for f in files):
             try:
                 load(files[0], **options)
@@ -165,15 +194,15 @@ class ReadingOptions:
         return open_file(
             file,
             time=self.time,
-            step=self.sampling,
+            step=self.step,
             inputs=pairs("-u", self.inputs) or None,
             outputs=pairs("-y", self.outputs) or None,
-            units=pairs("--unit", self.units),
+            units=pairs("--units", self.units),
             columns=self.columns,
             time_unit=self.time_unit,
-            intersample=pairs("--intersample", self.between),
+            intersample=pairs("--intersample", self.intersample),
             layout=layout_options(self),
-            window=None if self.sliced is None else interval(self.sliced, "--slice", "1.1:19.5"),
+            window=None if self.window is None else interval(self.window, "--window", "1.1:19.5"),
             resample=self.resample,
             missing=self.missing,
         )
@@ -183,59 +212,53 @@ class ReadingOptions:
 class StructureOptions:
     """Options that modify a structure; None for an option that is not given."""
 
-    only: Annotated[Text, Option(metavar="OUTPUT", help="Only the equation of this output.")] = None
+    panel: ClassVar[str] = STRUCTURE
+
+    only: Annotated[Text, Option(metavar="OUTPUT", help="Fit the equation of this output only; default all.")] = None
     coupling: Annotated[
         Literal["measured", "simulated"] | None,
-        Option(help="Whose other outputs drive a free run; default measured of a flexible link, else simulated."),
+        Option(help="Other outputs in an equation; default measured for a link."),
     ] = None
-    cross_stage: Annotated[bool, Option("--cross-stage", help="Add the other stage's angles and current.")] = False
-    inertial: Annotated[
-        bool, Option("--inertial", help="Add the other stage's accelerations, by the energies of the arm.")
-    ] = False
+    cross_stage: Annotated[
+        Literal["torques", "inertial"] | None, Option(help="Terms of the other stage of the arm; default none.")
+    ] = None
     cross_sensitivity: Annotated[
-        bool, Option("--cross-sensitivity", help="Deflections follow hub angles through gauge and cable, too.")
+        bool, Option("--cross-sensitivity", help="Deflections also follow hub angles (gauge and cable).")
     ] = False
     cross_damping: Annotated[
-        bool, Option("--cross-damping", help="With --inertial: the rate of the other deflection, an observer's gain.")
+        bool, Option("--cross-damping", help="With --cross-stage inertial: rate of the other deflection.")
     ] = False
     friction: Annotated[bool, Option("--friction", help="Add Coulomb friction of the hubs.")] = False
     laws: Annotated[
         Literal["none", "orders", "velocities"] | None,
-        Option(
-            help="orders: search all equations under the order law; velocities: with gamma = mu besides; default none."
-        ),
+        Option(help="Order law; velocities: also gamma = mu; default none."),
     ] = None
     form: Annotated[
         Literal["lagrange", "published"] | None,
-        Option(help="Equation of the deflection: the paper's (15), or its (23) as printed; default lagrange."),
+        Option(help="Equation of the deflection: (15) or (23); default lagrange."),
     ] = None
     input_order: Annotated[
-        Literal["published", "derived"] | None,
-        Option(help="Order of the current in the published form, which it implies."),
+        Literal["published", "derived"] | None, Option(help="Order of the current in the published form.")
     ] = None
-    stock_filter: Annotated[bool, Option("--stock-filter", help="Deflections passed the stock 2 Hz low-pass.")] = False
-    filtered: Annotated[
-        Texts, Option("--filtered", metavar="SIGNAL", help="Signal of equations in words that passed a low-pass.")
+    sensor_filter: Annotated[
+        Text, Option(metavar="stock|HZ[:DAMPING]", help="Low-pass filter of the sensors; stock: 2 Hz, damping 0.9.")
     ] = None
-    low_pass: Annotated[
-        Text, Option("--low-pass", metavar="HZ[:DAMPING]", help="That low-pass; default 2:0.9, the arm's stock one.")
+    filtered_signals: Annotated[
+        Texts, Option(metavar="SIGNAL", help="Signal of an equation in words that passed the filter.")
     ] = None
-    orders: Annotated[Texts, Option("--order", metavar="NAME=VALUE", help="Fix an order.")] = None
-    fixed: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix a coefficient.")] = None
-    delay: Annotated[Texts, Option(metavar="INPUT=SECONDS", help="Delay of an input; LEAST:LARGEST is estimated.")] = (
+    orders: Orders = None
+    fixed: Fixed = None
+    delay: Delay = None
+    saturation: Annotated[
+        Texts, Option(metavar="INPUT=LIMIT", help="Saturation limit of an input; LOW:HIGH is estimated.")
+    ] = None
+    dead_zone: Annotated[Texts, Option(metavar="INPUT=LIMIT", help="Dead zone of an input; LOW:HIGH is estimated.")] = (
         None
     )
-    saturation: Annotated[
-        Texts, Option(metavar="INPUT=LIMIT", help="How far an input acts at most; LEAST:LARGEST is estimated.")
-    ] = None
-    dead_zone: Annotated[
-        Texts,
-        Option("--dead-zone", metavar="INPUT=LIMIT", help="What an input exceeds before it acts; or LEAST:LARGEST."),
-    ] = None
     initial: Annotated[str, Option(help="auto, rest, caputo, history, or exponents of t: 0,1.")] = "auto"
     offset: Annotated[
         Literal["none", "constant", "ramp", "auto"] | None,
-        Option(help="Unknown constant (and ramp) in each equation, one a run; default what the equation says."),
+        Option(help="Offset of each equation and run; default the equation's."),
     ] = None
 
     def structure(self, text: str, *, alone: bool = False) -> Structure:
@@ -259,7 +282,7 @@ class StructureOptions:
         built = built.with_limits(
             saturation=ranges("--saturation", self.saturation), dead_zone=ranges("--dead-zone", self.dead_zone)
         )
-        return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
+        return built.with_orders(numbers("--orders", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
 
     def structure_for_runs(self, text: str, runs: Sequence[Run]) -> Structure:
         """Return the structure of `text` for runs: one link alone if no run contains the other stage."""
@@ -274,10 +297,8 @@ class StructureOptions:
 
     def given_options(self) -> list[str]:
         """Options with values other than their defaults."""
-        names = {"orders": "--order", "fixed": "--fixed"}
         usual = StructureOptions()
-        said = [f.name for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)]
-        return [names.get(n, "--" + n.replace("_", "-")) for n in said]
+        return [parameter(f.name) for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)]
 
     def _check_equation(self, count: int) -> None:
         """Raise for options of the flexible link, given the number of equations."""
@@ -296,28 +317,32 @@ class StructureOptions:
     def _link_options(self) -> dict[str, bool]:
         """Whether each option of the flexible link is given."""
         return {
-            "--cross-stage": self.cross_stage,
-            "--inertial": self.inertial,
+            "--cross-stage": self.cross_stage is not None,
             "--cross-sensitivity": self.cross_sensitivity,
             "--cross-damping": self.cross_damping,
             "--friction": self.friction,
             "--laws": self.laws is not None,
             "--form": self.form is not None,
             "--input-order": self.input_order is not None,
-            "--stock-filter": self.stock_filter,
         }
 
     def _sensor(self) -> SensorFilter | None:
         """Sensor filter of signals in equations."""
-        if not self.filtered:
-            if self.low_pass is not None:
-                raise ModelError("--low-pass is of signals that --filtered names; name them, or leave it out")
+        if not self.filtered_signals:
+            if self.sensor_filter is not None:
+                raise ModelError(
+                    "--sensor-filter is of signals that --filtered-signals names; name them, or leave it out"
+                )
             return None
-        frequency, _, damping = (self.low_pass or "2:0.9").partition(":")
+        if self.sensor_filter in (None, "stock"):
+            return SensorFilter.low_pass(self.filtered_signals)
+        frequency, _, damping = str(self.sensor_filter).partition(":")
         try:
-            return SensorFilter.low_pass(self.filtered, float(frequency), float(damping or 0.9))
+            return SensorFilter.low_pass(self.filtered_signals, float(frequency), float(damping or 0.9))
         except ValueError:
-            raise ModelError(f"--low-pass {self.low_pass!r} is not HZ or HZ:DAMPING, such as 2:0.9") from None
+            raise ModelError(
+                f"--sensor-filter {self.sensor_filter!r} is not stock, HZ or HZ:DAMPING, such as 2:0.9"
+            ) from None
 
     def _arm(self, text: str, alone: bool) -> Structure:
         """Deflections of the real arm with all angles as inputs, integer orders but that of the links' elasticity.
@@ -328,7 +353,7 @@ class StructureOptions:
         requested.
         """
         given = self._link_options() | {"--coupling": self.coupling is not None}
-        given |= {"--filtered": bool(self.filtered), "--low-pass": self.low_pass is not None}
+        given |= {"--sensor-filter": self.sensor_filter is not None, "--filtered-signals": bool(self.filtered_signals)}
         wrong = [option for option, is_given in given.items() if is_given]
         if wrong:
             raise ModelError(
@@ -358,12 +383,11 @@ class StructureOptions:
         stage = stages.get(text.partition(":")[2])
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
-        if self.filtered or self.low_pass:
+        if self.filtered_signals or self.sensor_filter not in (None, "stock"):
             raise ModelError(
-                "--filtered and --low-pass are of equations in words; the flexible link has --stock-filter"
+                "--filtered-signals and --sensor-filter HZ are of equations in words; the flexible link has "
+                "--sensor-filter stock"
             )
-        if self.cross_stage and self.inertial:
-            raise ModelError("--cross-stage adds torques, --inertial accelerations of the other stage; use one of them")
         laws: dict[str, Sequence[Law]] = {
             "none": (),
             "orders": ("orders", "coefficients"),
@@ -374,12 +398,12 @@ class StructureOptions:
             form=self.form,
             input_order=self.input_order,
             coupling=self.coupling,
-            cross_stage="inertial" if self.inertial else self.cross_stage,
+            cross_stage=self.cross_stage or False,
             cross_sensitivity=self.cross_sensitivity,
             cross_damping=self.cross_damping,
             friction=self.friction,
             laws=laws[self.laws or "none"],
-            sensor_filter="stock" if self.stock_filter else None,
+            sensor_filter="stock" if self.sensor_filter == "stock" else None,
         )
 
     def _initial(self) -> Any:
@@ -394,59 +418,88 @@ class StructureOptions:
 
 
 @dataclass(frozen=True)
-class SearchOptions:
-    """Options of candidates, their computation and ranking; None for an option that is not given."""
+class OrderGridOptions:
+    """Order grid of a search and its norm; None for an option that is not given."""
 
-    criterion: Annotated[Criterion | None, Option(help="Error that ranks the candidates; default output-error.")] = None
-    norm: Annotated[
-        Literal["l1", "l2"] | None,
-        Option(help="Of errors: l1 their sizes, the paper's (45), l2 their squares, (46); default l1."),
-    ] = None
-    values: Annotated[
-        Texts, Option("--lattice", metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha means every alpha.")
-    ] = None
-    step: Annotated[Number, Option("--step", help="Step of the order lattice; default 0.05.")] = None
-    p: Annotated[int | None, Option(help="Innovation length, of multi-innovation; default 7.")] = None
-    k0: Annotated[Number, Option(help="Prior covariance of the coefficients, of multi-innovation; default 1.")] = None
-    rows: Annotated[
-        Literal["haar", "time"] | None,
-        Option(help="Rows of multi-innovation, the paper's (44), in Haar coordinates or in time; default haar."),
-    ] = None
-    m: BlockPulses = None
-    keep: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
+    panel: ClassVar[str] = METHOD
+    methods: ClassVar[tuple[str, ...]] = methods_with("order_grid", "norm")
 
-    def lattice(self) -> OrderGrid | None:
+    order_grid: Annotated[
+        Texts, Option(metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha stands for every alpha.")
+    ] = None
+    increment: Annotated[Number, Option(help="Increment of the order grid; default 0.05.")] = None
+    norm: Annotated[Literal["l1", "l2"] | None, Option(help="Norm of errors: l1 (45) or l2 (46); default l1.")] = None
+
+    def grid(self) -> OrderGrid | None:
         """Order grid of the search; None without options."""
-        if self.step is None and not self.values:
+        if self.increment is None and not self.order_grid:
             return None
-        named: dict[str, Any] = dict(pairs("--lattice", self.values))
+        named: dict[str, Any] = dict(pairs("--order-grid", self.order_grid))
         alpha = named.pop("alpha", None)
-        made = order_grid(**named) if self.step is None else order_grid(increment=self.step, **named)
+        made = order_grid(**named) if self.increment is None else order_grid(increment=self.increment, **named)
         return made if alpha is None else replace(made, orders={**made.orders, "alpha": alpha})
 
-    def settings(self) -> dict[str, Any]:
-        """Given settings of an order search, by their names in Python."""
-        given = {
-            "criterion": self.criterion,
-            "norm": self.norm,
-            "innovation_length": self.p,
-            "prior_covariance": self.k0,
-            "row_basis": self.rows,
-            "top": self.keep,
-        }
-        return {name: value for name, value in given.items() if value is not None}
+
+@dataclass(frozen=True)
+class RankingOptions:
+    """Options of the ranking of candidates; None for an option that is not given."""
+
+    panel: ClassVar[str] = METHOD
+    methods: ClassVar[tuple[str, ...]] = methods_with("criterion", "top", "store")
+
+    criterion: Annotated[Criterion | None, Option(help="Error that ranks candidates; default output-error.")] = None
+    top: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
+    store: Annotated[Text, Option(metavar="FILE", help="Checkpoint file, from which the search resumes.")] = None
+
+
+@dataclass(frozen=True)
+class MultiInnovationOptions:
+    """Options of the multi-innovation method; None for an option that is not given."""
+
+    panel: ClassVar[str] = METHOD
+    methods: ClassVar[tuple[str, ...]] = methods_with("innovation_length", "prior_covariance", "row_basis")
+
+    innovation_length: Annotated[int | None, Option(help="Innovation length p; default 7.")] = None
+    prior_covariance: Annotated[Number, Option(help="Prior covariance K0 of the coefficients; default 1.")] = None
+    row_basis: Annotated[Literal["haar", "time"] | None, Option(help="Basis of the rows of (44); default haar.")] = None
+
+
+@dataclass(frozen=True)
+class OutputErrorOptions:
+    """Options of the output-error method; None for an option that is not given."""
+
+    panel: ClassVar[str] = METHOD
+    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference")
+
+    loss: Loss = None
+    intervals: Annotated[
+        Literal["auto", "quadratic", "profile"] | None,
+        Option(help="Confidence intervals: Wald, profile likelihood; default auto."),
+    ] = None
+    start: Annotated[Text, Option(metavar="MODEL", help="Saved model as an additional initial guess.")] = None
+    reference: Annotated[
+        Text, Option(metavar="SIGNAL", help="Reference signal of a closed loop; also name it with -u.")
+    ] = None
 
 
 @dataclass(frozen=True)
 class GeneticOptions:
-    """Options of the genetic algorithm."""
+    """Options of the genetic algorithm; None for an option that is not given."""
+
+    panel: ClassVar[str] = METHOD
+    methods: ClassVar[tuple[str, ...]] = methods_with("seeds", "evaluations")
 
     seeds: Annotated[
-        list[int] | None, Option("--seed", min=0, help="Seed of the genetic algorithm; several are several runs.")
+        list[int] | None, Option("--seeds", min=0, help="Seed of the genetic algorithm; several are several runs.")
     ] = None
-    evaluations: Annotated[int | None, Option(help="Evaluations a seed of the genetic algorithm.")] = None
+    evaluations: Annotated[int | None, Option(help="Evaluations per seed of the genetic algorithm.")] = None
 
-    def settings(self) -> dict[str, Any]:
-        """Given options of the genetic algorithm, by their names in Python."""
-        given = {"seeds": tuple(self.seeds) if self.seeds else None, "evaluations": self.evaluations}
-        return {name: value for name, value in given.items() if value is not None}
+
+def given_fields(*records: Any) -> dict[str, Any]:
+    """Return the fields of option records that the user has set, by name."""
+    return {
+        f.name: getattr(record, f.name)
+        for record in records
+        for f in fields(record)
+        if getattr(record, f.name) is not None
+    }

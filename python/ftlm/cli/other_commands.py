@@ -21,6 +21,7 @@ from ftlm.cli.options import (
     Texts,
     Threads,
     Verbose,
+    given_fields,
 )
 from ftlm.errors import ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm
@@ -42,8 +43,8 @@ DEMO_SECONDS = 22.0
 @command
 def demo(
     *,
-    out: Annotated[str, Option("-o", "--out", metavar="FOLDER", help="Where to write.")] = "ftlm-demo",
-    step: GridIncrement = 0.1,
+    out: Annotated[str, Option("-o", "--out", metavar="FOLDER", help="Folder to write to.")] = "ftlm-demo",
+    increment: GridIncrement = 0.1,
     noise: Annotated[float, Option(help="Noise on every angle [rad].")] = 1e-4,
     seed: Annotated[int, Option(min=0, help="Seed of the noise.")] = 1,
     threads: Threads = None,
@@ -56,10 +57,10 @@ def demo(
     The paper's order grid has the increment 0.05, which takes minutes.
     """
     with Progress("", quiet=as_json) as progress:
-        progress.expect("the demo", estimate_duration(DEMO_SECONDS * (0.1 / step) ** 2, check_threads(threads)))
+        progress.expect("the demo", estimate_duration(DEMO_SECONDS * (0.1 / increment) ** 2, check_threads(threads)))
         result = run_demo(
             Path(out),
-            increment=step,
+            increment=increment,
             noise=noise,
             seed=seed,
             threads=threads,
@@ -81,20 +82,18 @@ def demo(
 def reproduce(
     *,
     out: Page = "paper.html",
-    save: Annotated[Text, Option(metavar="FOLDER", help="Also write runs, models and the tables' numbers.")] = None,
-    square: Annotated[Text, Option(metavar="FILE", help="A measured run to identify from.")] = None,
-    sine: Annotated[Text, Option(metavar="FILE", help="Another one, to validate on.")] = None,
+    save: Annotated[Text, Option(metavar="FOLDER", help="Also write runs, models and tables to this folder.")] = None,
+    square: Annotated[Text, Option(metavar="FILE", help="Measured run to identify from.")] = None,
+    sine: Annotated[Text, Option(metavar="FILE", help="Measured run to validate on.")] = None,
     reading: ReadingOptions,
-    step: GridIncrement = 0.05,
+    increment: GridIncrement = 0.05,
     noise: Annotated[float, Option(help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
-    seed: Annotated[int, Option("--noise-seed", min=0, help="Seed of that noise.")] = 1,
+    seed: Annotated[int, Option(min=0, help="Seed of that noise.")] = 1,
     arms: Annotated[
-        Texts, Option("--arms", metavar="ARM", help="Simulated arm that verdicts are computed on; several, or all.")
+        Texts, Option("--arms", metavar="ARM", help="Simulated arm for the verdicts; several, or all.")
     ] = None,
-    records: Annotated[int, Option(min=1, help="Records of each, whose noise differs.")] = 3,
-    rivals_step: Annotated[
-        float, Option("--rivals-step", help="Smallest step of the lattice that the genetic algorithm is held against.")
-    ] = CONTEST_STEP,
+    records: Annotated[int, Option(min=1, help="Records per arm, with different noise.")] = 3,
+    rivals_increment: Annotated[float, Option(help="Smallest increment in the comparison with the GA.")] = CONTEST_STEP,
     genetic: GeneticOptions,
     threads: Threads = None,
     force: Force = False,
@@ -106,15 +105,16 @@ def reproduce(
         check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
         raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
-    measured, rival = reading.runs([f for f in (square, sine) if f is not None], apart=True), genetic.settings()
+    measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
+    rival = given_fields(genetic)
     with Progress("", quiet=as_json) as progress:
         result = reproduction.reproduce(
             *measured,
-            increment=step,
+            increment=increment,
             noise=noise,
             seed=seed,
             genetic=GeneticAlgorithm(**rival) if rival else None,
-            rivals_increment=rivals_step,
+            rivals_increment=rivals_increment,
             arms=arms,
             records=records,
             threads=threads,
@@ -136,7 +136,7 @@ def orders(
     out: Page = "orders.html",
     reading: ReadingOptions,
     filtered: Annotated[
-        bool, Option("--stock-filter/--no-filter", help="Whether deflections passed the stock 2 Hz low-pass.")
+        bool, Option("--filtered/--no-filtered", help="Whether deflections passed the stock low-pass.")
     ] = True,
     threads: Threads = None,
     force: Force = False,
@@ -158,13 +158,13 @@ def orders(
 @command
 def app(
     *,
-    files: Annotated[list[str] | None, Argument(metavar="[FILE...]", help="Measured files to open at once.")] = None,
+    files: Annotated[list[str] | None, Argument(metavar="[FILE...]", help="Measured files to open.")] = None,
     port: Annotated[
         int | None,
-        Option(metavar="PORT", help=f"Of 127.0.0.1; default {DEFAULT_PORT}, or any other where that is taken."),
+        Option(metavar="PORT", help=f"Port of 127.0.0.1; default {DEFAULT_PORT}, or a free one."),
     ] = None,
     browser: Annotated[
-        bool, Option("--browser/--no-browser", help="Open a browser, or print the address alone.")
+        bool, Option("--browser/--no-browser", help="Open a browser, or only print the address.")
     ] = True,
 ) -> None:
     """Start the local web application for identification in a browser; Ctrl-C stops it."""

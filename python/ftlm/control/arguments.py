@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr, whole_number
 
 #: Sampling rates [Hz] at which margins can be computed in floating point.
@@ -21,8 +22,8 @@ def checked_rate(rate: object) -> float:
     value = real_number("rate", rate)
     if not RATE_RANGE_HZ[0] <= value <= RATE_RANGE_HZ[1]:
         raise ModelError(
-            f"rate = {short_repr(rate)} Hz is not a positive number of samples per second from {RATE_RANGE_HZ[0]:g} "
-            f"to {RATE_RANGE_HZ[1]:g}"
+            f"{setting('rate')} {short_repr(rate)} Hz is not a positive number of samples per second from "
+            f"{RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g}"
         )
     return value
 
@@ -63,7 +64,7 @@ def check_limit(limit: object) -> float:
     """Return the largest command, which may be infinite."""
     most = real_number("limit", limit)
     if not most > 0:
-        raise ModelError(f"limit = {short_repr(limit)} is not a number above 0")
+        raise ModelError(f"{setting('limit')} {short_repr(limit)} is not a number above 0")
     return most
 
 
@@ -71,7 +72,7 @@ def check_samples(samples: object, seed: object) -> tuple[int, int]:
     """Return the number of parameter samples and their seed."""
     count = whole_number(samples)
     if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {short_repr(samples)} is no whole number from 0 to 10000")
+        raise ModelError(f"{setting('samples')} {short_repr(samples)} is no whole number from 0 to 10000")
     return count, check_seed(seed)
 
 

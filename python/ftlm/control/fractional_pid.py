@@ -15,6 +15,7 @@ from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_o
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr, whole_number
 
 #: Poles extend this factor beyond the band on both sides.
@@ -135,7 +136,7 @@ class DiscretePid:
             low, high = (real_number("band", b) for b in band)
         except (TypeError, ValueError):
             raise ModelError(
-                f"band = {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
+                f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
             ) from None
         if not (0 < low < high <= half and high <= MAX_BAND_RATIO * low):
             raise ModelError(
@@ -144,7 +145,7 @@ class DiscretePid:
             )
         count = whole_number(order)
         if count is None or not 1 <= count <= LARGEST_ORDER:
-            raise ModelError(f"order = {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
+            raise ModelError(f"{setting('order')} {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
         reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
@@ -396,12 +397,12 @@ def fractional_pid(
     wc = real_number("crossover", crossover)
     if not MIN_CROSSOVER_SHARE * plant.rate <= wc < math.pi * plant.rate / 4:
         raise ModelError(
-            f"crossover = {short_repr(crossover)} rad/s is outside [{MIN_CROSSOVER_SHARE * plant.rate:.4g}, "
+            f"{setting('crossover')} {short_repr(crossover)} rad/s is outside [{MIN_CROSSOVER_SHARE * plant.rate:.4g}, "
             f"{math.pi * plant.rate / 4:.4g}), from a millionth to an eighth of the rate of {plant.rate:g} Hz"
         )
     asked = real_number("phase_margin", phase_margin)
     if not 10 <= asked <= 80:
-        raise ModelError(f"phase_margin = {short_repr(phase_margin)} degrees is outside [10, 80]")
+        raise ModelError(f"{setting('phase_margin')} {short_repr(phase_margin)} degrees is outside [10, 80]")
     count, start = check_samples(samples, seed)
     plant.check_stable()
     drawn = plant.samples(count, start)
@@ -463,7 +464,7 @@ def plant_of(
         if name is None and len(known) == 1:
             names.append(known[0])
         elif name is None:
-            raise ModelError(f"the model has several {what}s: say which, {what}=…; it has {', '.join(known)}")
+            raise ModelError(f"the model has several {what}s: say which, {parameter(what)}…; it has {', '.join(known)}")
         elif not isinstance(name, str) or name not in known:
             near = nearest(name, known) if isinstance(name, str) else ""
             raise ModelError(

@@ -15,6 +15,7 @@ from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.utils.formatting import with_error
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_choice, short_repr, whole_number
 
@@ -83,14 +84,14 @@ class Shaper:
         rate = checked_rate(rate)
         if self.delay * rate > MAX_SHAPER_SAMPLES:
             raise ModelError(
-                f"rate = {rate:g} Hz makes the shaper {self.delay * rate:.3g} samples long; use at most "
+                f"{setting('rate')} {rate:g} Hz makes the shaper {self.delay * rate:.3g} samples long; use at most "
                 f"{MAX_SHAPER_SAMPLES / self.delay:.3g} Hz"
             )
         taps = np.ones(1)
         for mode in self.modes:
             if mode.pole.imag * 2.0 > math.pi * rate:
                 raise ModelError(
-                    f"rate = {rate:g} Hz has fewer than four samples in a period of the mode at "
+                    f"{setting('rate')} {rate:g} Hz has fewer than four samples in a period of the mode at "
                     f"{mode.frequency:.4g} rad/s; use at least {2.0 * mode.pole.imag / math.pi:.3g} Hz"
                 )
             part = _zv_samples(mode, 1.0 / rate)
@@ -190,7 +191,7 @@ def input_shaper(
     check_choice("kind", kind, SHAPER_REPETITIONS)
     count = whole_number(modes)
     if count is None or count < 1:
-        raise ModelError(f"modes = {short_repr(modes)} is no number of modes; give a whole number from 1")
+        raise ModelError(f"{setting('modes')} {short_repr(modes)} is no number of modes; give a whole number from 1")
     if isinstance(model, (complex, float, int, np.number)):
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:
@@ -224,7 +225,7 @@ def input_shaper(
             f"{with_error(widest.frequency, widest.frequency_error)} rad/s, damping "
             f"{with_error(widest.damping, widest.damping_error)}, a {kind} shaper may leave {100 * worst:.0f} % of the "
             f"vibration, more than {100 * MAX_RESIDUAL_VIBRATION:.0f} %; identify from a longer run, or from one "
-            "that excites this mode" + (", or use kind='zvd'" if kind == "zv" else "")
+            "that excites this mode" + (f", or use {parameter('kind', 'zvd')}" if kind == "zv" else "")
         )
     return Shaper(kind, chosen, tuple(instants.tolist()), tuple(summed.tolist()), worst)
 

@@ -14,6 +14,7 @@ from ftlm.control.fractional_pid import least_certain_parameter
 from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats, real_number, short_repr
 
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
@@ -124,7 +125,8 @@ def point_to_point(
         raise ModelError(f"dwell_before = {dwell_before!r} and dwell_after = {dwell_after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
         raise ModelError(
-            f"duration = {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
+            f"{setting('duration')} {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it "
+            "more time"
         )
     rows = (sum(rests) + times[0]) * times[1] + 1
     if rows > MAX_PATH_ROWS:
@@ -151,7 +153,7 @@ def inverse_dynamics(
     path : array_like
         Desired path, one row per sample at the loop's rate. It is at rest at both ends, with a dwell before the move as
         long as the reference must lead.
-    of : str, optional
+    output : str, optional
         Output of the model or a sum such as ``"theta11 + theta12"``, as measured by the loop; may be omitted for a
         model with one output.
     limit

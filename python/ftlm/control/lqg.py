@@ -18,6 +18,7 @@ from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_o
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model, check_model
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.
@@ -82,7 +83,7 @@ class Observer:
         if abs(run.step * self.realisation.rate - 1.0) > 1e-6:
             raise DataError(
                 f"run {run.name} has a step of {run.step:g} s, and the observer one of "
-                f"{1.0 / self.realisation.rate:g} s; make it for rate={1.0 / run.step:g}"
+                f"{1.0 / self.realisation.rate:g} s; make it for {parameter('rate')}{1.0 / run.step:g}"
             )
         a, b, c = self.matrices
         y = np.array([run[n] for n in self.measured])
@@ -213,7 +214,7 @@ def kalman_filter(
 def noise_deviations(model: Model, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
-        raise ModelError(f"noise = {short_repr(given)} is no mapping from outputs to standard deviations")
+        raise ModelError(f"{setting('noise')} {short_repr(given)} is no mapping from outputs to standard deviations")
     for name in given or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
@@ -226,7 +227,7 @@ def noise_deviations(model: Model, measured: tuple[str, ...], given: Mapping[str
         if value is None:
             raise ModelError(
                 f"the noise of {name} is not known, since this model does not say what its fit left; give its standard "
-                f"deviation in noise (--noise {name}=0.001)"
+                f"deviation in {parameter('noise', {name: 0.001})}"
             )
         out.append(positive(f"noise of {name}", value))
     return tuple(out)
@@ -537,9 +538,8 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
     """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
-            f"max_deviation = {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to deviations; "
-            "give such as "
-            f"{{{names[0]!r}: 0.01}}"
+            f"{setting('max_deviation')} {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to "
+            "deviations; give such as {{names[0]!r}: 0.01}"
         )
     return [
         (sum_row("max_deviation", text, names), positive(f"max_deviation[{short_repr(text)}]", size))

@@ -15,6 +15,7 @@ import numpy as np
 from ftlm.analysis.poles import modes
 from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats, error_text, real_number, short_repr, whole_number
 
 #: Number of fitted frequencies; the error is also evaluated between them.
@@ -111,7 +112,9 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     else:
         count = whole_number(poles)
         if count is None or not MIN_POLES <= count <= MAX_POLES:
-            raise ModelError(f"poles = {short_repr(poles)} is no whole number from {MIN_POLES} to {MAX_POLES}")
+            raise ModelError(
+                f"{setting('poles')} {short_repr(poles)} is no whole number from {MIN_POLES} to {MAX_POLES}"
+            )
         counts = [count]
     library = python_control()
     w = np.geomspace(low, high, FIT_FREQUENCIES)
@@ -174,7 +177,9 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
-        raise ModelError(f"band = {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+        raise ModelError(
+            f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
+        ) from None
     if not (math.isfinite(low) and 0 < low < high <= half / 2):
         raise ModelError(
             f"band = ({low:g}, {high:g}) rad/s is no interval up to a quarter of the rate, {half / 2:g} rad/s"

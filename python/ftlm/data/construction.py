@@ -37,6 +37,7 @@ from ftlm.data.sampling import (
 )
 from ftlm.data.units import TIME_UNITS, check_units
 from ftlm.errors import DataError
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, bad_rows, check_run_name, check_signal_name, join_names
 
 
@@ -159,7 +160,7 @@ class RunArguments:
             raise DataError(
                 f"{self.time_label}: {lost} rows are missing of a regular grid of {step:.6g} s, the first before row "
                 f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or hold "
-                "the inputs over them with missing='hold'"
+                f"the inputs over them with {parameter('missing', 'hold')}"
             )
         whole = times[0] + uniform_times(int(places[-1]) + 1, step)
         whole[places] = times
@@ -197,7 +198,7 @@ class RunArguments:
                     "no value before which there is none to hold",
                     0,
                     int(gone.sum()),
-                    "begin where the input is known, with window=",
+                    f"begin where the input is known, with {parameter('window')}",
                 )
             out[name] = fill_input_gaps(values, behaviour[name])
             how = "its last value was held" if behaviour[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
@@ -212,26 +213,32 @@ class RunArguments:
         if both:
             raise DataError(f"signal {both[0]!r} is both an input and an output, {len(both)} in all; give it two names")
         if not self.outputs:
-            raise DataError("outputs=: there is none; name at least one output")
+            raise DataError(f"{parameter('outputs')}: there is none; name at least one output")
         if (self.step is None) == (self.time is None):
             given = "neither is given" if self.step is None else "both are given"
-            raise DataError(f"step= and time=: {given}; pass exactly one of them")
+            raise DataError(f"{parameter('step')} and {parameter('time')}: {given}; pass exactly one of them")
 
     def _time_axis(self, vectors: Mapping[str, Floats]) -> _TimeAxis:
         """Return the time axis; raise if the signals differ in length."""
         lengths = {self.label_of(s): vector.size for s, vector in vectors.items()}
         if self.time is None:
             if self.time_unit != "s":
-                raise DataError(f"time_unit={self.time_unit!r} is the unit of time=, which is not given; step= is in s")
+                raise DataError(
+                    f"{parameter('time_unit', self.time_unit)} is the unit of {parameter('time')}, which is not "
+                    f"given; {parameter('step')} is in s"
+                )
             step = check_step(self.step, "step")
             clock = _TimeAxis(uniform_times(min(lengths.values()), step), step, 0.0)
         else:
             if not isinstance(self.time_unit, str) or self.time_unit not in TIME_UNITS:
-                raise DataError(f"time_unit={self.time_unit!r} is unknown; the known ones are {join_names(TIME_UNITS)}")
+                raise DataError(
+                    f"{parameter('time_unit', self.time_unit)} is unknown; the known ones are {join_names(TIME_UNITS)}"
+                )
             dated = as_seconds(self.time, self.time_label)
             if dated is not None and self.time_unit != "s":
                 raise DataError(
-                    f"time_unit={self.time_unit!r} is the unit of numbers, and {self.time_label} holds dates"
+                    f"{parameter('time_unit', self.time_unit)} is the unit of numbers, and {self.time_label} holds "
+                    "dates"
                 )
             times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label)
             lengths = {self.time_label: times.size, **lengths}
@@ -264,11 +271,15 @@ class RunArguments:
         for signal, vector in vectors.items():
             unit, scale = units[signal]
             gaps = missing == "hold" or (missing == "weight" and signal in self.outputs)
-            instead = "give them no weight with missing='weight'"
+            instead = f"give them no weight with {parameter('missing', 'weight')}"
             if signal in self.inputs:
-                instead = "hold the last value before them with missing='hold'"
+                instead = f"hold the last value before them with {parameter('missing', 'hold')}"
             check_values(
-                vector, self.label_of(signal), first, gaps=gaps, instead=f"{instead}, or avoid them with window="
+                vector,
+                self.label_of(signal),
+                first,
+                gaps=gaps,
+                instead=f"{instead}, or avoid them with {parameter('window')}",
             )
             with np.errstate(over="ignore"):
                 data[signal] = vector * scale if scale != 1.0 else vector

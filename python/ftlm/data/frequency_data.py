@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, as_floats, real_number
 
 #: Accepted frequency units and their angular frequency [rad/s]; lower-case m means milli.
@@ -209,7 +210,9 @@ def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
 def frequency_factor(unit: str) -> float:
     """Angular frequency [rad/s] of one unit of frequency."""
     if unit not in FREQUENCY_UNITS:
-        raise DataError(f"frequency_unit={unit!r} is unknown; the known ones are {', '.join(FREQUENCY_UNITS)}")
+        raise DataError(
+            f"{parameter('frequency_unit', unit)} is unknown; the known ones are {', '.join(FREQUENCY_UNITS)}"
+        )
     return FREQUENCY_UNITS[unit]
 
 

@@ -38,6 +38,7 @@ from ftlm.errors import DataError
 from ftlm.structure.input_nonlinearity import InputNonlinearity
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import Figures
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, join_names, names_to_columns, nearest
 
 if TYPE_CHECKING:
@@ -626,7 +627,10 @@ class Run:
                 )
             if is_constant(values):
                 thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(there[0])!r}"
-                way_out = "check the sensor and the column, or load a part of the record in which it moves with window="
+                way_out = (
+                    "check the sensor and the column, or load a part of the record in which it moves with "
+                    f"{parameter('window')}"
+                )
                 raise bad_rows(thing, what, 0, values.size, way_out)
 
     def plot(self, *signals: str) -> Figures:
@@ -789,7 +793,7 @@ def check_compatible(runs: Iterable[Run]) -> None:
             name = differing[0]
             raise DataError(
                 f"{who} have different units: signal {name!r} is in {units[name]!r} and {first_units[name]!r}, "
-                f"{len(differing)} in all; give the same units= when loading"
+                f"{len(differing)} in all; give the same {parameter('units')} when loading"
             )
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from ftlm.errors import DataError
+from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.validation import Floats, as_mapping, bad_rows, join_names, nearest
 
 Intersample: TypeAlias = Literal["zoh", "foh"]
@@ -55,12 +56,13 @@ def check_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]) 
     for signal, kind in as_mapping("intersample", {} if given is None else given).items():
         if signal not in inputs:
             raise DataError(
-                f"intersample=: {signal!r} is not an input{nearest(signal, inputs)}; the inputs are "
+                f"{parameter('intersample')}: {signal!r} is not an input{nearest(signal, inputs)}; the inputs are "
                 f"{join_names(inputs)}"
             )
         if kind != "zoh" and kind != "foh":  # noqa: PLR1714 — the type checker follows this
             raise DataError(
-                f"intersample=: {kind!r} of input {signal!r} is unknown; use 'zoh' (held) or 'foh' (linear)"
+                f"{parameter('intersample')}: {kind!r} of input {signal!r} is unknown; use 'zoh' (held) or 'foh' "
+                "(linear)"
             )
         checked[signal] = kind
     return checked
@@ -70,9 +72,9 @@ def check_step(step: object, argument: str) -> float:
     """Return a sampling interval [s]; raise if it is not positive and finite."""
     value = as_number(step)
     if value is None:
-        raise DataError(f"{argument}={step!r} is not a number; give the time between rows in s")
+        raise DataError(f"{parameter(argument, step)} is not a number; give the time between rows in s")
     if not _MIN_STEP_S <= value <= _MAX_STEP_S:
-        raise DataError(f"{argument}={value!r} is not a positive, finite time; give the time between rows in s")
+        raise DataError(f"{parameter(argument, value)} is not a positive, finite time; give the time between rows in s")
     return value
 
 
@@ -202,9 +204,7 @@ def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[F
     return (lambda t: mean + slope * (t - middle)), f"{mean - slope * middle:.6g} {sign} {abs(slope):.6g} t"
 
 
-def check_values(
-    values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str = "avoid them with window="
-) -> None:
+def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str | None = None) -> None:
     """Raise for values that are not finite or whose squares overflow; ``offset`` is the number of the first row.
 
     With `gaps`, NaN is accepted. ``instead`` is the second remedy in the error message for NaN.
@@ -218,12 +218,17 @@ def check_values(
     rows = np.flatnonzero(~good)
     value = float(values[rows[0]])
     first, count = offset + int(rows[0]), rows.size
+    avoided = f"avoid them with {parameter('window')}"
     if math.isnan(value):
-        raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead}")
+        raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead or avoided}")
     if math.isinf(value):
-        raise bad_rows(thing, f"infinity ({value})", first, count, "correct these rows, or avoid them with window=")
+        raise bad_rows(
+            thing, f"infinity ({value})", first, count, f"correct these rows, or avoid them with {parameter('window')}"
+        )
     what = f"{value!r} is larger than {MAX_SAMPLE_VALUE:g} and its square overflows"
-    raise bad_rows(thing, what, first, count, "correct these rows, scale the signal, or avoid them with window=")
+    raise bad_rows(
+        thing, what, first, count, f"correct these rows, scale the signal, or avoid them with {parameter('window')}"
+    )
 
 
 def check_increasing(clock: Floats, thing: str, offset: int) -> None:
@@ -258,13 +263,17 @@ def regular_step(
         if gaps.size:
             what = f"gap of {steps[gaps[0]]:.6g} s where {usual:.6g} s is usual"
             way_out = (
-                "load the part before or after it with window=, let the rows be missing with missing='hold', or put "
-                "the inputs on a regular grid with resample=STEP"
+                f"load the part before or after it with {parameter('window')}, let the rows be missing with "
+                f"{parameter('missing', 'hold')}, or put the inputs on a regular grid with "
+                f"{parameter('resample', Placeholder('STEP'))}"
             )
             raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
         rows = np.flatnonzero(deviation > _MAX_JITTER_SHARE * mean)
         share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _MAX_JITTER_SHARE:g} % allowed)"
-        way_out = "put the inputs on a regular grid with resample=STEP; outputs are compared when they were read"
+        way_out = (
+            f"put the inputs on a regular grid with {parameter('resample', Placeholder('STEP'))}; outputs are "
+            "compared when they were read"
+        )
         raise bad_rows(thing, f"jitter of up to {share}", offset + int(rows[0]), rows.size, way_out)
     fact: tuple[str, ...] = ()
     if worst > _MIN_REPORTED_JITTER_SHARE * mean:
@@ -294,20 +303,22 @@ def _short_decimal(mean: float, count: int, rounding: float, observed: float) ->
 def window_rows(clock: Floats, window: object, argument: str, thing: str = "time") -> tuple[int, int]:
     """Return the half-open range of rows with start ≤ t < stop."""
     if not isinstance(window, Sequence) or isinstance(window, str) or len(window) != 2:
-        raise DataError(f"{argument}={window!r} is not a pair (start, stop) of seconds; use None for an open end")
+        raise DataError(
+            f"{parameter(argument, window)} is not a pair (start, stop) of seconds; use None for an open end"
+        )
     limits: list[float | None] = []
     for limit in window:
         value = as_number(limit)
         if value is None and limit is not None:
-            raise DataError(f"{argument}: limit {limit!r} is not a number of seconds")
+            raise DataError(f"{parameter(argument)}: limit {limit!r} is not a number of seconds")
         if value is not None and not math.isfinite(value):
-            raise DataError(f"{argument}: limit {value!r} is not finite; use None for an open end")
+            raise DataError(f"{parameter(argument)}: limit {value!r} is not finite; use None for an open end")
         limits.append(value)
     start, stop = limits
     ends = clock[[0, -1]]
     if not np.isfinite(ends).all():
         row, count = 0 if not np.isfinite(ends[0]) else clock.size - 1, int((~np.isfinite(clock)).sum())
-        way_out = "remove these rows; window= counts from the first time"
+        way_out = f"remove these rows; {parameter('window')} counts from the first time"
         raise bad_rows(thing, "the first or last time is not finite", row, count, way_out)
     with np.errstate(over="ignore", invalid="ignore"):
         since = clock - clock[0]
@@ -319,11 +330,11 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     way_out = f"the record has times from 0 to {whole:.12g} s since its first row"
     for limit in (start, stop):
         if limit is not None and not -_EDGE_TOLERANCE_STEPS * step <= limit <= whole + _EDGE_TOLERANCE_STEPS * step:
-            raise DataError(f"{argument}: limit {limit!r} s is out of range; {way_out}")
+            raise DataError(f"{parameter(argument)}: limit {limit!r} s is out of range; {way_out}")
     low = 0.0 if start is None else start
     high = math.inf if stop is None else stop
     if low >= high:
-        raise DataError(f"{argument}: the limits {start!r} and {stop!r} s do not increase; {way_out}")
+        raise DataError(f"{parameter(argument)}: the limits {start!r} and {stop!r} s do not increase; {way_out}")
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero(
             (since >= low - _EDGE_TOLERANCE_STEPS * step) & (since < high - _EDGE_TOLERANCE_STEPS * step)
@@ -337,10 +348,12 @@ def check_rows(since: Floats, step: float) -> int:
     """Return the number of samples at a new step; raise if there are too many or too few."""
     spans = float(since[-1]) / step
     if spans + 1 > _MAX_RUN_SAMPLES:
-        raise DataError(f"resample={step!r} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
+        raise DataError(f"{parameter('resample', step)} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
     rows = math.floor(spans + _EDGE_TOLERANCE_STEPS) + 1
     if rows < MIN_RUN_SAMPLES:
-        raise DataError(f"resample={step!r} leaves {rows} rows, {MIN_RUN_SAMPLES} are needed; use a smaller step")
+        raise DataError(
+            f"{parameter('resample', step)} leaves {rows} rows, {MIN_RUN_SAMPLES} are needed; use a smaller step"
+        )
     return rows
 
 
@@ -413,8 +426,8 @@ def check_missing_policy(given: object) -> MissingPolicy:
         if given == known:
             return known
     raise DataError(
-        f"missing={given!r} is unknown; use 'refuse', 'weight' (outputs that were not read weigh nothing) or 'hold' "
-        "(inputs hold their last value besides)"
+        f"{parameter('missing', given)} is unknown; use 'refuse', 'weight' (outputs that were not read weigh "
+        "nothing) or 'hold' (inputs hold their last value besides)"
     )
 
 

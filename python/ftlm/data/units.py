@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Mapping
 
 from ftlm.errors import DataError
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import as_mapping, join_names, nearest
 
 #: SI unit and conversion factor of each accepted signal unit.
@@ -213,7 +214,7 @@ def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[s
         Two units that contradict each other, or a unit in the header that is not known where none is given.
     """
     if given is not None and (not isinstance(given, str) or given not in TIME_UNITS):
-        raise DataError(f"time_unit={given!r} is unknown; the known ones are {join_names(TIME_UNITS)}")
+        raise DataError(f"{parameter('time_unit', given)} is unknown; the known ones are {join_names(TIME_UNITS)}")
     stated = split_time_header(name)[1]
     if stated is None:
         return given or "s", ()
@@ -221,13 +222,13 @@ def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[s
         if given is None:
             raise DataError(
                 f"{label}: its header states the unit {stated!r}, which is unknown; the known ones are "
-                f"{join_names(TIME_UNITS)}; say with time_unit= in which the numbers are"
+                f"{join_names(TIME_UNITS)}; say with {parameter('time_unit')} in which the numbers are"
             )
         return given, ()
     if given is not None and TIME_UNITS[given] != TIME_UNITS[stated]:
         raise DataError(
-            f"{label}: its header states {stated!r}, and time_unit={given!r} is asked for; leave time_unit= out, or "
-            "rename the column"
+            f"{label}: its header states {stated!r}, and {parameter('time_unit', given)} is asked for; leave "
+            f"{parameter('time_unit')} out, or rename the column"
         )
     return stated, () if stated == "s" else (f"time read in {stated}, as the header {name!r} says",)
 
@@ -238,7 +239,8 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
     for signal, unit in given.items():
         if signal not in signals:
             raise DataError(
-                f"units=: {signal!r} is not a signal{nearest(signal, signals)}; the signals are {join_names(signals)}"
+                f"{parameter('units')}: {signal!r} is not a signal{nearest(signal, signals)}; the signals are "
+                f"{join_names(signals)}"
             )
         if not isinstance(unit, str) or unit not in SIGNAL_UNITS:
             raise DataError(

@@ -13,6 +13,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.estimation.fit import Fit
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import minimum_norm_solution
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import autoregression, is_constant
 from ftlm.utils.validation import Floats, nearest
 from ftlm.validation.residual_tests import DEFAULT_LAGS, past_regressors
@@ -41,28 +42,30 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     """
     if reference in structure.signals:
         raise ModelError(
-            f"reference={reference!r} is a signal of the model; a reference drives the loop from outside, and the "
-            "model does not read it"
+            f"{parameter('reference', reference)} is a signal of the model; a reference drives the loop from "
+            "outside, and the model does not read it"
         )
     for run in runs:
         if run.sample_times is not None:
             raise DataError(
-                f"run {run.name!r} has rows with times of their own, but the answer of an input to reference= is found "
-                "on regular ones; give regular rows"
+                f"run {run.name!r} has rows with times of their own, but the answer of an input to "
+                f"{parameter('reference')} is found on regular ones; give regular rows"
             )
         if reference not in run:
             raise DataError(
-                f"run {run.name!r} has no signal {reference!r}{nearest(reference, run.signals)} for reference=; it has "
-                f"{', '.join(run.signals)}"
+                f"run {run.name!r} has no signal {reference!r}{nearest(reference, run.signals)} for "
+                f"{parameter('reference')}; it has {', '.join(run.signals)}"
             )
     inputs = [s for s in structure.signals if s in runs[0].inputs]
     if not inputs:
         raise DataError(
-            f"reference={reference!r}: the model reads no input of run {runs[0].name!r} that it could drive"
+            f"{parameter('reference', reference)}: the model reads no input of run {runs[0].name!r} that it could drive"
         )
     moves = [run[reference] for run in runs]
     if is_constant(moves):
-        raise DataError(f"reference={reference!r} does not move, so it explains nothing; record one that does")
+        raise DataError(
+            f"{parameter('reference', reference)} does not move, so it explains nothing; record one that does"
+        )
     shortest = min(run.length for run in runs)
     ends = np.cumsum([run.length for run in runs])[:-1]
     laws = [

@@ -23,6 +23,7 @@ from ftlm.estimation.objective import Iterate, Objective, covariance, covariance
 from ftlm.estimation.output_error import JointFit, Loss, ProfileInterval, fit_output_error
 from ftlm.estimation.result import Identification
 from ftlm.utils.linalg import dot, projections, thin_svd
+from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import interruptible_pool
 from ftlm.utils.validation import Floats, real_number
 
@@ -614,8 +615,7 @@ def with_intervals(
     if found.incomplete_names:
         warnings.append(
             f"the cost is no parabola along {', '.join(found.incomplete_names)}, and its profile there would take "
-            "long: these "
-            "intervals are rough; intervals='profile' finds them"
+            f"long: these intervals are rough; {parameter('intervals', 'profile')} finds them"
         )
     return replace(joint, profiles=found.intervals), warnings
 
@@ -639,7 +639,9 @@ def is_lower_on_finer_grid(grid: Objective, before: Floats, after: Floats) -> bo
 def likelihood_of(result: Identification) -> ProfileLikelihood:
     """Return the profile likelihood around the optimum of an output-error result."""
     if result.fit is None or result.task is None:
-        raise ModelError(f"method {result.method!r} has no likelihood to profile; identify by method='output-error'")
+        raise ModelError(
+            f"method {result.method!r} has no likelihood to profile; identify by {parameter('method', 'output-error')}"
+        )
     problem = FreeProblem.of(replace(result.task.structure, initial=result.fit.initial))
     return ProfileLikelihood.of(result.fit, problem, result.task.runs)
 
@@ -654,8 +656,8 @@ def result_profiles(
     """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
     if "reference" in result.settings:
         raise ModelError(
-            "a fit with reference= is where residuals are orthogonal to instruments, and no minimum of a cost: it has "
-            "no profile; use its standard errors"
+            f"a fit with {parameter('reference')} is where residuals are orthogonal to instruments, and no minimum "
+            "of a cost: it has no profile; use its standard errors"
         )
     valley = likelihood_of(result)
     unknown = [n for n in names if n not in valley.names]
@@ -670,6 +672,6 @@ def result_profiles(
     if found.lower_optimum is not None:
         raise ConvergenceError(
             "the profile leads to an optimum below this fit's, so its estimates are not the likeliest; identify again "
-            "with intervals='profile', which goes on from there"
+            f"with {parameter('intervals', 'profile')}, which goes on from there"
         )
     return found.intervals

@@ -20,6 +20,7 @@ from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, format_bound
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
 from ftlm.utils.validation import whole_number
 from ftlm.validation.comparison import compare, finite
@@ -269,7 +270,7 @@ def consistency(
     runs: Run | Sequence[Run],
     structure: Structure,
     *,
-    parts: int | None = None,
+    segments: int | None = None,
     method: str | EstimationMethod = "output-error",
     offset: Offset | None = None,
     m: int | None = None,
@@ -311,11 +312,13 @@ def consistency(
         A segment whose fit fails.
     """
     every = as_runs(runs)
-    given = None if parts is None else whole_number(parts)
-    if parts is not None and (given is None or given < DEFAULT_SEGMENTS):
-        raise ModelError(f"parts = {parts!r}; use a whole number, at least {DEFAULT_SEGMENTS}")
+    given = None if segments is None else whole_number(segments)
+    if segments is not None and (given is None or given < DEFAULT_SEGMENTS):
+        raise ModelError(f"{setting('segments')} {segments!r}; use a whole number, at least {DEFAULT_SEGMENTS}")
     if len(every) > 1 and given is not None:
-        raise ModelError(f"{len(every)} runs are parts by themselves; leave parts= out, or give one run")
+        raise ModelError(
+            f"{len(every)} runs are segments by themselves; leave {parameter('segments')} out, or give one run"
+        )
     chosen = resolve_method(method)
     kept = [n for n in ("store", "start") if getattr(chosen, n, None) is not None]
     if kept:
@@ -331,7 +334,7 @@ def consistency(
         if not results[0].standard_errors:
             raise ModelError(
                 f"method {results[0].method!r} gives no standard errors of {structure}, and without them nothing tells "
-                "whether numbers differ; use method='output-error', and leave something to estimate"
+                f"whether numbers differ; use {parameter('method', 'output-error')}, and leave something to estimate"
             )
         if progress is not None:
             progress(len(results), len(pieces))

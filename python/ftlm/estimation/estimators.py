@@ -32,6 +32,7 @@ from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.linalg import orthonormal, projections, vector_norm
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
 
@@ -187,7 +188,7 @@ def estimate_output_error(
         structure = replace(structure, initial="history")
         warnings.append(
             f"{', '.join(r.name for r in task.runs)}: the first values look like rest, but the residuals of a fit from "
-            "rest ask for what was before; initial='history' was used"
+            f"rest ask for what was before; {parameter('initial', 'history')} was used"
         )
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))

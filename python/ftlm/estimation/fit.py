@@ -12,6 +12,7 @@ from ftlm.estimation.result import Task
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
 from ftlm.structure.structure import History, Initial, Structure
+from ftlm.utils.parameters import parameter
 
 ProgressCallback = Callable[[int, int], None] | None
 
@@ -68,7 +69,8 @@ def check_no_friction(structure: Structure, method: str) -> None:
     if structure.has_friction:
         output = structure.outputs[structure.friction_equations[0]]
         raise ModelError(
-            f"the equation of {output} has friction, which method={method!r} does not know; use method='output-error'"
+            f"the equation of {output} has friction, which {parameter('method', method)} does not know; use "
+            f"{parameter('method', 'output-error')}"
         )
 
 

@@ -22,6 +22,7 @@ from ftlm.structure.input_nonlinearity import FreeInputParameter
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Hints, History, Offset, Structure
 from ftlm.utils.linalg import dot, vector_norm
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, check_known, real_number
 
 
@@ -201,11 +202,13 @@ def warm_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[s
     bounds = dict(zip(problem.names, problem.all_bounds, strict=True))
     check_known("start value", known, problem.names)
     if not known:
-        raise ModelError(f"start= has none of the numbers that are free: {', '.join(problem.names)}")
+        raise ModelError(f"{parameter('start')} has none of the numbers that are free: {', '.join(problem.names)}")
     for name, value in known.items():
         low, high = bounds[name]
         if not low <= real_number(f"start value of {name}", value) <= high:
-            raise ModelError(f"start= has {name} = {value:g}, out of its bounds {low:g} to {high:g}; widen them")
+            raise ModelError(
+                f"{parameter('start')} has {name} = {value:g}, out of its bounds {low:g} to {high:g}; widen them"
+            )
     places: dict[str, list[float]] = {}
     for name, (low, high) in bounds.items():
         if name in known:

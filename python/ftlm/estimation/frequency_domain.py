@@ -24,6 +24,7 @@ from ftlm.structure.order import MAX_DEFAULT_SEARCH_ORDER, MAX_IMPROPER_ORDER, M
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared_99, is_white
 from ftlm.utils.validation import Complex, Floats, as_floats, check_known
@@ -588,7 +589,8 @@ def identify_frequency(
     fits = [f for f in fits if math.isfinite(f.cost)]
     if not fits:
         raise ConvergenceError(
-            "no start has a finite response: the lattice of orders is empty or singular; widen orders=, or give start="
+            "no start has a finite response: the lattice of orders is empty or singular; widen "
+            f"{parameter('orders')}, or give {parameter('start')}"
         )
     first = min(fits, key=lambda f: f.cost)
     reached = sum(
@@ -640,11 +642,13 @@ def _structure(
     if wanted.limits:
         raise ModelError(f"{wanted.limits[0].signal} saturates or has a dead zone, {lacking}; identify runs over time")
     if wanted.offset != "none":
-        raise ModelError(f"the equations have an offset, {lacking}; leave '+ c' out, or offset=")
+        raise ModelError(f"the equations have an offset, {lacking}; leave '+ c' out, or {parameter('offset')}")
     if wanted.sensor_filter is not None:
         raise ModelError("the structure has a sensor filter; divide the data by its response, and leave it out")
     if wanted.coefficient_law:
-        raise ModelError("the structure has a law of its coefficients, which this fit does not keep; leave laws= out")
+        raise ModelError(
+            f"the structure has a law of its coefficients, which this fit does not keep; leave {parameter('laws')} out"
+        )
     if not (wanted.order_names or wanted.coefficient_names or wanted.free_inputs):
         raise ModelError("nothing is free: every order, coefficient and delay is a number; name what is unknown")
     return replace(wanted, coupling="simulated", initial="auto")
@@ -664,13 +668,14 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
                 if len(known) > 1:
                     raise DataError(
                         f"{record.name} does not say its {side}, and the equations have {', '.join(known)}; say "
-                        f"{side}= when loading it"
+                        f"{parameter(side)} when loading it"
                     )
                 own[side] = known[0]
             elif own[side] not in known:
                 raise DataError(
                     f"{record.name} has the {side} {own[side]!r}, which is no {side} of the equations; these have "
-                    f"{', '.join(known)}: write the equation in the names of the data, or say {side}= when loading"
+                    f"{', '.join(known)}: write the equation in the names of the data, or say {parameter(side)} when "
+                    "loading"
                 )
         found.append(replace(record, output=own["output"], input=own["input"]))
     for output in outputs:
@@ -686,18 +691,24 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
     """Return the kind of weights and the factor of each residual."""
     if not isinstance(weights, str):
         if len(records) > 1:
-            raise ModelError("weights= as an array are of one record; give each record its deviation instead")
+            raise ModelError(
+                f"{parameter('weights')} as an array are of one record; give each record its deviation instead"
+            )
         (record,) = records
         return "deviation", [1.0 / _given_deviations(record, weights)]
     if weights not in ("auto", "relative", "uniform", "deviation"):
         raise ModelError(
-            f"weights={weights!r} is not known; use 'auto', 'relative', 'uniform', 'deviation' or standard deviations"
+            f"{parameter('weights', weights)} is not known; use 'auto', 'relative', 'uniform', 'deviation' or "
+            "standard deviations"
         )
     known = [r.deviation for r in records]
     if weights == "deviation" or (weights == "auto" and all(d is not None for d in known)):
         without = [r.name for r, d in zip(records, known, strict=True) if d is None]
         if without:
-            raise DataError(f"{without[0]} states no standard deviation; use weights='relative' or give deviation=")
+            raise DataError(
+                f"{without[0]} states no standard deviation; use {parameter('weights', 'relative')} or give "
+                f"{parameter('deviation')}"
+            )
         return "deviation", [1.0 / d for d in known if d is not None]
     if weights == "uniform":
         return "uniform", [np.ones(r.frequency.size) for r in records]
@@ -707,7 +718,7 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
             at = int(np.argmin(size))
             raise DataError(
                 f"{record.name}: the response is 0 at row {at}, {int(np.sum(size == 0))} in all, and has no relative "
-                "weight; leave such rows out, or use weights='uniform'"
+                f"weight; leave such rows out, or use {parameter('weights', 'uniform')}"
             )
     return "relative", [1.0 / np.abs(r.response) for r in records]
 
@@ -744,7 +755,9 @@ def _user_start(
     values = np.array([float(start.get(n, 1.0 if k < free else 0.0)) for k, n in enumerate(problem.names)])
     begun = problem.in_problem_units(values)
     if not (np.all(np.isfinite(values)) and np.all(rows @ begun <= limits + 1e-9)):
-        raise ModelError("start= is out of the bounds of orders or delays, or not finite; choose values within them")
+        raise ModelError(
+            f"{parameter('start')} is out of the bounds of orders or delays, or not finite; choose values within them"
+        )
     return [begun]
 
 

@@ -23,6 +23,7 @@ from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, wrap_text
+from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 from ftlm.validation.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, group_warnings
@@ -300,7 +301,9 @@ class FrequencyIdentification:
                 found.append((LEVEL_WITH_CARE, words, "fewer free numbers, or both records in one fit"))
         same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
         if others is None or same:
-            found.append((LEVEL_WITH_CARE, NOT_TRIED, "validate(load_frequency(file)), or --validation FILE"))
+            found.append(
+                (LEVEL_WITH_CARE, NOT_TRIED, choose_text("validate(load_frequency(file))", "--validation FILE"))
+            )
         found.sort(key=lambda item: item[0] != LEVEL_DO_NOT_USE)
         if found:
             level, reason, remedy = found[0]
@@ -340,7 +343,7 @@ class FrequencyIdentification:
             [
                 *lines,
                 *(f"note: {w}" for r in self.data for w in r.warnings),
-                *finding_lines(self.warnings, "result.warnings"),
+                *finding_lines(self.warnings, choose_text("result.warnings", "--verbose shows all")),
             ]
         )
 
@@ -468,8 +471,8 @@ def assign_signals(model: Model, record: FrequencyData) -> FrequencyData:
             out[side] = known[0]
         if out[side] not in known:
             raise DataError(
-                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(known)}; say {side}= when "
-                "loading it"
+                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(known)}; say "
+                f"{parameter(side)} when loading it"
             )
     return replace(record, output=out["output"], input=out["input"])
 

@@ -24,6 +24,7 @@ from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, check_choice, check_threads, whole_number
 
 #: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
@@ -233,12 +234,12 @@ def genetic_search(
     if records[0].offset != "none":
         raise ModelError(
             f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
-            "use method='output-error', or offset='none'"
+            f"use {parameter('method', 'output-error')}, or {parameter('offset', 'none')}"
         )
     if records[0].start != (False, []):
         raise ModelError(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "
-            "slice the runs, or give the structure initial='rest'"
+            f"slice the runs, or give the structure {parameter('initial', 'rest')}"
         )
     problem = GeneticProblem(records, structure, settings, check_threads(threads))
     wanted = settings.evaluations or problem.size
@@ -485,15 +486,16 @@ class GeneticAlgorithm:
         check_choice("norm", self.norm, get_args(Norm))
         population = whole_number(self.population)
         if population is None or not 8 <= population <= 100_000:
-            raise ModelError(f"population = {self.population!r} is outside [8, 100000]")
+            raise ModelError(f"{setting('population')} {self.population!r} is outside [8, 100000]")
         if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
             raise ModelError(
-                f"evaluations = {self.evaluations!r} is less than two generations of {self.population}; give more"
+                f"{setting('evaluations')} {self.evaluations!r} is less than two generations of {self.population}; "
+                "give more"
             )
         given = self.seeds if isinstance(self.seeds, Iterable) and not isinstance(self.seeds, str) else [None]
         seeds = [whole_number(s) for s in given]
         if not seeds or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
-            raise ModelError(f"seeds = {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
+            raise ModelError(f"{setting('seeds')} {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
         if not isinstance(self.bounds, Mapping):
             raise ModelError(f"bounds = {self.bounds!r} is no mapping; write {{name: (low, high)}}")
         for name, pair in self.bounds.items():

@@ -38,6 +38,7 @@ from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
 from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
@@ -93,7 +94,7 @@ def _history_offset_warnings(fit: Fit) -> list[str]:
     return [
         f"what {', '.join(fit.model.outputs)} did before the runs is estimated with {joint.initial_terms} powers of "
         f"time; an unknown constant in the equation explains as much with {less} numbers fewer: if a sensor's zero, a "
-        "load or a mean may be there, offset='auto' estimates it"
+        f"load or a mean may be there, {parameter('offset', 'auto')} estimates it"
     ]
 
 
@@ -215,12 +216,13 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
     if structure.has_friction:
         raise ModelError(
             f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the test of "
-            "offset='auto' does not know; use offset='constant', whose interval says whether it is 0, or offset='none'"
+            f"{parameter('offset', 'auto')} does not know; use {parameter('offset', 'constant')}, whose interval "
+            f"says whether it is 0, or {parameter('offset', 'none')}"
         )
     if getattr(method, "store", None) is not None:
         raise ModelError(
-            "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
-            "offset='constant' with store="
+            f"{parameter('offset', 'auto')} may need two searches, and a store keeps those of one; use "
+            f"{parameter('offset', 'none')} or {parameter('offset', 'constant')} with {parameter('store')}"
         )
 
 
@@ -393,7 +395,7 @@ def identify_many(
     if getattr(chosen, "store", None) is not None:
         raise ModelError("a store keeps one identification; call identify for each run with a store of its own")
     if executor is not None and getattr(chosen, "executor", None) is not None:
-        raise ModelError("the method has an executor besides executor=; leave one of the two out")
+        raise ModelError(f"the method has an executor besides {parameter('executor')}; leave one of the two out")
     options = {"method": chosen, "offset": offset, "m": m, "threads": threads}
     if executor is None:
         every = []

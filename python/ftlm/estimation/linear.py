@@ -18,6 +18,7 @@ from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, whole_number
 
 #: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
@@ -102,7 +103,8 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
         if not converged:
             fit.warnings.append(
                 f"{outputs}: instrumental variables did not stand still in {iterations} steps; the coefficients are "
-                "those of the least output error met. Too much noise for these terms: use method='output-error'"
+                "those of the least output error met. Too much noise for these terms: use "
+                f"{parameter('method', 'output-error')}"
             )
         if damped:
             fit.warnings.append(f"{outputs}: the free run of these coefficients is unstable; do not trust them")
@@ -138,7 +140,7 @@ def step_bias_warnings(
     amount = f"about {moved[worst]:.2g}" if moved[worst] <= 10 else "more than 10"
     return [
         f"at {fit.m} pulses the step alone moves coefficient {worst} by {amount} standard errors, which do "
-        f"not count it; {finer}use method='output-error', which refines the step"
+        f"not count it; {finer}use {parameter('method', 'output-error')}, which refines the step"
     ]
 
 
@@ -151,7 +153,7 @@ def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: 
     return [
         f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
         f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs "
-        "the data against it. Raise prior_covariance or use method='least-squares'"
+        f"the data against it. Raise prior_covariance or use {parameter('method', 'least-squares')}"
     ]
 
 
@@ -220,7 +222,9 @@ def multi_innovation_trace(
     if len(equation.equations) != 1 or equation.order_names:
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
     if equation.offset != "none":
-        raise ModelError(f"a trace follows no offset, and offset = {equation.offset!r}; use offset='none'")
+        raise ModelError(
+            f"a trace follows no offset, and offset = {equation.offset!r}; use {parameter('offset', 'none')}"
+        )
     stride = whole_number(every)
     if stride is None or stride < 1:
         raise ModelError(f"every = {every!r} is no whole number from 1; 1 gives every step")
@@ -271,7 +275,9 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
     steps = traces[0][1].step
     for name, trace in traces:
         if not np.array_equal(trace.step, steps):
-            raise DataError(f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same every=")
+            raise DataError(
+                f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same {parameter('every')}"
+            )
     return line_chart(
         steps,
         [(name, trace.error) for name, trace in traces],
@@ -327,8 +333,8 @@ class Streaming:
             )
         if structure.offset != "none":
             raise ModelError(
-                f"offset = {structure.offset!r} cannot be followed in a stream; identify the recorded run, or use "
-                "offset='none'"
+                f"{setting('offset')} {structure.offset!r} cannot be followed in a stream; identify the recorded "
+                f"run, or use {parameter('offset', 'none')}"
             )
         if (
             structure.delay

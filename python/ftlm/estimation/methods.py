@@ -22,6 +22,7 @@ from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, S
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_choice, check_threads
 
 
@@ -92,8 +93,8 @@ class OutputError:
             raise ModelError(f"reference is {type(self.reference).__name__}, not the name of a signal of the runs")
         if self.intervals == "profile" and self.reference is not None:
             raise ModelError(
-                "intervals='profile' needs a cost that has its minimum at the estimate, and reference= has none; use "
-                "intervals='quadratic', or leave it out"
+                f"{parameter('intervals', 'profile')} needs a cost that has its minimum at the estimate, and "
+                f"{parameter('reference')} has none; use {parameter('intervals', 'quadratic')}, or leave it out"
             )
 
     def fit(
@@ -109,7 +110,7 @@ class OutputError:
         if self.reference is not None and structure.has_friction:
             raise ModelError(
                 f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the "
-                f"instrument reference={self.reference!r} does not know; leave one of the two out"
+                f"instrument {parameter('reference', self.reference)} does not know; leave one of the two out"
             )
         workers, answers, weak = check_threads(threads), None, list[str]()
         if self.reference is not None:
@@ -267,9 +268,11 @@ def method_with_options(name: str, options: Mapping[str, Any]) -> EstimationMeth
     names = {method: [f.name for f in fields(kind)] for method, kind in METHODS.items()}
     foreign = [option for option in options if option not in names[name]]
     if foreign:
-        users = " or ".join(f"method={method!r}" for method, known in names.items() if foreign[0] in known)
+        users = " or ".join(parameter("method", method) for method, known in names.items() if foreign[0] in known)
         count = len(foreign) - 1
         others = f", nor {count} other{'s' if count > 1 else ''} given here" if count else ""
-        raise ModelError(f"{foreign[0]}= is not used by method={name!r}{others}; leave it out, or use {users}")
+        raise ModelError(
+            f"{parameter(foreign[0])} is not used by {parameter('method', name)}{others}; leave it out, or use {users}"
+        )
     made: EstimationMethod = METHODS[name](**options)
     return made

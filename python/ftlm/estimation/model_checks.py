@@ -19,6 +19,7 @@ from ftlm.simulation.discretization import compared_values, has_nonuniform_sampl
 from ftlm.simulation.output_samples import OutputSamples
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, is_white, robust_deviation
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_warnings
@@ -192,9 +193,8 @@ def _outlier_warning(runs: Sequence[Run], joint: JointFit, output: str) -> str |
     power = f" and {held} {100 * share:.0f} % of their squares" if share >= MIN_OUTLIER_POWER_FRACTION else ""
     return (
         f"{far} of {count} residuals of {output} {verb} beyond {OUTLIER_DEVIATIONS:g} times the usual one{power}, "
-        f"{first}: "
-        f"{'an outlier' if far == 1 else 'outliers'}, or moments "
-        "that the model does not explain; squares let them cost precision: loss='huber' weighs them down"
+        f"{first}: {'an outlier' if far == 1 else 'outliers'}, or moments that the model does not explain; squares "
+        f"let them cost precision: {parameter('loss', 'huber')} weighs them down"
     )
 
 
@@ -331,7 +331,8 @@ def friction_direction_warnings(model: Model, free: Sequence[OutputSamples]) -> 
 
     return [
         f"the velocity of {model.outputs[i]} never changes its sign in a run: while it slides, friction is a constant "
-        "like the offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
+        "like the offset, and only the rests tell them apart; add a run that moves both ways, or use "
+        f"{parameter('offset', 'none')}"
         for i in model.structure.friction_equations
         if not any(turns(run.outputs[i]) for run in free)
     ]

@@ -36,6 +36,7 @@ from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Structure, offset_exponents
 from ftlm.utils.linalg import dot, orthonormal, projections, thin_svd
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, SIGNIFICANCE_LEVEL, autoregression, chi_squared
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
@@ -225,8 +226,7 @@ def unrequested_offset_warnings(test: OffsetTest | None, outputs: Sequence[str])
     return [
         f"an unknown constant in the equation of {', '.join(outputs)} explains {100 * min(test.share, 1):.2g} % of "
         f"what the model misses ({test.statistic_text}): a sensor's zero, a load, a voltage at rest; use "
-        "offset='constant' "
-        "or offset='auto'"
+        f"{parameter('offset', 'constant')} or {parameter('offset', 'auto')}"
     ]
 
 

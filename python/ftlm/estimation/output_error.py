@@ -25,6 +25,7 @@ from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Structure
 from ftlm.utils.formatting import format_bound
+from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import memory_limit, stop_flag
 from ftlm.utils.statistics import NORMAL_95, estimate_noise
 from ftlm.utils.validation import Floats
@@ -412,7 +413,7 @@ def parameter_set_of(model: Model) -> FitParameters:
         how = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
         raise ModelError(
             f"this model {how}, or of a file that does not say what was free in its fit: without intervals and noise "
-            "no experiment can be laid out; identify it with method='output-error'"
+            f"no experiment can be laid out; identify it with {parameter('method', 'output-error')}"
         )
     return known
 

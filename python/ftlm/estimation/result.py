@@ -19,6 +19,7 @@ from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import format_bound
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, Metrics, filter_state, finite
@@ -183,7 +184,9 @@ class Identification:
             A model without coefficient law or intervals, or a name that is no parameter of it.
         """
         if self.fit is None:
-            raise ModelError(f"method {self.method!r} gives no joint covariance; identify by method='output-error'")
+            raise ModelError(
+                f"method {self.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
+            )
         return physical_parameters(self.fit, known)
 
     def profile(

@@ -17,6 +17,7 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.result import Identification
 from ftlm.model.model import Estimate, Model, ModelFinding
 from ftlm.utils.formatting import format_bound
+from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import MAX_FIT_DROP_POINTS, MAX_NORMALIZED_RESIDUAL, Comparison, Metrics
 from ftlm.validation.findings import (
@@ -145,7 +146,7 @@ def _combined_verdict(
         found += _validation_losses(before, comparison)
     found += [a for a in own if a.level == LEVEL_WITH_CARE]
     if not tried:
-        found.append(_make_finding(LEVEL_WITH_CARE, NOT_TRIED, "validate(run), or --validation FILE"))
+        found.append(_make_finding(LEVEL_WITH_CARE, NOT_TRIED, choose_text("validate(run)", "--validation FILE")))
     bad = [a for a in found if a.level == LEVEL_DO_NOT_USE] + [a for a in found if a.level == LEVEL_WITH_CARE]
     if not bad:
         return None
@@ -180,7 +181,9 @@ def saved_findings(known: Estimate) -> list[ModelFinding]:
     if unseen:
         found.append(
             _make_finding(
-                LEVEL_DO_NOT_USE, f"the runs do not tell {_join_names(unseen)} apart", _KINDS_BY_NAME["unseen"].remedy
+                LEVEL_DO_NOT_USE,
+                f"the runs do not tell {_join_names(unseen)} apart",
+                _KINDS_BY_NAME["unseen"].format_remedy(),
             )
         )
     before = {n: f for n, f in known.fit.items() if f is not None}
@@ -190,10 +193,14 @@ def saved_findings(known: Estimate) -> list[ModelFinding]:
             "unseen",
         ):
             reason = f"{concern.kind.what}: {_first_clause(concern.warnings[0])}"
-            found.append(_make_finding(concern.kind.level, reason, concern.kind.remedy))
+            found.append(_make_finding(concern.kind.level, reason, concern.kind.format_remedy()))
     if not known.standard_errors:
         found.append(
-            _make_finding(LEVEL_WITH_CARE, f"{known.method} gives no standard errors", "use method='output-error'")
+            _make_finding(
+                LEVEL_WITH_CARE,
+                f"{known.method} gives no standard errors",
+                f"use {parameter('method', 'output-error')}",
+            )
         )
     return found
 
@@ -207,7 +214,7 @@ def _rules(result: Identification) -> Iterator[ModelFinding]:
     kinds = {c.kind.name: c for c in group_warnings(result.warnings)}
 
     def of(kind: WarningKind, reason: str = "", remedy: str = "") -> ModelFinding:
-        return _make_finding(kind.level, reason or kind.what, remedy or kind.remedy)
+        return _make_finding(kind.level, reason or kind.what, remedy or kind.format_remedy())
 
     yield from _free_runs(result)
     errors, joint = result.standard_errors, result.fit
@@ -239,7 +246,7 @@ def _rules(result: Identification) -> Iterator[ModelFinding]:
         yield _make_finding(
             LEVEL_WITH_CARE,
             f"{result.method} gives no standard errors, so nothing says how sure its numbers are",
-            "use method='output-error'",
+            f"use {parameter('method', 'output-error')}",
         )
 
 

@@ -23,6 +23,7 @@ from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_li
 from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr
@@ -326,7 +327,9 @@ def _check_arguments(
     if reference_run is None and isinstance(model, Identification) and model.task is not None:
         reference_run = model.task.runs[0]
     if reference_run is not None and not isinstance(reference_run, Run):
-        raise ModelError(f"like is {type(reference_run).__name__}, not a Run; give a run that the machine bore")
+        raise ModelError(
+            f"reference_run is {type(reference_run).__name__}, not a Run; give a run that the machine bore"
+        )
     free = parameter_set_of(solved)
     outputs = solved.outputs
     laid = ModelFit.of(solved, per_signal_values("noise", noise, outputs, free.noise))
@@ -344,8 +347,8 @@ def _check_arguments(
     rows = round(min(length / time, 1e9)) + 1
     if not MIN_RUN_SAMPLES <= rows <= MAX_RUN_SAMPLES:
         raise ModelError(
-            f"duration = {length:g} s in steps of {time:g} s are {rows} rows; give a run of {MIN_RUN_SAMPLES} to "
-            f"{MAX_RUN_SAMPLES} rows"
+            f"{setting('duration')} {length:g} s in steps of {time:g} s are {rows} rows; give a run of "
+            f"{MIN_RUN_SAMPLES} to {MAX_RUN_SAMPLES} rows"
         )
     swings = dict.fromkeys(outputs, math.inf) | (
         {} if reference_run is None else _largest_values(reference_run, outputs, moved=True)
@@ -368,15 +371,15 @@ def _check_arguments(
         slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
         raise ModelError(
             f"slew of {slow} = {bounds.slews[slow]:g} a second takes {ramp * time:.3g} s from one peak to the other, "
-            f"of {length:g} s in all: no input of that peak can be kept within it; lower peak=, or raise slew= or "
-            "duration="
+            f"of {length:g} s in all: no input of that peak can be kept within it; lower {parameter('peak')}, or "
+            f"raise {parameter('slew')} or {parameter('duration')}"
         )
     _check_stable(laid, bounds)
     _check_uncertainty(laid, time, length)
     at = _parameter_indices(laid, parameters)
     if not isinstance(criterion, str) or criterion not in ("D", "E"):
         raise ModelError(
-            f"criterion = {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
+            f"{setting('criterion')} {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
         )
     # An order is of size 1 by itself; what else is known, is known as a share of itself.
     units = [1.0 if laid.names[i] in laid.problem.orders else abs(laid.values[i]) or 1.0 for i in at]
@@ -385,7 +388,9 @@ def _check_arguments(
         _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]") / time
     )
     if not 2 <= every <= 2 * rows:
-        raise ModelError(f"period = {period:g} s is not between two steps and twice the run; give another one")
+        raise ModelError(
+            f"{setting('period')} {period:g} s is not between two steps and twice the run; give another one"
+        )
     told = () if solved.estimate is None else solved.estimate.warnings
     colour = next((w for w in told if "not white" in w), None)
     words = (
@@ -413,16 +418,16 @@ def _check_signals(laid: ModelFit, reference_run: Run | None) -> None:
     if lacking:
         raise DataError(
             f"run {reference_run.name!r} has no input {lacking[0]!r}{nearest(lacking[0], reference_run.inputs)}, which "
-            "drives the model; give the run of that machine, or leave reference_run= out"
+            f"drives the model; give the run of that machine, or leave {parameter('reference_run')} out"
         )
 
 
 def _positive(name: str, value: object, what: str) -> float:
     if value is None:
-        raise ModelError(f"{name} is not given; give {name}= {what}, or reference_run= a run")
+        raise ModelError(f"{name} is not given; give {parameter(name)} {what}, or {parameter('reference_run')} a run")
     number = real_number(name, value)
     if not (number > 0 and math.isfinite(number)):
-        raise ModelError(f"{name} = {number:g} is not {what} above 0; give one")
+        raise ModelError(f"{setting(name)} {number:g} is not {what} above 0; give one")
     return number
 
 
@@ -473,7 +478,7 @@ def _check_stable(laid: ModelFit, bounds: Bounds) -> None:
     if found.origin_order > 0 and drifting:
         raise ModelError(
             f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; "
-            "say how far it may go by limits= (--limit), or give reference_run= a run"
+            f"say how far it may go by {parameter('limits')}, or give {parameter('reference_run')} a run"
         )
 
 

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, nearest, real_number, short_repr
 
 Kind = Literal["D", "E"]
@@ -164,7 +165,8 @@ def per_signal_values(
         if said is None:
             if default is None or name not in default:
                 raise ModelError(
-                    f"{what} of {name} is not given; give {what}= a number, or one by name, or reference_run= a run"
+                    f"{what} of {name} is not given; give {parameter(what)} a number, or one by name, or "
+                    f"{parameter('reference_run')} a run"
                 )
             out[name] = default[name]
             continue

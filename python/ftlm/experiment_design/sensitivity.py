@@ -18,6 +18,7 @@ from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.utils.linalg import orthonormal, thin_svd
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats
 
 #: Relative size below which a direction of the offset responses is rounding error.
@@ -213,7 +214,7 @@ def _offset_responses(laid: ModelFit, step: float, rows: int) -> Floats:
     structure = laid.problem.structure
     drives = {"none": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
-        raise ModelError(f"offset = {structure.offset!r} of the model is not decided; identify it again")
+        raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not decided; identify it again")
     if not drives:
         return np.zeros((0, len(laid.outputs) * rows))
     taken = {*structure.signals, *structure.coefficient_names, *structure.order_names}

@@ -32,7 +32,8 @@ SECONDS_LIMIT = 60
 SIZE_LIMIT = 1 << 30
 MAX_ARRAYS = 10_000
 MAX_GROUP_DEPTH = 8
-SHEET_CHOICE_HINT = "say which with layout=dict(sheet=NAME)"
+#: Remedy that the parent completes with the parameter of the interface in use.
+SHEET_CHOICE_HINT = "say which sheet"
 SAVE_AGAIN = "save it again with save('FILE.mat', '-v7')"
 NUMERIC_MATLAB_CLASSES = frozenset(
     ("double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")

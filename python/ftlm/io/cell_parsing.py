@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ftlm.data.units import TIME_UNITS, parse_unit, split_time_header
 from ftlm.errors import DataError
+from ftlm.utils.parameters import layout_parameter
 from ftlm.utils.validation import Floats, bad_rows
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
@@ -272,7 +273,7 @@ class Timestamps:
                 "a date that is none",
                 int(np.flatnonzero(bad)[0]),
                 int(bad.sum()),
-                "correct these rows, or say the order of day and month with layout=dict(dates='dmy')",
+                f"correct these rows, or say the order of day and month with {layout_parameter(dates='dmy')}",
             )
         months = (12 * (year - 1970) + month - 1).astype("datetime64[M]")
         days = months.astype("datetime64[D]").astype(np.int64) + day - 1
@@ -304,12 +305,12 @@ class Timestamps:
             return {"ymd": (0, 1, 2), "dmy": (2, 1, 0), "mdy": (2, 0, 1)}[order]
         if first > 12:
             raise DataError(
-                f"{thing}: {self.first!r} may begin with the year or with the day; say layout=dict(dates='ymd') or "
-                "layout=dict(dates='dmy')"
+                f"{thing}: {self.first!r} may begin with the year or with the day; say "
+                f"{layout_parameter(dates='ymd')} or {layout_parameter(dates='dmy')}"
             )
         raise DataError(
-            f"{thing}: {self.first!r} may begin with the day or with the month; say layout=dict(dates='dmy') or "
-            "layout=dict(dates='mdy')"
+            f"{thing}: {self.first!r} may begin with the day or with the month; say {layout_parameter(dates='dmy')} or "
+            f"{layout_parameter(dates='mdy')}"
         )
 
 

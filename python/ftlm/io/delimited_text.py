@@ -32,6 +32,7 @@ from ftlm.io.cell_parsing import (
 )
 from ftlm.io.dialect import SEPARATOR_WORDS, Assumption, Layout, TableDialect, find_table
 from ftlm.io.table import Column, FileTable
+from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
 from ftlm.utils.validation import bad_rows
 
 _BLOCK_BYTES = 8 << 20
@@ -40,7 +41,14 @@ _SAMPLE_CHARACTERS, _MIN_SAMPLE_LINES = 1 << 16, 8
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF32 = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
 _MAX_UNPACKED_BYTES = 1 << 30
-_FILL_HINT = "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
+
+
+def _fill_hint() -> str:
+    """Remedy for cells without a number."""
+    return (
+        f"fill or remove these rows yourself, or let them be missing with {parameter('missing', 'weight')} or "
+        f"{parameter('missing', 'hold')}"
+    )
 
 
 @dataclass
@@ -64,21 +72,23 @@ class _BadCells:
         way_out = "correct or remove these rows"
         if not text:
             what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
-            way_out = _FILL_HINT
+            way_out = _fill_hint()
         elif is_gap(text):
             what = f"{shown} stands for no number"
-            way_out = _FILL_HINT
+            way_out = _fill_hint()
         elif (mark := detect_thousands_separator(text, comma=self.comma)) is not None:
             what = f"{shown} has marks between thousands"
-            way_out = f"say layout=dict(thousands={mark!r}), or write all numbers without"
+            way_out = f"say {layout_parameter(thousands=mark)}, or write all numbers without"
         elif self.comma and "." in text and is_number(text):
             what = f"{shown} has a point where decimals follow a comma"
             way_out = "write all numbers alike"
             if may_group(text, "point", comma=True):
-                way_out += ", or say layout=dict(thousands='point') where points group thousands"
+                way_out += f", or say {layout_parameter(thousands='point')} where points group thousands"
         elif DECIMAL_COMMA.fullmatch(text):
             what = f"{shown} has a decimal comma"
-            way_out = "write all numbers alike, or say layout=dict(decimal='comma') where all of them have commas"
+            way_out = (
+                f"write all numbers alike, or say {layout_parameter(decimal='comma')} where all of them have commas"
+            )
         elif self.other:
             what = f"{shown} and {self.other!r} are dates or times of day written in two ways"
             way_out = "write all alike"
@@ -207,7 +217,7 @@ def _with_gaps(
     if len(gaps) > 1:
         words = f"lines {gaps[0]} to {gaps[-1]}, right below the header, are empty and left out"
     header = 1 if found.units is None else 2
-    return replace(found, assumed=(*found.assumed, Assumption("header", header, words, "layout=dict(header=1)")))
+    return replace(found, assumed=(*found.assumed, Assumption("header", header, words, layout_parameter(header=1))))
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
@@ -307,7 +317,7 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
                 f"dates or times of day, not numbers ({moments.first!r})",
                 0,
                 rows.count,
-                "name it with time=, or choose another column",
+                f"name it with {parameter('time')}, or choose another column",
             )
         unit = (found.units[k] if found.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
         blank = trouble is not None and trouble.blank
@@ -347,7 +357,7 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
         zeros, others = head[offset:4000:2].count(0), head[1 - offset : 4000 : 2].count(0)
         if zeros > 4 and others == 0 and zeros > 0.8 * len(head[offset:4000:2]):
             words = f"every other byte is 0, so the text is {name}"
-            return name, (Assumption("encoding", name, words, "layout=dict(encoding=NAME)", False),)
+            return name, (Assumption("encoding", name, words, layout_parameter(encoding=Placeholder("NAME")), False),)
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError as error:
@@ -356,10 +366,11 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
             zipped = ": it begins as workbooks do, whose names end in .xlsx or .ods" if head[:2] == b"PK" else ""
             raise DataError(
                 f"{path.name}: line {at} is not UTF-8 text (byte {head[error.start]:#04x}), and other bytes are of no "
-                f"text at all{zipped}; say layout=dict(encoding=NAME), or pass a csv, text or .mat file"
+                f"text at all{zipped}; say {layout_parameter(encoding=Placeholder('NAME'))}, or pass a csv, text or "
+                ".mat file"
             ) from None
         words = f"no UTF-8 (byte {head[error.start]:#04x}), taken for cp1252 of Windows, which numbers do not depend on"
-        otherwise = "layout=dict(encoding=NAME)"
+        otherwise = layout_parameter(encoding=Placeholder("NAME"))
         try:
             head.decode("cp1252")
         except UnicodeDecodeError:
@@ -405,11 +416,13 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
 
 def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
     if not isinstance(error, UnicodeDecodeError):
-        return DataError(f"{path.name}: the text is no {encoding} ({error}); say layout=dict(encoding=NAME)")
+        return DataError(
+            f"{path.name}: the text is no {encoding} ({error}); say {layout_parameter(encoding=Placeholder('NAME'))}"
+        )
     at, byte = line + error.object[: error.start].count(b"\n"), error.object[error.start]
     return DataError(
-        f"{path.name}: line {at} is not {encoding.upper()} text (byte {byte:#04x}); say layout=dict(encoding='cp1252') "
-        "if it is that of Windows, or save it as UTF-8"
+        f"{path.name}: line {at} is not {encoding.upper()} text (byte {byte:#04x}); say "
+        f"{layout_parameter(encoding='cp1252')} if it is that of Windows, or save it as UTF-8"
     )
 
 

@@ -19,6 +19,7 @@ from ftlm.io.cell_parsing import (
     split_cells,
     unit_of,
 )
+from ftlm.utils.parameters import Placeholder, layout_fields, layout_parameter, parameter
 from ftlm.utils.validation import join_names, nearest, whole_number
 
 #: Cell separators by name; None means any white space.
@@ -82,24 +83,30 @@ class Layout:
             if given is not None:
                 object.__setattr__(self, option, _word(option, given, known))
         if self.separator == self.decimal == "comma":
-            raise DataError("layout=: separator and decimal are both a comma; cells could not be told apart")
+            raise DataError(f"{layout_fields('separator', 'decimal')} are both a comma; cells could not be told apart")
         if self.thousands is not None and self.thousands == self.decimal:
-            raise DataError(f"layout=: thousands and decimal are both a {self.decimal}; say which of them it is")
+            raise DataError(
+                f"{layout_fields('thousands', 'decimal')} are both a {self.decimal}; say which of them it is"
+            )
         if self.separator == self.thousands == "space":
-            raise DataError("layout=: separator and thousands are both a space; cells could not be told apart")
+            raise DataError(
+                f"{layout_fields('separator', 'thousands')} are both a space; cells could not be told apart"
+            )
         if self.dates is not None and self.dates not in DATE_ORDERS:
-            raise DataError(f"layout=: dates is {self.dates!r}; the known orders are {join_names(DATE_ORDERS)}")
+            raise DataError(
+                f"{layout_fields('dates')} is {self.dates!r}; the known orders are {join_names(DATE_ORDERS)}"
+            )
         for option, most in (("skip", _MAX_SKIPPED_LINES), ("header", 2)):
             given = getattr(self, option)
             count = None if given is None else whole_number(given)
             if given is not None and (count is None or not 0 <= count <= most):
                 what = "0, 1 (names) or 2 (names and units)" if option == "header" else "a number of lines from 0"
-                raise DataError(f"layout=: {option} is {given!r}; give {what}")
+                raise DataError(f"{layout_fields(option)} is {given!r}; give {what}")
             object.__setattr__(self, option, count)
         if self.encoding is not None:
             object.__setattr__(self, "encoding", _encoding(self.encoding))
         if self.sheet is not None and not isinstance(self.sheet, str):
-            raise DataError(f"layout=: sheet is a {type(self.sheet).__name__}; give the name of a sheet")
+            raise DataError(f"{layout_fields('sheet')} is a {type(self.sheet).__name__}; give the name of a sheet")
 
     @classmethod
     def of(cls, given: object) -> Layout:
@@ -109,12 +116,15 @@ class Layout:
         if isinstance(given, Layout):
             return given
         if not isinstance(given, Mapping):
-            raise DataError(f"layout= is a {type(given).__name__}; pass a dict, such as dict(decimal='comma')")
+            raise DataError(
+                f"{parameter('layout')} is a {type(given).__name__}; pass a dict, such as dict(decimal='comma')"
+            )
         known = [f.name for f in fields(cls)]
         for key in given:
             if key not in known:
                 raise DataError(
-                    f"layout=: {key!r} is unknown{nearest(key, known)}; the known keys are {join_names(known)}"
+                    f"{parameter('layout')}: {key!r} is unknown{nearest(key, known)}; the known keys are "
+                    f"{join_names(known)}"
                 )
         return cls(**given)
 
@@ -130,7 +140,7 @@ class Layout:
         """Raise if an option is set that this file format does not use."""
         unused = [option for option in self.to_dict() if option not in used]
         if unused:
-            raise DataError(f"{path}: layout=: {unused[0]!r} is not used with {kind}; leave it out")
+            raise DataError(f"{path}: {layout_fields(unused[0])} is not used with {kind}; leave it out")
 
 
 @dataclass(frozen=True)
@@ -169,7 +179,7 @@ def _word(option: str, given: object, known: Mapping[str, str | None]) -> str:
         for word, character in known.items():
             if given == (" " if character is None else character) or (character == "\t" and given == "\\t"):
                 return word
-    raise DataError(f"layout=: {option} is {given!r}; the known ones are {join_names(known)}")
+    raise DataError(f"{layout_fields(option)} is {given!r}; the known ones are {join_names(known)}")
 
 
 def _encoding(given: object) -> str:
@@ -181,7 +191,8 @@ def _encoding(given: object) -> str:
         b"a".decode(name, errors="replace")  # some codecs of Python are none of text
     except (LookupError, ValueError):
         raise DataError(
-            f"layout=: encoding is {str(given)[:40]!r}, which is unknown; utf-8, utf-16, cp1252 and latin-1 are known"
+            f"{layout_fields('encoding')} is {str(given)[:40]!r}, which is unknown; utf-8, utf-16, cp1252 and "
+            "latin-1 are known"
         ) from None
     return name
 
@@ -288,7 +299,10 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
         given = Layout(separator="tab", decimal="point", thousands="none").under(given)
     kept = [(at, line) for at, line in lines if at > (given.skip or 0)]
     if not kept:
-        raise DataError(f"{source}: no table below the first {given.skip} lines; say another number with layout=")
+        raise DataError(
+            f"{source}: no table below the first {given.skip} lines; say another number with "
+            f"{layout_parameter(skip=Placeholder('LINES'))}"
+        )
     separator, comma, mark, cut = _choose_separator(kept, given, source)
     width = _width(cut)
     first = 0 if given.skip is not None and given.header is not None else _first_row(cut, width)
@@ -364,7 +378,7 @@ def _choose_separator(
         if best is None or rank > best[0]:
             best = rank, separator, comma, mark, cut
     if best is None:
-        raise DataError(f"{source}: the separator and the decimals that layout= says do not go together; say others")
+        raise DataError(f"{source}: {layout_fields('separator', 'decimal')} do not go together; say others")
     _, separator, comma, mark, cut = best
     if given.decimal is None and given.separator is None and separator == ",":
         _check_commas(kept, cut, source)
@@ -475,7 +489,9 @@ def _header(
         # A header of numbers looks like a row.
         top = count
     if count > top:
-        raise DataError(f"{source}: layout= says {count} lines of header, and {top} stand above the rows; say fewer")
+        raise DataError(
+            f"{source}: {layout_fields('header')} says {count} lines, and {top} stand above the rows; say fewer"
+        )
     if count == 0:
         return None, None, top
     line = cut[top - count]
@@ -486,7 +502,7 @@ def _header(
     if commas and not own and count == 1:
         raise DataError(
             f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is no line of names; say "
-            "layout=dict(decimal='comma')"
+            f"{layout_parameter(decimal='comma')}"
         )
     check_distinct(names, line.at, source)
     if count == 1:
@@ -524,7 +540,7 @@ def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool,
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
             f"a table of {width} cells a row; give every line the same number of cells, or say how many lines to leave "
-            "out with layout=dict(skip=LINES)"
+            f"out with {layout_parameter(skip=Placeholder('LINES'))}"
         )
 
 
@@ -555,7 +571,7 @@ def _check_commas(kept: Sequence[tuple[int, str]], cut: list[_Line], source: str
         at, shown = rows[0][0].at, rows[0][1].strip()[:40]
         raise DataError(
             f"{source}: line {at}: the commas of {shown!r} may stand between cells or before decimals; say "
-            "layout=dict(separator='comma'), or layout=dict(decimal='comma') where spaces separate"
+            f"{layout_parameter(separator='comma')}, or {layout_parameter(decimal='comma')} where spaces separate"
         )
 
 
@@ -571,7 +587,7 @@ def _check_thousands(cut: list[_Line], source: str) -> None:
         at, shown = cells[0]
         raise DataError(
             f"{source}: line {at}: the comma of {shown!r} may stand before decimals or group thousands, as in every "
-            "other number there; say layout=dict(decimal='comma'), or write them without"
+            f"other number there; say {layout_parameter(decimal='comma')}, or write them without"
         )
 
 
@@ -584,8 +600,8 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
     if len(both[0]) > header.width and len(both) > 1 and len({len(cells) for cells in both}) == 1:
         raise DataError(
             f"{source}: line {header.at} and the rows below it have commas and {SEPARATOR_WORDS[separator]}s between "
-            f"their cells; write one separator, or say layout=dict(separator={_WORDS_BY_SEPARATOR[separator]!r}, "
-            "decimal='comma')"
+            "their cells; write one separator, or say "
+            f"{layout_parameter(separator=_WORDS_BY_SEPARATOR[separator], decimal='comma')}"
         )
 
 
@@ -614,25 +630,29 @@ def _summarize_layout(
     assumed = []
     if given.separator is None:
         words = f"{SEPARATOR_WORDS[separator]} between cells"
-        assumed.append(Assumption("separator", str(layout.separator), words, "layout=dict(separator=NAME)", False))
+        assumed.append(
+            Assumption(
+                "separator", str(layout.separator), words, layout_parameter(separator=Placeholder("NAME")), False
+            )
+        )
     if given.decimal is None and comma:
         shown = _decimal_comma(cut)
-        words, otherwise = f"decimal commas, as in {shown!r}", "layout=dict(decimal='point')"
+        words, otherwise = f"decimal commas, as in {shown!r}", layout_parameter(decimal="point")
         assumed.append(Assumption("decimal", "comma", words, otherwise))
     if given.thousands is None and mark is not None:
         shown = next(
             c.strip() for line in cut for c in line.cells if detect_thousands_separator(c, comma=comma) == mark
         )
         words = f"{mark}s group thousands, as in {shown!r}"
-        assumed.append(Assumption("thousands", mark, words, "layout=dict(thousands='none')"))
+        assumed.append(Assumption("thousands", mark, words, layout_parameter(thousands="none")))
     if given.skip is None and skip:
         words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
-        assumed.append(Assumption("skip", skip, words, "layout=dict(skip=LINES)"))
+        assumed.append(Assumption("skip", skip, words, layout_parameter(skip=Placeholder("LINES"))))
     if given.header is None and units is not None:
         words = f"line {cut[top - 1].at} holds units"
-        assumed.append(Assumption("header", 2, words, "layout=dict(header=1)"))
+        assumed.append(Assumption("header", 2, words, layout_parameter(header=1)))
     elif given.header is None and header == 0:
         assumed.append(
-            Assumption("header", 0, "no line of names: columns are c1, c2, …", "layout=dict(header=1)", False)
+            Assumption("header", 0, "no line of names: columns are c1, c2, …", layout_parameter(header=1), False)
         )
     return layout, tuple(assumed)

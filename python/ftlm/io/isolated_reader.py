@@ -21,10 +21,13 @@ from ftlm.io.cell_parsing import Timestamps
 from ftlm.io.delimited_text import parse_text
 from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.table import Column, FileTable
+from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
 from ftlm.utils.validation import bad_rows
 
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
 _READER_TIMEOUT_S = 60.0
+#: Remedy of the reader that the parent completes with the parameter of the interface in use.
+_SHEET_CHOICE_HINT = "say which sheet"
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,10 @@ class _ReaderOutput:
             return None
         header, arrays, cells = answer
         if "error" in header:
-            raise DataError(f"{str(path)!r}: {header['error']}; {header['way_out']}")
+            remedy = str(header["way_out"])
+            if remedy == _SHEET_CHOICE_HINT:
+                remedy += f" with {layout_parameter(sheet=Placeholder('NAME'))}"
+            raise DataError(f"{str(path)!r}: {header['error']}; {remedy}")
         if "sheet" in header:
             return _sheet(path, header, cells, layout)
         skipped = cast("dict[str, str]", header.get("skipped", {}))
@@ -221,7 +227,7 @@ def _sheet(path: Path, header: dict[str, object], cells: bytes, layout: Layout) 
     others = header.get("others")
     if layout.sheet is None and isinstance(others, list) and others:
         words = f"sheet {sheet!r}, the only one that is not empty"
-        assumed = Assumption("sheet", sheet, words, "layout=dict(sheet=NAME)")
+        assumed = Assumption("sheet", sheet, words, layout_parameter(sheet=Placeholder("NAME")))
         table = replace(table, assumed=(assumed, *table.assumed))
     return table
 
@@ -269,6 +275,10 @@ def _timestamp_column(path: Path, array: _Array) -> Column:
     first = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"
     moments = Timestamps(np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first)
     problem = bad_rows(
-        thing, f"dates, not numbers ({first})", 0, values.size, "name it with time=, or choose another column"
+        thing,
+        f"dates, not numbers ({first})",
+        0,
+        values.size,
+        f"name it with {parameter('time')}, or choose another column",
     )
     return Column(name, name, path, values, problem, timestamps=moments)

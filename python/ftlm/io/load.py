@@ -22,6 +22,7 @@ from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Layout
 from ftlm.io.isolated_reader import binary_format_of, read_isolated
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.parameters import NAMED_COLUMNS, parameter
 from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, join_names, names_to_columns, nearest
 
 PathLike: TypeAlias = str | os.PathLike[str]
@@ -161,8 +162,8 @@ def run_from_tables(tables: list[FileTable], wanted: ColumnSelection, options: L
     _check_disjoint_roles(wanted, pool)
     if not wanted.outputs:
         raise DataError(
-            f"no output is named; name the signals with inputs={{name: column}} and outputs={{name: column}}, "
-            f"or in a columns file (commands: -u NAME=COLUMN -y NAME=COLUMN, or --columns FILE); {pool.describe()}"
+            f"no output is named; name the signals with {parameter('inputs', NAMED_COLUMNS)} and "
+            f"{parameter('outputs', NAMED_COLUMNS)}, or in a file for {parameter('columns')}; {pool.describe()}"
         )
     labels: dict[str, str] = {}
     used: list[Column] = []
@@ -225,7 +226,10 @@ def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: Loa
     given = options.time_unit
     if wanted.step is not None:
         if given is not None:
-            raise DataError(f"time_unit={given!r} is the unit of time=, which is not used; step= is in s")
+            raise DataError(
+                f"{parameter('time_unit', given)} is the unit of {parameter('time')}, which is not used; "
+                f"{parameter('step')} is in s"
+            )
         return _TimeColumn()
     column, assumed = pool.time(wanted.time, used)
     label = f"{column.source.name}: column {column.name!r} (time)"
@@ -234,7 +238,9 @@ def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: Loa
         unit, said = time_unit_of(time_header(column), label, given)
         return _TimeColumn(column.numbers(), unit, label, column.name, facts + said)
     if given is not None:
-        raise DataError(f"time_unit={given!r} is the unit of numbers, and {label} holds dates or times of day")
+        raise DataError(
+            f"{parameter('time_unit', given)} is the unit of numbers, and {label} holds dates or times of day"
+        )
     seconds = column.timestamps.seconds(label, wanted.layout.dates)
     order = date_order_assumption(column, wanted.layout.dates)
     facts += () if order is None else (str(order),)
@@ -349,11 +355,11 @@ def select_columns(
     """Merge the column selection of the arguments and of a columns file; arguments take precedence."""
     told = _columns_file(columns)
     if time is not None and step is not None:
-        raise DataError("time= and step=: both are given; pass one of them")
+        raise DataError(f"{parameter('time')} and {parameter('step')}: both are given; pass one of them")
     if time is None and step is None:
         time, step = told.get("time"), told.get("step")
         if time is not None and step is not None:
-            raise DataError("columns=: both time and step are given; keep one of them")
+            raise DataError(f"{parameter('columns')}: both time and step are given; keep one of them")
     return ColumnSelection(
         time,
         cast("float | None", step),
@@ -374,7 +380,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
         return {}
     told: Mapping[str, object]
     if isinstance(columns, Mapping):
-        told, source = columns, "columns="
+        told, source = columns, parameter("columns")
     elif isinstance(columns, (str, os.PathLike)):
         path = Path(columns)
         source = repr(str(path))
@@ -389,7 +395,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
                 "of name = column"
             ) from None
     else:
-        raise DataError(f"columns= is a {type(columns).__name__}; pass a dict or the path of a TOML file")
+        raise DataError(f"{parameter('columns')} is a {type(columns).__name__}; pass a dict or the path of a TOML file")
     unknown = [key for key in told if key not in _COLUMN_KEYS]
     if unknown:
         raise DataError(
@@ -415,7 +421,7 @@ def _apply_header(wanted: ColumnSelection, header: Header) -> None:
         told = wanted.units.get(name)
         if stated and told and told != stated:
             raise DataError(
-                f"units=: {told!r} is asked for signal {name!r}, and the file itself says {stated!r}; "
+                f"{parameter('units')}: {told!r} is asked for signal {name!r}, and the file itself says {stated!r}; "
                 "leave the unit out for a file written by ftlm"
             )
         if stated and not told:

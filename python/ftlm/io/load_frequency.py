@@ -15,6 +15,7 @@ from ftlm.io.dialect import Layout
 from ftlm.io.load import PathLike, base_name, read_tables
 from ftlm.io.table import Column, Pool
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.parameters import PART_COLUMNS, parameter
 from ftlm.utils.validation import Complex, Floats, join_names, nearest
 
 #: Column names of each part, case-folded, without spaces and underscores; a leading minus inverts the sign.
@@ -233,7 +234,7 @@ def load_frequency(
     if "real" in found and "imag" in found:
         if magnitude_unit is not None or phase_unit is not None:
             which = "magnitude_unit" if magnitude_unit is not None else "phase_unit"
-            raise DataError(f"{which}= is not used: the file gives real and imaginary part; leave it out")
+            raise DataError(f"{parameter(which)} is not used: the file gives real and imaginary part; leave it out")
         response, factor, unit = _cartesian(found, negated, notes)
         if "magnitude" in found:
             _compare(found, response / factor, notes)
@@ -266,7 +267,7 @@ def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
         if item.part in found:
             raise DataError(
                 f"the columns {found[item.part].column.name!r} and {column.name!r} may both be the {item.part}; name "
-                "one with columns={part: column}"
+                f"one with {parameter('columns', PART_COLUMNS)}"
             )
         found[item.part] = item
     _check_parts(found, pool)
@@ -299,7 +300,7 @@ def _check_parts(found: Mapping[str, _ResponseColumn], pool: Pool) -> None:
     missing = "the frequency" if "frequency" not in found else "real and imaginary part, or magnitude and phase"
     raise DataError(
         f"{missing} cannot be told from the names of the columns (known are: {known}); name them with "
-        f"columns={{part: column}}, parts frequency, real and imag, or frequency, magnitude and phase; "
+        f"{parameter('columns', PART_COLUMNS)}, parts frequency, real and imag, or frequency, magnitude and phase; "
         f"{pool.describe()}"
     )
 
@@ -359,18 +360,18 @@ def _frequencies(item: _ResponseColumn, asked: str | None, notes: list[str]) -> 
         frequency_factor(asked)
         if stated and stated != asked:
             raise DataError(
-                f"column {item.column.name!r} states {stated}, and frequency_unit={asked!r} is asked for; leave "
-                "frequency_unit= out, or rename the column"
+                f"column {item.column.name!r} states {stated}, and {parameter('frequency_unit', asked)} is asked "
+                f"for; leave {parameter('frequency_unit')} out, or rename the column"
             )
     unit = asked or stated
     if not unit:
         if item.unit:
             raise DataError(
                 f"column {item.column.name!r} states the unit {item.unit!r}, which is no unit of frequency; say "
-                f"frequency_unit=, one of {', '.join(FREQUENCY_UNITS)}"
+                f"{parameter('frequency_unit')}, one of {', '.join(FREQUENCY_UNITS)}"
             )
         unit = "rad/s" if item.word in _ANGULAR_FREQUENCY_NAMES else "Hz"
-        notes.append(f"frequencies {item.column.name!r} taken for {unit}; otherwise frequency_unit=")
+        notes.append(f"frequencies {item.column.name!r} taken for {unit}; otherwise {parameter('frequency_unit')}")
     return values * FREQUENCY_UNITS[unit]
 
 
@@ -406,11 +407,14 @@ def _cartesian(
     turned = imag.is_negated if negated is None else _truth("negated", negated)
     x, y = (i.column.numbers().astype(np.float64) for i in (real, imag))
     if turned and negated is None:
-        notes.append(f"column {imag.column.name!r} holds the negative imaginary part, by its name; otherwise negated=")
+        notes.append(
+            f"column {imag.column.name!r} holds the negative imaginary part, by its name; otherwise "
+            f"{parameter('negated')}"
+        )
     elif negated is None and imag.word.startswith("z") and np.mean(y > 0) > 0.5:
         notes.append(
             f"the imaginary part {imag.column.name!r} is positive in {int(np.sum(y > 0))} of {y.size} rows, as of an "
-            "inductance; if it holds -Z'', say negated=True"
+            f"inductance; if it holds -Z'', say {parameter('negated', True)}"
         )
     response: Complex = np.asarray(factor * (x - 1j * y if turned else x + 1j * y), dtype=np.complex128)
     return response, factor, unit or _magnitude_scale(imag)[1]
@@ -436,8 +440,8 @@ def _polar(
     if decibels == "dB" and "deviation" in found:
         raise DataError(
             f"column {found['deviation'].column.name!r} is taken for the standard deviation of the real and of the "
-            "imaginary part, and sizes in dB have another; "
-            "give real and imaginary part, or name the others with columns={part: column}"
+            "imaginary part, and sizes in dB have another; give real and imaginary part, or name the others with "
+            f"{parameter('columns', PART_COLUMNS)}"
         )
     written = _PHASE_UNIT_FACTORS.get(angle.unit.casefold())
     stated = None if written is None else "rad" if written == 1.0 else "mrad" if written == 1e-3 else "deg"
@@ -449,11 +453,13 @@ def _polar(
         bad = values < 0
         raise DataError(
             f"column {size.column.name!r}: a size is negative, first at row {int(np.argmax(bad))}, {int(bad.sum())} in "
-            "all; say magnitude_unit='dB' if these are decibels"
+            f"all; say {parameter('magnitude_unit', 'dB')} if these are decibels"
         )
     turned = angle.is_negated if negated is None else _truth("negated", negated)
     if turned and negated is None:
-        notes.append(f"column {angle.column.name!r} holds the negative phase, by its name; otherwise negated=")
+        notes.append(
+            f"column {angle.column.name!r} holds the negative phase, by its name; otherwise {parameter('negated')}"
+        )
     response: Complex = factor * values * np.exp((-1j if turned else 1j) * radians * phase)
     return response, factor, unit
 
@@ -465,23 +471,27 @@ def _resolve_unit(
     if asked is not None:
         if asked not in known:
             hint = nearest(asked, known)
-            raise DataError(f"{what}_unit={asked!r} is unknown{hint}; the known ones are {join_names(known)}")
+            raise DataError(
+                f"{parameter(f'{what}_unit', asked)} is unknown{hint}; the known ones are {join_names(known)}"
+            )
         if stated is not None and stated != asked:
             raise DataError(
-                f"column {item.column.name!r} states {stated}, and {what}_unit={asked!r} is asked for; leave "
-                f"{what}_unit= out, or rename the column"
+                f"column {item.column.name!r} states {stated}, and {parameter(f'{what}_unit', asked)} is asked for; "
+                f"leave {parameter(f'{what}_unit')} out, or rename the column"
             )
         return asked
     if stated is not None:
         return stated
     words = "a size, not decibels" if what == "magnitude" else "degrees"
-    notes.append(f"the {what} {item.column.name!r} is taken for {words}; otherwise {what}_unit={known[1]!r}")
+    notes.append(
+        f"the {what} {item.column.name!r} is taken for {words}; otherwise {parameter(f'{what}_unit', known[1])}"
+    )
     return known[0]
 
 
 def _truth(name: str, value: object) -> bool:
     if not isinstance(value, bool):
-        raise DataError(f"{name}={value!r} is neither True nor False")
+        raise DataError(f"{parameter(name)}{value!r} is neither True nor False")
     return value
 
 

@@ -28,6 +28,7 @@ from ftlm.io.load import (
 )
 from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, flag_of, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
 _INPUT_WORDS = frozenset(
@@ -286,23 +287,17 @@ class OpenedFile:
         # Options that are detected reliably or equal the default are omitted.
         plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
         words = []
-        for key, option in (
-            ("time", "--time"),
-            ("step", "--sampling"),
-            ("time_unit", "--time-unit"),
-            ("resample", "--resample"),
-            ("missing", "--missing"),
-        ):
+        for key in ("time", "step", "time_unit", "resample", "missing"):
             if key in told and key not in plain:
-                words += [option, str(told[key])]
+                words += [flag_of(key), str(told[key])]
         if "window" in told:
-            words += ["--slice", ":".join("" if end is None else repr(end) for end in told["window"])]
-        for key, option in (("inputs", "-u"), ("outputs", "-y"), ("units", "--unit"), ("intersample", "--intersample")):
+            words += [flag_of("window"), ":".join("" if end is None else repr(end) for end in told["window"])]
+        for key in ("inputs", "outputs", "units", "intersample"):
             bare = key in ("inputs", "outputs")
             pairs = (name if bare and name == value else f"{name}={value}" for name, value in told.get(key, {}).items())
-            words += [w for pair in pairs for w in (option, pair)]
+            words += [w for pair in pairs for w in (flag_of(key), pair)]
         told_layout: Layout = told.get("layout", Layout())
-        words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (f"--{k}", str(v))]
+        words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (flag_of(k), str(v))]
         return words
 
 
@@ -408,7 +403,11 @@ class _FilePreview:
             return clock, (assumed,), ""
         if wanted.time is None and clock.matrix is not None:
             words = f"the time is the first column of the matrix, {clock.name!r}"
-            return clock, (Assumption("time", clock.name, words, "time=COLUMN", False),), ""
+            return (
+                clock,
+                (Assumption("time", clock.name, words, f"{parameter('time', Placeholder('COLUMN'))}", False),),
+                "",
+            )
         return clock, (), ""
 
     def _roles(
@@ -437,13 +436,21 @@ class _FilePreview:
         if guessed:
             inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
             words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
-            said.append(Assumption("inputs", inputs, words, "inputs={name: column}, outputs={name: column}"))
+            said.append(
+                Assumption(
+                    "inputs",
+                    inputs,
+                    words,
+                    f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}",
+                )
+            )
         left = ""
         if not wanted.outputs:
             choice = join_names((c.name for c in every if c is not clock and _has_numbers(c)), 20)
             left = (
                 "which columns are inputs and which are outputs, their names do not say; name them with "
-                f"inputs={{name: column}} and outputs={{name: column}}; there are {choice or 'none'}"
+                f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
+                f"{choice or 'none'}"
             )
             wordy = (c for c in every if c is not clock and not _has_numbers(c) and c.timestamps is None)
             others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in wordy]
@@ -464,7 +471,7 @@ class _FilePreview:
         if self.asked.time_unit is not None or known or clock.problem is not None:
             return ()
         words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
-        return (Assumption("time_unit", "s", words, "time_unit=UNIT", False),)
+        return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
         """Return the arguments of `load` that give the same run."""

@@ -15,6 +15,7 @@ from ftlm.data.units import is_time_name, split_time_header
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import Timestamps, is_time_unit, split_slash_unit, split_unit
 from ftlm.io.dialect import Assumption, Layout
+from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
 from ftlm.utils.validation import bad_rows, join_names, nearest
 
 _RELATIVE_TIME_TOLERANCE = 1e-9
@@ -171,11 +172,10 @@ class Pool:
             if len(named) > 1:
                 raise DataError(
                     f"{table.path.name}: the columns {join_names(column.name for column in named)} may all be the "
-                    "time; "
-                    "name one with time="
+                    f"time; name one with {parameter('time')}"
                 )
             if named and why:
-                assumed = Assumption("time", named[0].name, why, "time=COLUMN")
+                assumed = Assumption("time", named[0].name, why, parameter("time", Placeholder("COLUMN")))
             clocks += named
         if not clocks:
             matrices = dict.fromkeys(column.matrix for column in used if column.matrix is not None)
@@ -183,7 +183,8 @@ class Pool:
         if not clocks:
             raise DataError(
                 "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
-                f"name it with time=, or give the time between rows with step=; {self.describe()}"
+                f"name it with {parameter('time')}, or give the time between rows with {parameter('step')}; "
+                f"{self.describe()}"
             )
         for other in clocks[1:]:
             _check_agreement(clocks[0], other)
@@ -213,7 +214,7 @@ def date_order_assumption(clock: Column, dates: str | None) -> Assumption | None
         return None
     first = "day" if order == "dmy" else "month"
     words = f"dates begin with the {first}, as in {clock.timestamps.first!r}"
-    return Assumption("dates", order, words, "layout=dict(dates=ORDER)")
+    return Assumption("dates", order, words, layout_parameter(dates=Placeholder("ORDER")))
 
 
 def _check_agreement(one: Column, other: Column) -> None:
@@ -221,12 +222,15 @@ def _check_agreement(one: Column, other: Column) -> None:
     if one.timestamps is not None and other.timestamps is not None:
         own, its = (np.column_stack([c.parts, c.clock]) for c in (one.timestamps, other.timestamps))
         if one.timestamps.mark != other.timestamps.mark or not np.array_equal(own, its):
-            raise DataError(f"{names} differ; give files of one record, or name the time to use with time=")
+            raise DataError(
+                f"{names} differ; give files of one record, or name the time to use with {parameter('time')}"
+            )
         return
     a, b = one.numbers(), other.numbers()
     if a.size != b.size:
         raise DataError(
-            f"{names} have {a.size} and {b.size} rows; give files of one record, or name the time with time="
+            f"{names} have {a.size} and {b.size} rows; give files of one record, or name the time with "
+            f"{parameter('time')}"
         )
     with np.errstate(invalid="ignore", over="ignore"):
         same = np.abs(np.subtract(a, b, dtype=np.float64)) <= _RELATIVE_TIME_TOLERANCE * max(
@@ -239,5 +243,5 @@ def _check_agreement(one: Column, other: Column) -> None:
             f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}",
             int(rows[0]),
             rows.size,
-            "give files of one record, or name the time to use with time=",
+            f"give files of one record, or name the time to use with {parameter('time')}",
         )

@@ -15,6 +15,7 @@ from ftlm.simulation.discretization import named_signals
 from ftlm.structure.equation import Equation
 from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
 from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import real_number, whole_number
 
@@ -25,10 +26,6 @@ DEFAULT_MAX_CELLS = 20_000_000
 DEFAULT_MAX_TERM_RATIO = 100.0
 #: Settings of an order search for which a certificate exists.
 CERTIFIED_SETTINGS: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
-_WAY_OUT = (
-    "rank by squared equation errors with least-squares coefficients (criterion='equation-error', norm='l2', "
-    "coefficients='least-squares'), or ask for none"
-)
 
 
 def certify_orders(
@@ -94,38 +91,42 @@ def certify_orders(
     share = _check_tolerance(tolerance)
     most = whole_number(max_cells)
     if most is None or not 1 <= most < 1 << 62:
-        raise ModelError(f"max_cells = {max_cells!r} is no whole number from 1; the default is {DEFAULT_MAX_CELLS}")
+        raise ModelError(
+            f"{setting('max_cells')} {max_cells!r} is no whole number from 1; the default is {DEFAULT_MAX_CELLS}"
+        )
     gap = real_number(
-        "apart",
+        "min_separation",
         (order_grid.increment if isinstance(order_grid, OrderGrid) else DEFAULT_INCREMENT)
         if min_separation is None
         else min_separation,
     )
     if not 0 < gap <= 1:
-        raise ModelError(f"min_separation = {min_separation!r} is outside (0, 1]; the step of the lattice is usual")
-    size = real_number("largest", max_term_ratio)
+        raise ModelError(
+            f"{setting('min_separation')} {min_separation!r} is outside (0, 1]; the increment of the order grid is "
+            "usual"
+        )
+    size = real_number("max_term_ratio", max_term_ratio)
     if not 1 <= size <= 1e9:
         raise ModelError(
-            f"max_term_ratio = {max_term_ratio!r} is outside [1, 1e9]; the default is {DEFAULT_MAX_TERM_RATIO:g}"
+            f"{setting('max_term_ratio')} {max_term_ratio!r} is outside [1, 1e9]; the default is "
+            f"{DEFAULT_MAX_TERM_RATIO:g}"
         )
     job = make_job(runs, equation, order_grid, SearchSettings(**CERTIFIED_SETTINGS), m=m, threads=threads)
     return certify_job(job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress)
 
 
-def check_certifiable(job: Job, tolerance: float) -> None:
-    """Raise ModelError if no certificate exists for a search, or the tolerance is out of range."""
-    _check_tolerance(tolerance)
-    for name, value in CERTIFIED_SETTINGS.items():
-        given = getattr(job.settings, name)
-        if given != value:
-            raise ModelError(f"there is no certificate over all orders for {name} = {given!r}; {_WAY_OUT}")
+def _check_certifiable(job: Job) -> None:
+    """Raise ModelError if no certificate exists for a search."""
     if job.structure.has_order_law:
         raise ModelError(
             "there is no certificate over all orders of a stage under its law; take its equations one by one"
         )
     item = job.structure.equations[0]
     if tuple(job.records[0].start) != (False, []):
-        raise ModelError("there is no certificate over all orders with initial terms; give the equation initial='rest'")
+        raise ModelError(
+            "there is no certificate over all orders with initial terms; give the equation "
+            f"{parameter('initial', 'rest')}"
+        )
     known = [t for t in item.terms if t.fixed is not None]
     if known:
         raise ModelError(
@@ -135,10 +136,10 @@ def check_certifiable(job: Job, tolerance: float) -> None:
 
 
 def _check_tolerance(tolerance: float) -> float:
-    share = real_number("within", tolerance)
+    share = real_number("tolerance", tolerance)
     if not 0 < share < 1:
         raise ModelError(
-            f"tolerance={tolerance!r} (--certify) is outside (0, 1); 0.05 asks that nothing be better by more than 5 %"
+            f"{parameter('tolerance', tolerance)} is outside (0, 1); 0.05 asks that nothing be better by more than 5 %"
         )
     return share
 
@@ -153,7 +154,7 @@ def certify_job(
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
     """Certify a prepared search; see :func:`certify_orders`."""
-    check_certifiable(job, tolerance)
+    _check_certifiable(job)
     record, item = job.records[0], job.structure.equations[0]
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
     region = _search_region(item, intervals, record.signals)

@@ -26,6 +26,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.simulation.discretization import Record
 from ftlm.structure.structure import Offset, Structure, check_initial
 from ftlm.utils.files import write_atomically
+from ftlm.utils.parameters import parameter
 
 FILE_SIGNATURE = b"ftlm search store 1\n"
 HEADER_FORMAT = struct.Struct("<II")
@@ -270,7 +271,7 @@ def check_file(path: str | os.PathLike[str], handle: int, kind: FileKind) -> Non
             f"{path} is the store of a {other}, not of a {kind.name}; go on with it by the call that began it"
         )
     if not kind.magic.startswith(begins[: len(kind.magic)]):
-        raise DataError(f"{path} is no ftlm {kind.name} store; give a file written with store= (--store)")
+        raise DataError(f"{path} is no ftlm {kind.name} store; give a file written with {parameter('store')}")
     if status.st_size > MAX_FILE_BYTES:
         raise DataError(
             f"{path} has {status.st_size} bytes, more than the {MAX_FILE_BYTES} of the largest store; start the "
@@ -509,7 +510,7 @@ def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
     """Parse the bytes of a checkpoint file; raise DataError for another file, no first frame, or a later version."""
     start = bytes(data[: len(FILE_SIGNATURE)])
     if not FILE_SIGNATURE.startswith(start):
-        raise DataError(f"{path} is no ftlm search store; give a file written with store= (--store)")
+        raise DataError(f"{path} is no ftlm search store; give a file written with {parameter('store')}")
     contents: Contents | None = None
     offset, digest = len(FILE_SIGNATURE), bytes(DIGEST_BYTES)
     while offset < len(data):
@@ -539,7 +540,9 @@ def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
         offset = end
         contents.end, contents.digest = end, digest
     if contents is None:
-        raise DataError(f"{path} ends before its first frame: its search had not begun; start it again with store=")
+        raise DataError(
+            f"{path} ends before its first frame: its search had not begun; start it again with {parameter('store')}"
+        )
     return contents
 
 
@@ -611,8 +614,8 @@ class Store:
         if not recover:
             raise DataError(
                 f"store {self.path} is damaged: {self.contents.corruption}; {lost} bytes from there on cannot be "
-                "trusted: "
-                "resume with recover=True (--recover) to keep what stands before and compute the rest again"
+                f"trusted: resume with {parameter('recover', True)} to keep what stands before and compute the rest "
+                "again"
             )
         copy = self.path.with_name(self.path.name + ".damaged")
         write_atomically(copy, data, force=False)

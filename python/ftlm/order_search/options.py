@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import check_choice, real_number, whole_number
 
@@ -55,15 +56,17 @@ class SearchSettings:
         check_choice("row_basis", self.row_basis, get_args(RowBasis))
         top, length = whole_number(self.top), whole_number(self.innovation_length)
         if top is None or not 1 <= top <= MAX_TOP:
-            raise ModelError(f"top = {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read")
+            raise ModelError(
+                f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read"
+            )
         if length is None or not 1 <= length < 1 << 62:
             raise ModelError(
-                f"innovation_length = {self.innovation_length!r} is no whole number from 1; the paper's is 7"
+                f"{setting('innovation_length')} {self.innovation_length!r} is no whole number from 1; the paper's is 7"
             )
         covariance = real_number("prior_covariance", self.prior_covariance)
         if not 0 < covariance < math.inf:
             raise ModelError(
-                f"prior_covariance = {self.prior_covariance!r} is not positive; a large one is a weak prior"
+                f"{setting('prior_covariance')} {self.prior_covariance!r} is not positive; a large one is a weak prior"
             )
         if not isinstance(self.pruning, bool):
             raise ModelError(f"pruning = {self.pruning!r} is neither True nor False")
@@ -73,8 +76,8 @@ class SearchSettings:
             changed = [f.name for f in fields(self) if f.name in MULTI_INNOVATION_SETTINGS and self.differs(f.name)]
             if changed:
                 raise ModelError(
-                    f"{changed[0]}= is not used by coefficients={self.coefficients!r}; leave it out, or use "
-                    "coefficients='multi-innovation'"
+                    f"{parameter(changed[0])} is not used by {parameter('coefficients', self.coefficients)}; leave "
+                    f"it out, or use {parameter('coefficients', 'multi-innovation')}"
                 )
 
     def differs(self, name: str) -> bool:

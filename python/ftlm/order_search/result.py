@@ -11,6 +11,7 @@ from ftlm.model.model import Model
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, number, symbol, symbol_html
+from ftlm.utils.parameters import parameter
 
 
 @dataclass(frozen=True)
@@ -154,8 +155,6 @@ class SearchResult:
         Orders of the first row at an end of their interval, by name.
     excluded_by_box
         Number of candidates under "bound" that were excluded with a whole box of orders.
-    certificate
-        Certificate over all orders, also between those of the grid, if requested (:func:`ftlm.certify_orders`).
     """
 
     table: list[SearchRow]
@@ -167,7 +166,6 @@ class SearchResult:
     settings: dict[str, Any]
     at_grid_edge: dict[str, float]
     excluded_by_box: int = 0
-    certificate: OrderCertificate | None = None
 
     @property
     def orders(self) -> dict[str, float]:
@@ -211,7 +209,7 @@ class SearchResult:
             "table": [dict(vars(row)) for row in self.table],
             "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
             "at_grid_edge": self.at_grid_edge,
-        } | ({} if self.certificate is None else {"certificate": self.certificate.to_dict()})
+        }
 
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)
@@ -226,8 +224,6 @@ class SearchResult:
         lines += [
             f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.at_grid_edge.items()
         ]
-        if self.certificate is not None:
-            lines.append(str(self.certificate))
         return "\n".join(lines)
 
 
@@ -287,7 +283,7 @@ class StoreStatus:
                 f"\n{self.truncated} bytes of an unfinished write at its end: being written now, or dropped on resuming"
             )
         if self.corruption is not None:
-            text += f"\ndamaged: {self.corruption}; resume with --salvage to keep what stands before"
+            text += f"\ndamaged: {self.corruption}; resume with {parameter('recover', True)} to keep what stands before"
         return text
 
 
@@ -365,6 +361,5 @@ def search_html(found: SearchResult) -> str:
         if reason == "bound" and found.excluded_by_box:
             rows.append(["of these in boxes excluded whole", found.excluded_by_box])
     name = found.model.outputs[0] if len(found.model.outputs) == 1 else "stage"
-    note = "" if found.certificate is None else str(found.certificate)
-    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows, note=note)
+    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows)
     return str(search_top(name, found).to_html() + rest.to_html())

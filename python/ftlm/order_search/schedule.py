@@ -34,6 +34,7 @@ from ftlm.order_search.checkpoint import (
 )
 from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.discretization import InitialTuple
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats
 
 #: Maximum number of search evaluators that a worker caches.
@@ -311,7 +312,7 @@ def _result(future: Future[Any], stretch: CandidateBlock) -> tuple[float, Any] |
 def _executor_error(error: BaseException) -> ConvergenceError:
     return ConvergenceError(
         f"the executor lost its work ({type(error).__name__}: {error}); start a new one and search again: "
-        "with store= nothing that was finished is lost"
+        f"with {parameter('store')} nothing that was finished is lost"
     )
 
 

@@ -32,6 +32,7 @@ from ftlm.plot.model_charts import Answer, bode_curves, pole_points, response_fr
 from ftlm.svg.heat_map import Landscape
 from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.formatting import symbol
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
@@ -181,7 +182,7 @@ def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[R
         return [runs] if isinstance(runs, Run) else list(runs)
     task = result.task if isinstance(result, Identification) else None
     if task is None:
-        raise ModelError("inputs=True needs the runs; give them")
+        raise ModelError(f"{parameter('inputs', True)} needs the runs; give them")
     return list(task.runs)
 
 
@@ -489,7 +490,9 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     if not isinstance(result, Identification):
         raise ModelError(f"result is {type(result).__name__}; give an identification")
     if result.fit is None:
-        raise ModelError(f"method {result.method!r} gives no joint covariance; identify by method='output-error'")
+        raise ModelError(
+            f"method {result.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
+        )
     names, values = result.fit.names, result.fit.correlation
     figure, axes = axes_for(ax, 1, row=4.0)
     axis = axes[0, 0]

@@ -19,6 +19,7 @@ from ftlm.report.typesetting import ORDER_DECIMALS, units_of
 from ftlm.structure.equation import Equation, format_equation
 from ftlm.structure.order import Order
 from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, with_error, wrap_text
+from ftlm.utils.parameters import choose_text
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison, describe_offsets
 from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings, hidden_warnings_text
@@ -173,7 +174,7 @@ def _starts(result: Identification) -> list[str]:
     return lines
 
 
-def finding_lines(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:
+def finding_lines(warnings: Sequence[str], how: str | None = None) -> list[str]:
     """Return up to three groups of warnings with remedies, most serious first."""
     found = group_warnings(warnings)
     lines = []
@@ -182,7 +183,11 @@ def finding_lines(warnings: Sequence[str], how: str = "print(result.details())")
         if concern.remedy and concern.remedy not in concern.warnings[0]:
             lines += wrap_text(concern.remedy, "  -> ")
     more = hidden_warnings_text(found)
-    return [*lines, f"  ({more}: {how})"] if more else lines
+    return (
+        [*lines, f"  ({more}: {how or choose_text('print(result.details())', '--verbose shows all')})"]
+        if more
+        else lines
+    )
 
 
 ROW_BASIS_TEXTS = {"haar": "Haar coordinates", "time": "order of time"}

@@ -17,6 +17,7 @@ from ftlm.progress import Progress
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run
 from ftlm.structure.structure import Structure
 from ftlm.utils.formatting import symbol
+from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, join_names
 from ftlm.validation.comparison import Comparison, finite
@@ -385,7 +386,8 @@ def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
         have = "; ".join(f"{run.name}: {', '.join(run.signals)}" for run in runs)
         raise DataError(
             f"no stage of the arm has both of its angles in all runs ({have}); needed are theta11 and theta12, or "
-            "theta21 and theta22: name their columns with --columns, or -y theta11=COLUMN"
+            f"theta21 and theta22: name their columns with {parameter('columns')}, or "
+            f"{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
         )
     return found
 

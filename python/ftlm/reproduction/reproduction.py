@@ -27,6 +27,7 @@ from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, Wor
 from ftlm.reproduction.stage_result import TRACE_EVERY, Stage
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
+from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads, join_names, nearest, real_number, whole_number
 
@@ -207,7 +208,7 @@ def reproduce(
         )
     simulated = square is None
     others, lattice = _other_arms(arms, records), OrderGrid(increment=increment)
-    for each in (increment, real_number("rivals_step", rivals_increment)):
+    for each in (increment, real_number("rivals_increment", rivals_increment)):
         OrderGrid(increment=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
     if square is None:
         if sine is not None:
@@ -298,12 +299,12 @@ Job = Callable[[WorkerProgress], StageOutcome | Panel]
 def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
     """Return the arms besides the first."""
     if isinstance(arms, str):
-        raise ModelError(f"arms = {arms!r} is a text; give a list of names, such as [{arms!r}]")
+        raise ModelError(f"{setting('arms')} {arms!r} is a text; give a list of names, such as [{arms!r}]")
     for name in arms or ():
         if name not in ARM_VARIANTS:
             raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
     if (whole_number(records) or 0) < 1:
-        raise ModelError(f"records = {records!r} is no whole number from 1")
+        raise ModelError(f"{setting('records')} {records!r} is no whole number from 1")
     return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 
@@ -354,7 +355,9 @@ def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
         listed = ", ".join(square.signals)
         raise DataError(
             f"run {square.name!r} has signals {listed}; a stage of the arm needs I1, theta11 and theta12, or I2, "
-            "theta21 and theta22: name its columns with --columns, or -u I1=COLUMN -y theta11=COLUMN"
+            f"theta21 and theta22: name its columns with {parameter('columns')}, or "
+            f"{parameter('inputs', {'I1': Placeholder('COLUMN')})} "
+            f"{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
         )
     if sine is not None:
         lacking = [s for n in found for s in wanted[n] if s not in sine.signals]

@@ -13,6 +13,7 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.rig.arm_parameters import PARAMETER_SETS, ArmParameters, StageParameters
 from ftlm.rig.recording import record
+from ftlm.utils.parameters import setting
 
 StageNumber = Literal[1, 2]
 STAGE_NUMBERS: tuple[StageNumber, StageNumber] = (1, 2)
@@ -135,7 +136,7 @@ def demo_run(
         Another shape, or negative noise.
     """
     if not (np.isfinite(noise) and noise >= 0):
-        raise ModelError(f"noise = {noise} rad is not a non-negative number")
+        raise ModelError(f"{setting('noise')} {noise} rad is not a non-negative number")
     if shape not in CURRENT_AMPLITUDES_A:
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
     recorded = record(

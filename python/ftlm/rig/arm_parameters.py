@@ -16,6 +16,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
 from ftlm.simulation.discretization import equation_tuple
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import join_names, nearest, short_repr
 
 #: Signals of the arm, in the order of their indices in the core.
@@ -146,9 +147,9 @@ class ArmParameters:
             )
         if not os.fspath(given).endswith(".toml"):
             raise ModelError(
-                f"parameters = {short_repr(os.fspath(given))} is not known{nearest(given, PARAMETER_SETS)}; use "
-                f"{join_names(PARAMETER_SETS)}, or a "
-                "file whose name ends with .toml"
+                f"{setting('parameters')} {short_repr(os.fspath(given))} is not "
+                f"known{nearest(given, PARAMETER_SETS)}; use {join_names(PARAMETER_SETS)}, or a file whose name ends "
+                "with .toml"
             )
         return cls._from_toml(Path(given))
 

@@ -13,6 +13,7 @@ import numpy as np
 from ftlm.errors import DataError, ModelError
 from ftlm.io.load import column_names, load
 from ftlm.rig.rig import CURRENT_LIMIT, MAX_RUN_DURATION_S
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number, short_repr
 
 SIGNAL_SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
@@ -68,7 +69,9 @@ class Excitation:
         t = np.arange(rows) / rate
         ramp = finite_number(self.ramp)
         if ramp is None or not 0 <= ramp <= duration:
-            raise ModelError(f"ramp = {short_repr(self.ramp)} s is outside [0, {duration:g}] s, the length of the run")
+            raise ModelError(
+                f"{setting('ramp')} {short_repr(self.ramp)} s is outside [0, {duration:g}] s, the length of the run"
+            )
         if self.shape == "csv":
             currents = self._file(t)
         else:
@@ -89,11 +92,14 @@ class Excitation:
         given = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
         pair = [a for a in map(finite_number, given) if a is not None and a >= 0]
         if len(given) != 2 or len(pair) != 2:
-            raise ModelError(f"amplitude = {short_repr(self.amplitude)} is not a current in A, or a pair of them")
+            raise ModelError(
+                f"{setting('amplitude')} {short_repr(self.amplitude)} is not a current in A, or a pair of them"
+            )
         for k, (value, limit) in enumerate(zip(pair, CURRENT_LIMIT, strict=True)):
             if value > limit:
                 raise ModelError(
-                    f"amplitude = {value:g} A of motor {k + 1} is over the limit of {limit:g} A; use a smaller one"
+                    f"{setting('amplitude')} {value:g} A of motor {k + 1} is over the limit of {limit:g} A; use a "
+                    "smaller one"
                 )
         return pair[0], pair[1]
 
@@ -102,11 +108,13 @@ class Excitation:
         period = usual if self.period is None else finite_number(self.period)
         if period is None or not period * rate >= 2:
             raise ModelError(
-                f"period = {short_repr(self.period)} s is not a time of at least two samples ({2 / rate:g} s)"
+                f"{setting('period')} {short_repr(self.period)} s is not a time of at least two samples "
+                f"({2 / rate:g} s)"
             )
         if self.shape == "multisine" and period > MAX_RUN_DURATION_S:
             raise ModelError(
-                f"period = {period:g} s of a multisine is longer than the longest run, {MAX_RUN_DURATION_S:g} s"
+                f"{setting('period')} {period:g} s of a multisine is longer than the longest run, "
+                f"{MAX_RUN_DURATION_S:g} s"
             )
         return period
 
@@ -127,7 +135,7 @@ class Excitation:
         elif self.shape in ("prbs", "multisine"):
             return np.column_stack([self._random(t, rate, period, motor) for motor in (0, 1)])
         else:
-            raise ModelError(f"input = {self.shape!r} is not known; use one of {', '.join(SIGNAL_SHAPES)}")
+            raise ModelError(f"{setting('input')} {self.shape!r} is not known; use one of {', '.join(SIGNAL_SHAPES)}")
         return np.column_stack([one, one])
 
     def _random(self, t: Floats, rate: float, period: float, motor: int) -> Floats:
@@ -139,7 +147,9 @@ class Excitation:
         lines = np.arange(math.ceil(low * period - 1e-9), math.floor(high * period + 1e-9) + 1)
         lines = lines[(lines > 0) & (2 * lines <= round(period * rate))]
         if lines.size == 0:
-            raise ModelError(f"band = {self.band!r} Hz holds no multiple of 1/period = {1 / period:g} Hz; widen it")
+            raise ModelError(
+                f"{setting('band')} {self.band!r} Hz holds no multiple of 1/period = {1 / period:g} Hz; widen it"
+            )
         phases = rng.uniform(0, 2 * math.pi, lines.size)
         n = max(2, round(period * rate))
         spectrum = np.zeros(n // 2 + 1, dtype=np.complex128)
@@ -153,13 +163,14 @@ class Excitation:
         ends = [b for b in map(finite_number, band) if b is not None] if isinstance(band, (tuple, list)) else []
         if len(ends) != 2 or len(band) != 2 or not 0 < ends[0] < ends[1] <= rate / 2:
             raise ModelError(
-                f"band = {short_repr(band)} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz"
+                f"{setting('band')} {short_repr(band)} Hz is not two rising frequencies up to half the rate, "
+                f"{rate / 2:g} Hz"
             )
         return ends[0], ends[1]
 
     def _file(self, t: Floats) -> Floats:
         if self.file is None:
-            raise ModelError("input = 'csv' needs a file; give it as file= (--file)")
+            raise ModelError(f"{setting('input')} 'csv' needs a file; give it as {parameter('file')}")
         names = column_names(self.file)
         there = [name for name in CURRENT_SIGNALS if names is not None and name in names]
         # A run written by ftlm is loaded whole; from any other file only the currents are read.

@@ -19,6 +19,7 @@ from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.recording import Experiment, check_times
 from ftlm.rig.rig import MAX_RUN_DURATION_S, Board, Rig
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, check_seed, error_text
 
 #: Controller: function of time [s], measured angles [rad] and reference [rad] that returns two currents [A].
@@ -106,7 +107,9 @@ def control(
     given = _numbers(reference)
     if duration is None:
         if given.ndim == 1:
-            raise ModelError("a reference that is held needs duration= [s]; or give it as rows, one a sample")
+            raise ModelError(
+                f"a reference that is held needs {parameter('duration')} [s]; or give it as rows, one a sample"
+            )
         _, _, rate = check_times(MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, rate)
         duration = (len(given) - 1) / rate
     duration, limit, rate = check_times(duration, limit, rate)
@@ -265,7 +268,7 @@ def _rows(given: Floats, rows: int, rate: float, travel: tuple[float, float]) ->
     if len(reference) != rows:
         raise DataError(
             f"reference has {len(reference)} rows, and a run of {(rows - 1) / rate:g} s at {rate:g} Hz has {rows}; "
-            "give as many, or leave duration= out"
+            f"give as many, or leave {parameter('duration')} out"
         )
     for hub, most in enumerate(travel):
         angles = reference[:, hub]

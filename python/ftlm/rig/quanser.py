@@ -42,7 +42,7 @@ NOTHING_TO_CLEAR = -599
 #: Bound on the relative drift between board and computer clocks; the reference of the delays follows at this rate.
 CLOCK_DRIFT_RATIO = 1e-3
 ERROR_MESSAGES = {
-    -108: "no Q8-USB board was found; plug it in, switch it on, and check --card",
+    -108: "no Q8-USB board was found; plug it in, switch it on, and check --board",
     -109: "the board is in use by another program; close that program",
     -111: "the buffer overflowed and samples were lost; lower the rate or the machine's load",
     -179: "the vendor's installation does not know the Q8-USB; install the suite or SDK that lists it (Windows)",

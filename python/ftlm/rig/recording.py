@@ -25,6 +25,7 @@ from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig
 from ftlm.rig.virtual_board import VirtualBoard
 from ftlm.utils.files import RUN_MESSAGES, check_free
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is_run_name, short_repr
 
 COLUMN_UNITS = {name: "A" if name.startswith("I") else "rad" for name in RIG_COLUMNS}
@@ -353,13 +354,15 @@ class Experiment:
         # Flags that let an arm move must be bool; truthy values are rejected.
         for name, flag in (("real_time", self.real_time), ("arm", self.arm), ("force", self.force)):
             if not isinstance(flag, bool):
-                raise ModelError(f"{name} = {short_repr(flag)} is neither True nor False; use one of them")
+                raise ModelError(f"{setting(name)} {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
             raise ModelError(f"progress is a {type(self.progress).__name__}; pass what is called with (done, all)")
         if self.sensor_filter is not None and not (
             isinstance(self.sensor_filter, str) and self.sensor_filter == "stock"
         ):
-            raise ModelError(f"sensor_filter = {short_repr(self.sensor_filter)} is not known; use 'stock' or None")
+            raise ModelError(
+                f"{setting('sensor_filter')} {short_repr(self.sensor_filter)} is not known; use 'stock' or None"
+            )
         board, known = _board(
             self.rig,
             self.parameters,
@@ -373,10 +376,10 @@ class Experiment:
         if board.hardware and not self.arm:
             raise ModelError(
                 f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
-                "with arm=True (--arm)"
+                f"with {parameter('arm', True)}"
             )
         if not is_run_name(self.name):
-            raise DataError(f"name={short_repr(self.name)} cannot name a run")
+            raise DataError(f"{setting('name')} {short_repr(self.name)} cannot name a run")
         target = None if self.out is None else Path(self.out)
         if target is not None:
             _check_target(target, force=self.force)
@@ -565,7 +568,9 @@ def _board(
             except (TypeError, ValueError, OverflowError):
                 first = second = math.nan
             if isinstance(offset, str) or not (math.isfinite(first) and math.isfinite(second)):
-                raise ModelError(f"offset = {short_repr(offset)} is not a pair of currents [A], of motor 1 and motor 2")
+                raise ModelError(
+                    f"{setting('offset')} {short_repr(offset)} is not a pair of currents [A], of motor 1 and motor 2"
+                )
             arm = replace(arm, current_offset=(first, second))
         return VirtualBoard(arm, seed=seed, real_time=real_time, horizon=horizon), {"parameters": arm.to_dict()}
     if isinstance(rig, str):
@@ -588,7 +593,7 @@ def _check_target(target: Path, *, force: bool) -> None:
     if os.path.lexists(left) and not force:
         raise DataError(
             f"{str(left)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
-            "overwrite it with force=True (--force)"
+            f"overwrite it with {parameter('force', True)}"
         )
 
 
@@ -597,21 +602,26 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
     longest, length, samples = finite_number(limit), finite_number(duration), finite_number(rate)
     if longest is None or not 0 < longest <= MAX_RUN_DURATION_S:
         raise ModelError(
-            f"limit = {short_repr(limit)} s is outside (0, {MAX_RUN_DURATION_S:g}] s; give the longest time of a run"
+            f"{setting('limit')} {short_repr(limit)} s is outside (0, {MAX_RUN_DURATION_S:g}] s; give the longest "
+            "time of a run"
         )
     if length is None or length <= 0:
-        raise ModelError(f"duration = {short_repr(duration)} s is not a time above 0; give the length of the run")
+        raise ModelError(
+            f"{setting('duration')} {short_repr(duration)} s is not a time above 0; give the length of the run"
+        )
     if length > longest:
         way_out = (
-            "raise limit= (--limit)"
+            f"raise {parameter('limit')}"
             if length <= MAX_RUN_DURATION_S
             else f"no run is longer than {MAX_RUN_DURATION_S:g} s"
         )
-        raise ModelError(f"duration = {length:g} s is over the limit of {longest:g} s; {way_out}")
+        raise ModelError(f"{setting('duration')} {length:g} s is over the limit of {longest:g} s; {way_out}")
     if samples is None or samples <= 0:
-        raise ModelError(f"rate = {short_repr(rate)} Hz is not a positive number of samples per second")
+        raise ModelError(f"{setting('rate')} {short_repr(rate)} Hz is not a positive number of samples per second")
     if length * samples < 2:
-        raise ModelError(f"duration = {length:g} s holds fewer than three samples at {samples:g} Hz; make it longer")
+        raise ModelError(
+            f"{setting('duration')} {length:g} s holds fewer than three samples at {samples:g} Hz; make it longer"
+        )
     return length, longest, samples
 
 

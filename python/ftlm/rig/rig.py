@@ -14,6 +14,7 @@ from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
 from ftlm.errors import FtlmError, ModelError, RigFault
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, error_text, real_number
 
 #: Termination signals, including those of a closed terminal.
@@ -325,12 +326,13 @@ class Rig:
         watchdog = real_number("watchdog", watchdog)
         if not low <= watchdog <= high:
             raise ModelError(
-                f"watchdog = {watchdog!r} s is outside [{low:g}, {high:g}] s; 0 would leave the motors running when "
-                "the program dies"
+                f"{setting('watchdog')} {watchdog!r} s is outside [{low:g}, {high:g}] s; 0 would leave the motors "
+                "running when the program dies"
             )
         if not 0 < limit <= MAX_RUN_DURATION_S:
             raise ModelError(
-                f"limit = {limit!r} s is outside (0, {MAX_RUN_DURATION_S:g}] s; give the longest time of a run"
+                f"{setting('limit')} {limit!r} s is outside (0, {MAX_RUN_DURATION_S:g}] s; give the longest time of "
+                "a run"
             )
         self.board = board
         self.rate = rate
@@ -440,15 +442,15 @@ def check_rate(rate: float) -> None:
     """Raise if the board does not support a sampling rate [Hz]."""
     low, high = SAMPLE_RATE_RANGE_HZ
     if not low <= rate <= high:
-        raise ModelError(f"rate = {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
+        raise ModelError(f"{setting('rate')} {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
 
 
 def check_watchdog(rate: float, seconds: float) -> None:
     """Raise if the watchdog timeout [s] is shorter than two samples, so that it would expire between them."""
     if seconds * rate < 2.0:
         raise ModelError(
-            f"watchdog = {seconds:g} s is shorter than two samples at {rate:g} Hz and would expire between them; use "
-            f"at least {2.0 / rate:g} s, or a higher rate"
+            f"{setting('watchdog')} {seconds:g} s is shorter than two samples at {rate:g} Hz and would expire "
+            f"between them; use at least {2.0 / rate:g} s, or a higher rate"
         )
 
 

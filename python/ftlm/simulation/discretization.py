@@ -26,6 +26,7 @@ from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, check_pulses, nearest
 
 #: Default number of block pulses, that of the paper, for runs with as many samples.
@@ -128,13 +129,14 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
         carried = run.length - 1
         if m > carried:
             raise ModelError(
-                f"m = {m} is more than run {run.name!r} carries: {run.length} rows are {carried} pulses; "
+                f"{setting('m')} {m} is more than run {run.name!r} carries: {run.length} rows are {carried} pulses; "
                 f"take m = {carried} or less"
             )
     if power_of_two and m & (m - 1):
         below = 1 << (m.bit_length() - 1)
         raise ModelError(
-            f"m = {m} is no power of two, which Haar rows need; take m = {below} or {2 * below}, or row_basis='time'"
+            f"{setting('m')} {m} is no power of two, which Haar rows need; take m = {below} or {2 * below}, or "
+            f"{parameter('row_basis', 'time')}"
         )
     return m
 
@@ -199,9 +201,8 @@ def apply_input_nonlinearity(run: Run, structure: Structure, name: str | None = 
     free = next((limit for limit in structure.limits if limit.free is not None), None)
     if free is not None:
         raise ModelError(
-            f"the {INPUT_EFFECT_LABELS[free.law]} of {free.signal} is free: only method='output-error' estimates "
-            "limits; give its "
-            "value"
+            f"the {INPUT_EFFECT_LABELS[free.law]} of {free.signal} is free: only "
+            f"{parameter('method', 'output-error')} estimates limits; give its value"
         )
     limits = [limit for limit in structure.limits if limit.signal in run and name in (None, limit.signal)]
     return run.with_input_nonlinearities(limits) if limits else run
@@ -227,7 +228,7 @@ def check_zero_order_hold(run: Run, structure: Structure, known: Mapping[str, fl
                 raise ModelError(
                     f"order {order.constant:g} of {term.signal} is above alpha = {alpha.constant:g} of "
                     f"{item.output}, and run {run.name!r} holds {term.signal} between its samples: its jumps have no "
-                    "derivative; lower the order, or say intersample='foh' if it moves in between"
+                    f"derivative; lower the order, or say {parameter('intersample', 'foh')} if it moves in between"
                 )
 
 
@@ -293,12 +294,13 @@ def _check_missing(run: Run, structure: Structure) -> None:
         raise DataError(
             f"signal {lacking!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
             f"{int(np.flatnonzero(gone)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
-            "rows yourself, avoid them with window=, or use coupling='simulated'"
+            f"rows yourself, avoid them with {parameter('window')}, or use {parameter('coupling', 'simulated')}"
         )
     if structure.all_filtered and any(name in missing for name in outputs):
         raise DataError(
-            f"run {run.name!r} has missing samples, and a sensor filter with coupling='measured', or on what "
-            "drives the run, must see all of them; use coupling='simulated', or a part without gaps"
+            f"run {run.name!r} has missing samples, and a sensor filter with {parameter('coupling', 'measured')}, or "
+            f"on what drives the run, must see all of them; use {parameter('coupling', 'simulated')}, or a part "
+            "without gaps"
         )
 
 
@@ -308,8 +310,8 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
         for name, gone in run.missing_samples.items():
             raise DataError(
                 f"output {name!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
-                f"{int(np.flatnonzero(gone)[0])}: {what} cannot leave them out; use method='output-error' "
-                "(identify), a part without gaps, or fill them yourself"
+                f"{int(np.flatnonzero(gone)[0])}: {what} cannot leave them out; use "
+                f"{parameter('method', 'output-error')} (identify), a part without gaps, or fill them yourself"
             )
 
 
@@ -321,13 +323,15 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
     if name not in run:
         raise DataError(
             f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
-            f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs= (commands: -u and -y)"
+            f"it has {', '.join(run.signals)}: name the columns with {parameter('inputs')} and "
+            f"{parameter('outputs')}"
         )
     run = with_effective_inputs(run, structure, name)
     samples = interpolate_gaps(run[name])
     if name in structure.free_delays:
         raise ModelError(
-            f"the delay of {name} is free: only method='output-error' estimates delays; give its value in seconds"
+            f"the delay of {name} is free: only {parameter('method', 'output-error')} estimates delays; give its "
+            "value in seconds"
         )
     delay = structure.delay.get(name, 0.0)
     if name not in run.inputs:
@@ -366,8 +370,8 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
     for item in equations:
         if item.friction is not None:
             raise ModelError(
-                f"the equation of {item.output} has friction, which {what} does not know; use method='output-error' "
-                "and free runs (simulate, compare), or leave the friction out"
+                f"the equation of {item.output} has friction, which {what} does not know; use "
+                f"{parameter('method', 'output-error')} and free runs (simulate, compare), or leave the friction out"
             )
 
 
@@ -447,7 +451,7 @@ def prepare(
                 raise DataError(
                     f"{term.signal} is constant on every run, so {term} and the offset in the equation of "
                     f"{item.output} cannot be told apart; add a run in which it changes, fix its coefficient, "
-                    "or use offset='none'"
+                    f"or use {parameter('offset', 'none')}"
                 )
     return prepared
 

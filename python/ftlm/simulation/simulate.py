@@ -21,6 +21,7 @@ from ftlm.simulation.discretization import (
 )
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import check_initial
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number
 
 
@@ -122,7 +123,7 @@ def simulate(
             raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
         check_initial([e for e in terms if not (model.structure.has_filter_transient(name) and e in impulses)])
     if not real_number("tolerance", tolerance) > 0:
-        raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
+        raise ModelError(f"{setting('tolerance')} {tolerance} is not positive; the default is 1e-6")
     own = run.length - 1
     max_m = min(max_m, MAX_M)
     if own > max_m:
@@ -168,7 +169,7 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
     if lacking is not None and model.structure.coupling != "simulated":
         raise DataError(
             f"run {run.name!r} has no signal {lacking!r}, which the equation of {read[lacking]} reads as measured; "
-            "give it, or use coupling='simulated'"
+            f"give it, or use {parameter('coupling', 'simulated')}"
         )
     return run.with_outputs({n: np.zeros(run.length) for n in missing})
 
@@ -197,7 +198,9 @@ def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record"
         A fractional order.
     """
     if step != "record":
-        raise ModelError(f"step = {step!r} is not known; Euler steps at the record's own step: resample the run")
+        raise ModelError(
+            f"{setting('step')} {step!r} is not known; Euler steps at the record's own step: resample the run"
+        )
     signals = model.structure.signals
     run = apply_input_nonlinearity(run, model.structure)
     rows = [run[s] if s not in model.outputs else np.zeros(run.length) for s in signals]

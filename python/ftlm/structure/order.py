@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import TypeAlias
 
 from ftlm.errors import ModelError
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import real_number
 
 #: Highest order of an equation, and lowest order of an input term (threefold integration).
@@ -94,7 +95,7 @@ class Order:
         try:
             return round(self.constant + sum(w * values[n] for n, w in self.weights), 9) + 0.0
         except KeyError as error:
-            raise ModelError(f"order {error.args[0]} has no value; give it in orders=") from None
+            raise ModelError(f"order {error.args[0]} has no value; give it in {parameter('orders')}") from None
 
     def __str__(self) -> str:
         parts = [

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from ftlm.errors import ModelError
 from ftlm.structure.order import MAX_ORDER, Order, Values, order_axis, parse_values
 from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import real_number
 
 #: Increment of the order grid in the paper.
@@ -110,7 +111,7 @@ def order_grid(
 def check_order_grid(order_grid: OrderGrid | None) -> None:
     """Raise if an argument is not an order grid."""
     if not (order_grid is None or isinstance(order_grid, OrderGrid)):
-        raise ModelError(f"lattice is {type(order_grid).__name__}, not a Lattice; use ftlm.lattice(…)")
+        raise ModelError(f"order_grid is {type(order_grid).__name__}, not an OrderGrid; use ftlm.order_grid(…)")
 
 
 def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:
@@ -123,7 +124,7 @@ def check_order_grid_names(given: OrderGrid | None, structure: Structure) -> Non
     for name in given.orders if given is not None else ():
         if name not in structure.order_names and name != "alpha":
             free = ", ".join(structure.order_names) or "none"
-            raise ModelError(f"lattice order {name!r} is no free order; free are {free}")
+            raise ModelError(f"order {name!r} of {parameter('order_grid')} is no free order; free are {free}")
 
 
 def restrict_order_grid(given: OrderGrid | None, part: Structure) -> OrderGrid | None:

@@ -22,6 +22,7 @@ from ftlm.structure.input_nonlinearity import (
 from ftlm.structure.order import Order, Values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial, check_offset
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_known, real_number
 
 IDENTIFIER_PATTERN = r"[^\W\d]\w*"
@@ -125,7 +126,9 @@ def _offset_of(parsed: Sequence[tuple[Equation, bool]], offset: str | None) -> O
     said = [item.output for item, found in parsed if found]
     if offset is not None:
         if said and check_offset(offset) == "none":
-            raise ModelError(f"the equation of {said[0]} has an offset, but offset='none'; leave one of them out")
+            raise ModelError(
+                f"the equation of {said[0]} has an offset, but {parameter('offset', 'none')}; leave one of them out"
+            )
         return check_offset(offset)
     without = [item.output for item, found in parsed if not found]
     if said and without:

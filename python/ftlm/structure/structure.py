@@ -22,6 +22,7 @@ from ftlm.structure.input_nonlinearity import (
 )
 from ftlm.structure.order import Order, Values, parse_values
 from ftlm.structure.sensor_filter import SensorFilter
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import check_known, real_number
 
 
@@ -47,7 +48,7 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
         exponents = tuple(real_number("exponent of an initial term", e) for e in initial)
     except TypeError:
         words = f"{', '.join(map(repr, INITIAL_CHOICES))} or exponents of t"
-        raise ModelError(f"initial = {initial!r} is not known; use {words}") from None
+        raise ModelError(f"{setting('initial')} {initial!r} is not known; use {words}") from None
     bad = next((e for e in exponents if not (math.isfinite(e) and -1 < e <= 10)), None)
     if bad is not None:
         raise ModelError(f"exponent {bad:g} of an initial term is outside (-1, 10]; t to this power is of no use")
@@ -58,15 +59,15 @@ def check_offset(offset: str) -> Offset:
     """Validate an offset: ``"none"``, ``"constant"``, ``"ramp"`` or ``"auto"``."""
     if offset in ("none", "constant", "ramp", "auto"):
         return offset  # type: ignore[return-value]
-    raise ModelError(f"offset = {offset!r} is not known; use 'none', 'constant', 'ramp' or 'auto'")
+    raise ModelError(f"{setting('offset')} {offset!r} is not known; use 'none', 'constant', 'ramp' or 'auto'")
 
 
 def check_offset_resolved(offset: str) -> None:
     """Raise if the offset is still ``"auto"``."""
     if offset == "auto":
         raise ModelError(
-            "offset='auto' lets ftlm.identify decide from the runs whether an equation has one; here use offset='none' "
-            "or offset='constant'"
+            f"{parameter('offset', 'auto')} lets ftlm.identify decide from the runs whether an equation has one; "
+            f"here use {parameter('offset', 'none')} or {parameter('offset', 'constant')}"
         )
 
 
@@ -165,7 +166,7 @@ class Structure:
         if twice is not None:
             raise ModelError(f"two equations have the output {twice}; give each output one equation")
         if self.coupling not in ("measured", "simulated"):
-            raise ModelError(f"coupling = {self.coupling!r} is not known; use 'measured' or 'simulated'")
+            raise ModelError(f"{setting('coupling')} {self.coupling!r} is not known; use 'measured' or 'simulated'")
         names = [n for e in self.equations for n in e.coefficient_names]
         twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
         if twice is not None:
@@ -210,14 +211,14 @@ class Structure:
             raise ModelError(
                 f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
                 f"measured signals they share no free run, so give that of {rubbing[0]} a structure of its own, or "
-                "follow them together with coupling='simulated'"
+                f"follow them together with {parameter('coupling', 'simulated')}"
             )
         if self.all_filtered:
             through = [s for s in self.signals if s not in self.outputs and self.is_filtered(s)]
             raise ModelError(
                 f"{words}, and {' and '.join(through)}, which drives it, passed the sensor filter: what sticks does so "
                 "before the filter, and what was filtered is not given back; let it follow from an equation of its "
-                "own with coupling='simulated', or leave it out of the filter"
+                f"own with {parameter('coupling', 'simulated')}, or leave it out of the filter"
             )
         if self.free_delays:
             raise ModelError(f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in seconds")
@@ -228,7 +229,7 @@ class Structure:
         if isinstance(self.initial, History) or self.initial == "history":
             raise ModelError(
                 f"{words}: powers of t for an unknown past would give it velocities that it never had; use "
-                "initial='caputo' (level and velocity at the start), or begin the run at rest"
+                f"{parameter('initial', 'caputo')} (level and velocity at the start), or begin the run at rest"
             )
 
     def _check_offset(self) -> None:
@@ -243,7 +244,7 @@ class Structure:
                     raise ModelError(
                         f"the offset of {item.output} is t^{power:g} in its equation, and so is one of the initial "
                         f"terms {', '.join(f'{e:g}' for e in self.initial)}: they cannot be told apart; "
-                        f"leave {power:g} out of initial, or use offset='none'"
+                        f"leave {power:g} out of initial, or use {parameter('offset', 'none')}"
                     )
 
     @property
@@ -286,8 +287,9 @@ class Structure:
             through = [o for o in self.outputs if self.is_filtered(o)]
             raise ModelError(
                 f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run starts "
-                "in motion: what such a filter still held is more than answers to impulses; use initial='rest' and "
-                "begin the run at rest, or give the exponents of its initial terms"
+                "in motion: what such a filter still held is more than answers to impulses; use "
+                f"{parameter('initial', 'rest')} and begin the run at rest, or give the exponents of its initial "
+                "terms"
             )
         return sensor.relative_degree
 

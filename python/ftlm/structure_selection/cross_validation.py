@@ -19,6 +19,7 @@ from ftlm.simulation.discretization import prepare
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import vector_norm
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import variance_inflation
 from ftlm.validation.comparison import compare
 
@@ -136,20 +137,21 @@ class Folds:
                 if any(_same(run, fitted) for fitted in every):
                     raise ModelError(
                         f"validation run {run.name} is one of those that are fitted to, which judges nothing; leave it "
-                        "out of one of the two, or use validation='runs'"
+                        f"out of one of the two, or use {parameter('validation', 'runs')}"
                     )
             names = ", ".join(r.name for r in others)
             return cls(every, tuple(Fold(every, run) for run in others), f"{names}, not fitted to")
         if validation == "runs":
             if len(every) < 2:
                 raise ModelError(
-                    "validation='runs' leaves one run out at a time, and there is one; give two or more, give "
-                    "validation= a run of its own, or use validation='blocks'"
+                    f"{parameter('validation', 'runs')} leaves one run out at a time, and there is one; give two or "
+                    f"more, give {parameter('validation')} a run of its own, or use "
+                    f"{parameter('validation', 'blocks')}"
                 )
             parts = [Fold(tuple(r for k, r in enumerate(every) if k != out), every[out]) for out in range(len(every))]
             return cls(every, tuple(parts), f"each of {len(every)} runs by the others")
         if validation != "blocks":
-            raise ModelError(f"validation = {validation!r} is not known; use 'runs', 'blocks', or a run")
+            raise ModelError(f"{setting('validation')} {validation!r} is not known; use 'runs', 'blocks', or a run")
         parts = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
         return cls(every, tuple(parts), f"each of {len(parts)} blocks, its outputs unread, by the rest")
 
@@ -164,8 +166,8 @@ def block_ranges(run: Run) -> list[tuple[int, int]]:
     """Return row ranges of blocks of nearly equal length."""
     if run.length < MIN_BLOCK_SAMPLES * BLOCKS_PER_RUN:
         raise DataError(
-            f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS_PER_RUN} blocks; give validation= "
-            "another run"
+            f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS_PER_RUN} blocks; give "
+            f"{parameter('validation')} another run"
         )
     return list(itertools.pairwise(np.linspace(0, run.length, BLOCKS_PER_RUN + 1).astype(int).tolist()))
 

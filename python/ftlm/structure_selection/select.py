@@ -27,6 +27,7 @@ from ftlm.structure_selection.stepwise import (
     evaluate_list,
     select_stepwise,
 )
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_threads
 
 #: Integer values of the highest order of the candidates.
@@ -50,12 +51,14 @@ def automatic_structures(runs: Sequence[Run], output: str | None = None) -> list
     if output is None:
         if len(outputs) != 1:
             raise ModelError(
-                f"the runs have the outputs {', '.join(outputs)}; structure='auto' is of one: use run.select([…]), or "
-                "name it in a structure in words"
+                f"the runs have the outputs {', '.join(outputs)}; {parameter('structure', 'auto')} is of one: use "
+                "run.select([…]), or name it in a structure in words"
             )
         output = outputs[0]
     if not first.inputs:
-        raise ModelError("the runs have no input, and structure='auto' needs one; name inputs when loading")
+        raise ModelError(
+            f"the runs have no input, and {parameter('structure', 'auto')} needs one; name inputs when loading"
+        )
     made = []
     for order in AUTOMATIC_ORDERS:
         own = [f"a{k} D^mu{k} {output}" for k in range(order - 1, 0, -1)] + [f"a0 {output}"]

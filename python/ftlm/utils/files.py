@@ -17,6 +17,7 @@ import msgspec
 
 from ftlm._core import __version__
 from ftlm.errors import DataError, ModelError
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import error_text, short_repr
 
 #: INFO: files read and written, start and end of fits. WARNING: findings that make a result doubtful.
@@ -38,15 +39,12 @@ class FileMessages:
         Whether the path stands in quotes.
     folder
         Remedy if a folder has that name; empty if a folder counts as an existing file.
-    overwrite
-        Remedy if the file exists.
     failed
         Message of a failure, with a placeholder for its reason.
     """
 
     quoted: bool = False
     folder: str = ""
-    overwrite: str = "force=True (--force)"
     failed: str = "cannot be written: {}; choose another folder"
 
     def format_path(self, path: Path) -> str:
@@ -61,7 +59,7 @@ RUN_MESSAGES = FileMessages(
     folder="give the name of a file in it",
     failed="cannot be written ({}); check the folder and the space left",
 )
-COMMAND_MESSAGES = FileMessages(folder="name a file in it", overwrite="--force")
+COMMAND_MESSAGES = FileMessages(folder="name a file in it")
 
 
 def check_new(path: str | os.PathLike[str], *, force: bool, words: FileMessages = DEFAULT_MESSAGES) -> Path:
@@ -73,7 +71,7 @@ def check_new(path: str | os.PathLike[str], *, force: bool, words: FileMessages 
     # A dangling link is a file that someone meant to be there.
     if there is not None and not force:
         raise DataError(
-            f"{words.format_path(file)} exists; choose another name, or overwrite it with {words.overwrite}"
+            f"{words.format_path(file)} exists; choose another name, or overwrite it with {parameter('force', True)}"
         )
     if there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode):
         # A device of the system would be gone, and what stands behind a link is not what was asked for.
@@ -116,7 +114,10 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
         raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
     there = [name for name in names if os.path.lexists(folder / name)]
     if there and not force:
-        raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
+        raise DataError(
+            f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or "
+            f"{parameter('force', True)}"
+        )
 
 
 def write_atomically(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.errors import DataError, ModelError
+from ftlm.utils.parameters import parameter, setting
 
 #: Environment variable with the default number of threads.
 THREADS_VARIABLE = "FTLM_THREADS"
@@ -45,7 +46,7 @@ def check_choice(name: str, value: object, known: Iterable[str]) -> None:
     """Raise unless a value is one of some strings."""
     words = list(known)
     if not isinstance(value, str) or value not in words:
-        raise ModelError(f"{name} = {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
+        raise ModelError(f"{setting(name)} {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
 
 
 def _is_number(value: object) -> bool:
@@ -73,7 +74,7 @@ def check_seed(seed: object) -> int:
     except TypeError:
         number = -1
     if number < 0:
-        raise ModelError(f"seed = {short_repr(seed)} is not a whole number from 0")
+        raise ModelError(f"{setting('seed')} {short_repr(seed)} is not a whole number from 0")
     return number
 
 
@@ -81,7 +82,7 @@ def check_pulses(m: object, below: float = 1 << 62) -> int:
     """Return the number of block pulses as an int below 2^62, the limit of the core."""
     pulses = whole_number(m)
     if pulses is None or not 1 <= pulses < below:
-        raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
+        raise ModelError(f"{setting('m')} {m!r} is no number of pulses; give a whole number, at least 1")
     return pulses
 
 
@@ -98,7 +99,7 @@ def real_number(name: str, value: object) -> float:
             raise TypeError
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
-        raise ModelError(f"{name} = {short_repr(value)} is not a number; give one") from None
+        raise ModelError(f"{setting(name)} {short_repr(value)} is not a number; give one") from None
 
 
 def join_names(names: Iterable[object], most: int = 40) -> str:
@@ -131,20 +132,24 @@ def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
     if isinstance(given, Mapping):
         return dict(given)
     if not isinstance(given, Iterable):
-        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: column, or a list of names")
+        raise DataError(
+            f"{parameter(argument)} is a {type(given).__name__}; pass a dict of name: column, or a list of names"
+        )
     names = list(given)
     for index, name in enumerate(names):
         if not isinstance(name, str):
-            raise DataError(f"{argument}=: entry {index} is {name!r}, not a name; pass a dict of name: column")
+            raise DataError(
+                f"{parameter(argument)}: entry {index} is {name!r}, not a name; pass a dict of name: column"
+            )
         if name in names[:index]:
-            raise DataError(f"{argument}=: the name {name!r} is given twice; give every name once")
+            raise DataError(f"{parameter(argument)}: the name {name!r} is given twice; give every name once")
     return {name: name for name in names}
 
 
 def as_mapping(argument: str, given: object, of: str = "array") -> Mapping[str, object]:
     """Return a mapping unchanged; raise for anything else."""
     if not isinstance(given, Mapping):
-        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: {of}")
+        raise DataError(f"{parameter(argument)} is a {type(given).__name__}; pass a dict of name: {of}")
     return given
 
 
@@ -180,7 +185,7 @@ def check_threads(threads: int | None) -> int:
         return int(given) if given else available_threads()
     count = whole_number(threads)
     if count is None or not 1 <= count <= 1024:
-        raise ModelError(f"threads = {threads!r} is outside [1, 1024]; leave it out to use all cores")
+        raise ModelError(f"{setting('threads')} {threads!r} is outside [1, 1024]; leave it out to use all cores")
     return count
 
 
@@ -234,7 +239,8 @@ def check_run_name(name: object) -> None:
     """Raise if a run name cannot be written into every file format."""
     if not is_run_name(name):
         raise DataError(
-            f"name={name!r} cannot name a run; use 1 to {_NAME_LENGTH} printable characters, not beginning with = + - @"
+            f"{parameter('name', name)} cannot name a run; use 1 to {_NAME_LENGTH} printable characters, not "
+            "beginning with = + - @"
         )
 
 

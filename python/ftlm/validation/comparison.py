@@ -32,6 +32,7 @@ from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, symbol_html
+from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_floats
 
 
@@ -300,7 +301,8 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
     if moving := runs_in_motion(model, runs):
         warnings.append(
             f"{', '.join(moving)} starts at zero and is simulated from rest, but what that leaves over dies away like "
-            "motion from before the start; give the model's structure initial='history' to have that estimated"
+            f"motion from before the start; give the model's structure {parameter('initial', 'history')} to have "
+            "that estimated"
         )
     return replace(found, warnings=tuple(warnings))
 

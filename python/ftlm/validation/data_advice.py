@@ -18,6 +18,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import minimum_norm_solution, orthonormal
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import estimate_noise, is_rest
 from ftlm.utils.validation import Floats
 
@@ -224,7 +225,11 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     if resting and not inputs_moved:
         return
     begin, end = first * run.step, (first + rows) * run.step
-    after = f"use window({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or cut it away"
+    after = (
+        f"use {parameter('window', (float(f'{end:.4g}'), None))}"
+        if first < run.length // 20
+        else "check the sensor, or cut it away"
+    )
     yield Finding(
         "dead",
         name,

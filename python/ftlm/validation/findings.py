@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from ftlm.utils.parameters import parameter
+
 #: Maximum number of warning groups in a summary.
 MAX_SUMMARY_WARNINGS = 3
 #: Severity levels: the model must not be used, must be used with care, or has a note.
@@ -24,9 +26,11 @@ class WarningKind:
     what
         Summary of such warnings.
     remedy
-        Recommended action.
+        Recommended action, with a placeholder for each parameter in it.
     marks
         Phrases by which its warnings are recognized, those of saved models included.
+    references
+        Parameters in the remedy, with their values.
     """
 
     name: str
@@ -34,6 +38,11 @@ class WarningKind:
     what: str
     remedy: str
     marks: tuple[str, ...] = ()
+    references: tuple[tuple[str, object], ...] = ()
+
+    def format_remedy(self) -> str:
+        """Return the remedy for the interface in use."""
+        return self.remedy.format(*(parameter(name, value) for name, value in self.references))
 
 
 #: Kinds, most serious first. A warning has the first kind of which it contains a mark.
@@ -42,14 +51,14 @@ WARNING_KINDS = (
         "unstable",
         LEVEL_DO_NOT_USE,
         "the free run grows without bound",
-        "leave out the term that pushes, bound its coefficient, or, in a closed loop, name what drives it with "
-        "reference=",
+        "leave out the term that pushes, bound its coefficient, or, in a closed loop, name what drives it with {}",
         (
             "free run grows without bound",
             "whose free run grows",
             "the free run of this optimum grows",
             "coefficients is unstable",
         ),
+        (("reference", None),),
     ),
     WarningKind(
         "range",
@@ -76,8 +85,9 @@ WARNING_KINDS = (
         "useless",
         LEVEL_DO_NOT_USE,
         "the free run explains little of an output",
-        "add what drives it, a delay or a term; or use method='output-error'",
+        "add what drives it, a delay or a term; or use {}",
         ("the free run explains little", "the equation error flatters this model"),
+        (("method", "output-error"),),
     ),
     WarningKind(
         "lost",
@@ -90,8 +100,9 @@ WARNING_KINDS = (
         "loop",
         LEVEL_WITH_CARE,
         "the runs were made in a closed loop",
-        "name what drives the loop with reference=, or open it",
+        "name what drives the loop with {}, or open it",
         ("a closed loop",),
+        (("reference", None),),
     ),
     WarningKind(
         "instrument",
@@ -118,8 +129,9 @@ WARNING_KINDS = (
         "provisional",
         LEVEL_WITH_CARE,
         "the fit is provisional",
-        "start=… another result, or fewer free numbers",
+        "give {} another result, or fewer free numbers",
         ("ended before it stood still", "it has not found the optimum", "there may be others"),
+        (("start", None),),
     ),
     WarningKind(
         "vague",
@@ -139,8 +151,9 @@ WARNING_KINDS = (
         "rough",
         LEVEL_WITH_CARE,
         "some intervals are rough",
-        "intervals='profile' finds them",
+        "{} finds them",
         ("intervals are rough",),
+        (("intervals", "profile"),),
     ),
     WarningKind(
         "step",
@@ -158,15 +171,17 @@ WARNING_KINDS = (
         "prior",
         LEVEL_WITH_CARE,
         "the prior pulls its coefficients",
-        "raise prior_covariance, or use method='least-squares'",
+        "raise {}, or use {}",
         ("the prior (K0",),
+        (("prior_covariance", None), ("method", "least-squares")),
     ),
     WarningKind(
         "law",
         LEVEL_WITH_CARE,
         "it breaks the law of its coefficients",
-        "use method='output-error'",
+        "use {}",
         ("coefficient law:",),
+        (("method", "output-error"),),
     ),
     WarningKind(
         "edge",
@@ -179,8 +194,9 @@ WARNING_KINDS = (
         "offset",
         LEVEL_WITH_CARE,
         "a constant is missing, or hidden",
-        "offset='constant' or offset='auto'",
+        "{} or {}",
         ("explains as much with", "an unknown constant"),
+        (("offset", "constant"), ("offset", "auto")),
     ),
     WarningKind(
         "history",
@@ -244,7 +260,7 @@ class WarningGroup:
     @property
     def remedy(self) -> str:
         """Remedy; empty if the warning itself states it."""
-        return "" if self.kind.remedy == OTHER_KIND.remedy else self.kind.remedy
+        return "" if self.kind.remedy == OTHER_KIND.remedy else self.kind.format_remedy()
 
 
 def group_warnings(warnings: Iterable[str]) -> tuple[WarningGroup, ...]:

@@ -9,6 +9,7 @@ from ftlm.data.sampling import drop_missing
 from ftlm.errors import ModelError
 from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import Cell, Exact
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import whole_number
 from ftlm.validation.comparison import finite
 from ftlm.validation.residual_tests import Residuals
@@ -76,7 +77,9 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     """
     given = whole_number(parameters)
     if given is None or given < 0:
-        raise ModelError(f"parameters = {parameters!r} is no number of parameters; give a whole number, at least 0")
+        raise ModelError(
+            f"{setting('parameters')} {parameters!r} is no number of parameters; give a whole number, at least 0"
+        )
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = given + tests.initial_terms + len(tests.outputs)

@@ -22,6 +22,7 @@ from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import Cell, symbol_html
 from ftlm.utils.linalg import blockwise_triangular_factor, dot, orthonormal, projections, triangular_factor
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import (
     NORMAL_99,
     SIGNIFICANCE_LEVEL,
@@ -491,7 +492,7 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     several = as_runs(runs)
     count = whole_number(lags)
     if count is None or count < 1:
-        raise ModelError(f"lags = {lags!r} is no number of lags; give a whole number, at least 1")
+        raise ModelError(f"{setting('lags')} {lags!r} is no number of lags; give a whole number, at least 1")
     check_run_lengths(several, count)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
@@ -642,7 +643,8 @@ def describe_feedback(name: str, signal: str, output: OutputResiduals) -> str:
         return f"{found}; with white residuals output error has no bias from it, equation-error methods have"
     return (
         f"{found}, and residuals are not white: the noise that comes back with {signal} biases estimates, which their "
-        "intervals do not know; record what drives the loop and name it with reference=, or open the loop"
+        f"intervals do not know; record what drives the loop and name it with {parameter('reference')}, or open the "
+        "loop"
     )
 
 

@@ -1,73 +1,74 @@
-//! All equations that drive each other together (Jakeman and Young, Refined instrumental
+//! Joint refinement of coupled equations by instrumental variables (Jakeman and Young, Refined instrumental
 //! variable methods of recursive time-series analysis, part II, Int. J. Control 29, 1979, 621-644).
 //!
-//! One equation filtered by its own 1/D̂ is left with the noise of every other measured output in it. Filtered by the
-//! inverse of the whole matrix Â of the equations, the errors of all of them become the noise of the outputs, white and
-//! separate, whose levels weigh the sum. With simulated outputs in its place, the same filter makes the instrument of a
-//! term what a change of its coefficient does to the free run, so where the steps stand still the weighted output error
-//! does, too.
+//! An equation filtered by its own 1/D̂ still contains the noise of the other measured outputs. Filtering by the
+//! inverse of the matrix Â of all equations turns the equation errors into the output noise, which is white and
+//! independent. The residuals are weighted by its variances. The same filter on simulated outputs makes each instrument
+//! the sensitivity of the simulation to that coefficient. A fixed point of the iteration is therefore a stationary
+//! point of the weighted output error.
 
-use super::prefilter::grows;
+use super::prefilter::is_unstable;
 use super::solution::{
-    dot, equations, initial_terms, long_run, orthonormal, unmoved, Dropped, Instruments, Settings, Solution,
+    add_long_run_covariance, dot, equations, has_converged, initial_terms, orthonormalize_instruments, Dropped,
+    RecordInstruments, Settings, Solution,
 };
 use crate::equation::Structure;
 use crate::error::Result;
-use crate::linalg::small::Scaled;
+use crate::linalg::small::EquilibratedLu;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 use crate::series_system::System;
 
-/// A step that raises the cost is halved, at most so many times in a row.
-const SHORTENED: usize = 8;
+/// Maximum number of halvings of a step that increases the cost.
+const MAX_STEP_HALVINGS: usize = 8;
 
-/// A rise of the cost that says nothing: the odds of two sets of coefficients differ by a millionth.
-const EQUAL: f64 = 1e-6;
+/// Increase of the cost (−2 log-likelihood) that counts as none: the likelihood ratio differs from 1 by a millionth.
+const COST_TOLERANCE: f64 = 1e-6;
 
-/// What is refined: equations, known coefficients, exponents and omissions of their initial terms.
+/// Equations to refine: structures, fixed coefficients, exponents and exclusions of their initial terms.
 pub struct Problem<'a> {
-    /// As measured.
+    /// Records as measured.
     pub records: &'a [Record],
-    /// With clean substitutes for measured outputs that no equation has.
+    /// Records with noise-free substitutes for measured outputs without an equation.
     pub clean: &'a [Record],
     /// The equations.
     pub structures: &'a [Structure],
-    /// Known coefficients, per equation.
+    /// Values of the fixed coefficients, per equation; None if free.
     pub fixed: &'a [Vec<Option<f64>>],
     /// Exponents of initial terms, per equation.
     pub exponents: &'a [Vec<f64>],
-    /// (record, position) of initial terms left out, per equation.
+    /// (record, position) of excluded initial terms, per equation.
     pub dropped: &'a [Dropped],
 }
 
-/// Where the steps ended.
+/// Joint estimate of all equations.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Ended {
+pub struct CoupledEstimate {
     /// Per equation: coefficients of its terms, then of its initial terms record by record.
     pub solutions: Vec<Solution>,
-    /// Per equation: covariance of its free coefficients, row-major, robust to coloured residuals.
+    /// Per equation: covariance of its free coefficients, row-major, robust to colored residuals.
     pub covariances: Vec<Vec<f64>>,
-    /// Σ n ln(Σ ε²/n) over outputs: minus twice the logarithm of their likelihood, noise levels unknown.
+    /// Σ n ln(Σ ε²/n) over outputs: −2 log-likelihood with unknown noise variances.
     pub cost: f64,
-    /// Steps made.
+    /// Number of iterations.
     pub iterations: usize,
-    /// Whether the last step moved nothing any more.
+    /// True if the last step changed no coefficient by more than the tolerance.
     pub converged: bool,
 }
 
-/// An unknown: equation, and its term or its (record, position) of an initial term.
+/// Free coefficient: (equation, term), or (equation, record, position) of an initial term.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Unknown {
+enum FreeCoefficient {
     Term(usize, usize),
     Initial(usize, usize, usize),
 }
 
-/// Coefficients of all equations, and their covariances where asked for.
-type Stepped = (Vec<Solution>, Vec<Vec<f64>>);
+/// Coefficients of all equations, and their covariances if requested.
+type StepResult = (Vec<Solution>, Vec<Vec<f64>>);
 
-/// What one set of coefficients does on every record.
-struct Point {
-    /// Free runs, per record and equation.
+/// Simulation of every record with one set of coefficients, and its cost.
+struct Iterate {
+    /// Outputs of the simulation, by record and equation.
     responses: Vec<Vec<Vec<f64>>>,
     /// Weight 1/σ² of each output.
     weights: Vec<f64>,
@@ -75,17 +76,17 @@ struct Point {
 }
 
 impl Problem<'_> {
-    /// Steps from a start until they stand still; the cost never rises but by rounding.
+    /// Iterate from an initial guess until convergence; the cost never increases except by rounding.
     ///
-    /// None where the free run of the start grows out of its output's size: nothing can be filtered by its inverse.
+    /// None if the simulation from the initial guess diverges, so that its inverse cannot be used as a filter.
     /// O(iterations · n · Σ (terms · m log m + n² m log² m)) for n equations.
     ///
     /// # Errors
-    /// [`crate::error::Error::Singular`] where the instruments of all equations together do not tell the terms apart.
-    pub fn refine(&self, start: &[Solution], settings: Settings) -> Result<Option<Ended>> {
-        let unknowns = self.unknowns();
+    /// [`crate::error::Error::Singular`] if the instruments do not identify the coefficients of all equations together.
+    pub fn refine(&self, start: &[Solution], settings: Settings) -> Result<Option<CoupledEstimate>> {
+        let unknowns = self.free_coefficients();
         let mut solutions = start.to_vec();
-        let Some(mut point) = self.point(&solutions)? else { return Ok(None) };
+        let Some(mut point) = self.evaluate(&solutions)? else { return Ok(None) };
         let (mut iterations, mut converged) = (0, false);
         while !converged && iterations < settings.iterations {
             let Some((next, _)) = self.step(&solutions, &point, &unknowns, false)? else { return Ok(None) };
@@ -94,17 +95,17 @@ impl Problem<'_> {
                 .iter()
                 .zip(&next)
                 .zip(self.structures)
-                .all(|((a, b), s)| unmoved(a, b, s.terms.len(), settings.tolerance));
+                .all(|((a, b), s)| has_converged(a, b, s.terms.len(), settings.tolerance));
             let mut share = 1.0;
             let mut taken = false;
-            for _ in 0..SHORTENED {
+            for _ in 0..MAX_STEP_HALVINGS {
                 let tried: Vec<Solution> = solutions
                     .iter()
                     .zip(&next)
                     .map(|(a, b)| a.iter().zip(b).map(|(a, b)| a + share * (b - a)).collect())
                     .collect();
-                match self.point(&tried)? {
-                    Some(found) if found.cost <= point.cost + EQUAL => {
+                match self.evaluate(&tried)? {
+                    Some(found) if found.cost <= point.cost + COST_TOLERANCE => {
                         (solutions, point, taken) = (tried, found, true);
                         break;
                     }
@@ -117,24 +118,24 @@ impl Problem<'_> {
             }
         }
         let Some((_, covariances)) = self.step(&solutions, &point, &unknowns, true)? else { return Ok(None) };
-        Ok(Some(Ended { solutions, covariances, cost: point.cost, iterations, converged }))
+        Ok(Some(CoupledEstimate { solutions, covariances, cost: point.cost, iterations, converged }))
     }
 
-    fn unknowns(&self) -> Vec<Unknown> {
+    fn free_coefficients(&self) -> Vec<FreeCoefficient> {
         let mut out = Vec::new();
         for (i, fixed) in self.fixed.iter().enumerate() {
-            out.extend((0..fixed.len()).filter(|&k| fixed[k].is_none()).map(|k| Unknown::Term(i, k)));
+            out.extend((0..fixed.len()).filter(|&k| fixed[k].is_none()).map(|k| FreeCoefficient::Term(i, k)));
             for r in 0..self.records.len() {
                 let kept = (0..self.exponents[i].len()).filter(|&e| !self.dropped[i].contains(&(r, e)));
-                out.extend(kept.map(|e| Unknown::Initial(i, r, e)));
+                out.extend(kept.map(|e| FreeCoefficient::Initial(i, r, e)));
             }
         }
         out
     }
 
-    /// Free runs and their cost; None where one leaves ten times its output's size.
+    /// Simulate all records and compute the cost; None if an output exceeds ten times the measured amplitude.
     #[allow(clippy::cast_precision_loss)]
-    fn point(&self, solutions: &[Solution]) -> Result<Option<Point>> {
+    fn evaluate(&self, solutions: &[Solution]) -> Result<Option<Iterate>> {
         let equations = equations(self.structures, solutions);
         let mut responses = Vec::with_capacity(self.records.len());
         let mut sums = vec![0.0; equations.len()];
@@ -154,20 +155,20 @@ impl Problem<'_> {
             responses.push(outputs);
         }
         let n = count as f64;
-        // Exact data leave rounding, which weighs as any noise.
+        // With noise-free data the residuals are rounding errors, which are weighted like noise.
         let variances: Vec<f64> = sums.iter().map(|s| (s / n).max(f64::MIN_POSITIVE)).collect();
         let cost = variances.iter().map(|v| n * libm::log(*v)).sum();
-        Ok(Some(Point { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
+        Ok(Some(Iterate { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
     }
 
-    /// New coefficients of all equations and, if asked for, the covariances; None where the inverse of the matrix grows.
+    /// New coefficients of all equations, with covariances if requested; None if the inverse matrix is unstable.
     fn step(
         &self,
         solutions: &[Solution],
-        point: &Point,
-        unknowns: &[Unknown],
+        point: &Iterate,
+        unknowns: &[FreeCoefficient],
         with_covariance: bool,
-    ) -> Result<Option<Stepped>> {
+    ) -> Result<Option<StepResult>> {
         let (n, k) = (self.structures.len(), unknowns.len());
         let equations = equations(self.structures, solutions);
         let mut parts = Vec::with_capacity(self.records.len());
@@ -175,7 +176,7 @@ impl Problem<'_> {
         for (r, record) in self.records.iter().enumerate() {
             let m = record.m();
             let inverse = System::new(&equations, record)?.inverse()?;
-            if inverse.iter().flatten().any(|series| grows(series)) {
+            if inverse.iter().flatten().any(|series| is_unstable(series)) {
                 return Ok(None);
             }
             let filters: Vec<Vec<Kernel>> =
@@ -186,7 +187,7 @@ impl Problem<'_> {
             });
             let simulated = Record::new(record.step(), simulated.collect(), None)?;
             let mut buffers = Buffers::default();
-            // Of every output, one after the other, in units of its noise.
+            // Response of every output in sequence, in units of the noise standard deviation of the output.
             let mut through = |i: usize, signal: &[f64]| -> Vec<f64> {
                 let spectrum = Kernel::new(signal);
                 let mut out = vec![0.0; n * m];
@@ -214,23 +215,23 @@ impl Problem<'_> {
                     }
                 }
                 for (e, &exponent) in self.exponents[i].iter().enumerate() {
-                    if unknowns.contains(&Unknown::Initial(i, r, e)) {
+                    if unknowns.contains(&FreeCoefficient::Initial(i, r, e)) {
                         let column = through(i, &record.initial_term(exponent));
                         psi.push(column.clone());
                         phi.push(column);
                     }
                 }
                 places.extend((0..k).filter(|&a| match unknowns[a] {
-                    Unknown::Term(equation, _) => equation == i,
-                    Unknown::Initial(equation, run, _) => equation == i && run == r,
+                    FreeCoefficient::Term(equation, _) => equation == i,
+                    FreeCoefficient::Initial(equation, run, _) => equation == i && run == r,
                 }));
             }
             parts.push((phi, target));
-            instruments.push(Instruments { columns: psi, places });
+            instruments.push(RecordInstruments { columns: psi, unknown_indices: places });
         }
-        orthonormal(&mut instruments, k)?;
+        orthonormalize_instruments(&mut instruments, k)?;
         let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
-        for ((phi, target), Instruments { columns, places }) in parts.iter().zip(&instruments) {
+        for ((phi, target), RecordInstruments { columns, unknown_indices: places }) in parts.iter().zip(&instruments) {
             for (instrument, &a) in columns.iter().zip(places) {
                 rhs[a] += dot(instrument, target);
                 for (regressor, &b) in phi.iter().zip(places) {
@@ -238,13 +239,13 @@ impl Problem<'_> {
                 }
             }
         }
-        let solved = Scaled::new(&cross, k)?;
+        let solved = EquilibratedLu::new(&cross, k)?;
         let x = solved.solve(&rhs);
         let mut next: Vec<Solution> = solutions.to_vec();
         for (&unknown, &value) in unknowns.iter().zip(&x) {
             match unknown {
-                Unknown::Term(i, term) => next[i][term] = value,
-                Unknown::Initial(i, r, e) => {
+                FreeCoefficient::Term(i, term) => next[i][term] = value,
+                FreeCoefficient::Initial(i, r, e) => {
                     next[i][self.structures[i].terms.len() + r * self.exponents[i].len() + e] = value;
                 }
             }
@@ -253,7 +254,7 @@ impl Problem<'_> {
         if with_covariance {
             let (mut meat, inverse) = (vec![0.0; k * k], solved.inverse());
             for (((phi, target), made), record) in parts.iter().zip(&instruments).zip(self.records) {
-                let Instruments { columns: psi, places } = made;
+                let RecordInstruments { columns: psi, unknown_indices: places } = made;
                 let mut rest = target.clone();
                 for (column, &place) in phi.iter().zip(places) {
                     rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
@@ -263,12 +264,13 @@ impl Problem<'_> {
                     .iter()
                     .map(|p| (0..m).map(|t| (0..n).map(|j| p[j * m + t] * rest[j * m + t]).sum()).collect())
                     .collect();
-                long_run(&scores, places, &mut meat, k);
+                add_long_run_covariance(&scores, places, &mut meat, k);
             }
             let half = |i: usize, j: usize| -> f64 { (0..k).map(|b| meat[i * k + b] * inverse[j * k + b]).sum() };
             for i in 0..n {
-                let own: Vec<usize> =
-                    (0..k).filter(|&a| matches!(unknowns[a], Unknown::Term(equation, _) if equation == i)).collect();
+                let own: Vec<usize> = (0..k)
+                    .filter(|&a| matches!(unknowns[a], FreeCoefficient::Term(equation, _) if equation == i))
+                    .collect();
                 let block = own.iter().flat_map(|&a| own.iter().map(move |&b| (a, b)));
                 covariances.push(block.map(|(a, b)| (0..k).map(|c| inverse[a * k + c] * half(c, b)).sum()).collect());
             }

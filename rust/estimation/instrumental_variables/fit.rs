@@ -1,12 +1,12 @@
-//! Equations refined from several starts, each by its own filter and then all of them together.
+//! Instrumental-variable estimation from several initial guesses: equation by equation, then all equations together.
 //!
-//! All equations given are simulated together, from the signals that none of them has as its output; where those are
-//! measured outputs too, a clean substitute for them is asked for ([`super::prefilter::project`] makes one).
+//! All given equations are simulated together. Their inputs are the signals that are no equation's output. If such a
+//! signal is measured with noise, a noise-free substitute is needed (`project`).
 
 use super::coupled;
 use super::prefilter::{damped_inverse, low_pass, power_frequency, unit};
-use super::single::{divisor, step, Scratch, Shelf, Source};
-use super::solution::{dot, equations, initial_terms, unmoved, Dropped, Settings, Solution};
+use super::single::{divisor, step, EquationSpectra, Scratch, Source};
+use super::solution::{dot, equations, has_converged, initial_terms, Dropped, Settings, Solution};
 use crate::equation::{Initial, Structure};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::least_squares;
@@ -14,51 +14,53 @@ use crate::regressors::Record;
 use crate::series::Kernel;
 use crate::series_system::System;
 
-/// Low-passes behind which a start is made, in units of the output's own band; none: the plain record.
-const PREFILTERS: [Option<f64>; 4] = [None, Some(1.0), Some(2.0), Some(4.0)];
+/// Cutoff frequencies of the low-pass prefilters of the initial guesses, relative to the bandwidth of the output.
+/// None: unfiltered record.
+const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 4] = [None, Some(1.0), Some(2.0), Some(4.0)];
 
-/// A step that raises the output error by this factor is halved, at most so many times in a row.
-const WORSE: f64 = 1.2;
-const SHORTENED: usize = 4;
+/// Increase of the output error above which a step is halved, at most [`MAX_STEP_HALVINGS`] times in a row.
+const MAX_ERROR_RATIO: f64 = 1.2;
+const MAX_STEP_HALVINGS: usize = 4;
 
-/// What the iteration came to, for one equation.
+/// Coefficient estimates of one equation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate {
-    /// One a term; fixed ones as given.
+    /// One per term; fixed coefficients as given.
     pub coefficients: Vec<f64>,
-    /// Coefficients of the initial terms, per record; 0 where dropped as combinations of others.
+    /// Coefficients of the initial terms, per record; 0 for a term excluded as linearly dependent.
     pub initial: Vec<Vec<f64>>,
     /// Exponents of the initial terms.
     pub exponents: Vec<f64>,
-    /// Covariance of the free coefficients at these orders, row-major, robust to coloured residuals.
+    /// Covariance of the free coefficients at these orders, row-major, robust to colored residuals.
     pub covariance: Vec<f64>,
 }
 
-/// Coefficients of all equations.
+/// Coefficient estimates of all equations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
-    /// One an equation.
+    /// One per equation.
     pub estimates: Vec<Estimate>,
-    /// Steps made.
+    /// Number of iterations.
     pub iterations: usize,
-    /// Whether the last step moved nothing any more; else these are the coefficients with the least output error met.
+    /// True if the last step changed no coefficient by more than the tolerance; otherwise the estimates are the iterate
+    /// with the least output error.
     pub converged: bool,
-    /// Whether the free run of the result is unstable, so that its instruments had to be damped.
+    /// True if the estimated model is unstable, so that its instruments were damped.
     pub damped: bool,
 }
 
-/// Refined instrumental variables for one or several equations on one or several records.
+/// Fit one or several equations to one or several records by refined instrumental variables.
 ///
-/// The records' clean signals ([`Record::with_clean`]) stand for outputs that no equation simulates, and are the first
-/// instruments for those that one does; a record without them stands for itself. The iteration
-/// starts from two-stage least squares behind several low-passes; the end with the least output error is kept, and
-/// where none stands still the iterate with the least. An unstable iterate is damped (its series read at ρz, ρ < 1),
-/// which keeps instruments bounded and clean.
+/// The noise-free signals of a record ([`Record::with_clean`]) replace outputs that no equation simulates. They are the
+/// first instruments of the simulated outputs. A record without them uses its measured signals. The initial guesses are
+/// two-stage least squares behind several low-pass prefilters. The result is the refined solution with the least output
+/// error, or the iterate with the least output error if none converges. An unstable iterate is damped (its series is
+/// evaluated at ρz, ρ < 1), which keeps the instruments bounded and free of noise.
 ///
 /// O(iterations · Σ (terms · m log m + n² m log² m)).
 ///
 /// # Errors
-/// As least squares and [`Settings::check`]; [`Error::Singular`] where instruments cannot tell the terms apart;
+/// As least squares and [`Settings::check`]; [`Error::Singular`] if the instruments do not identify the coefficients;
 /// [`Error::Length`].
 ///
 /// ```
@@ -93,16 +95,16 @@ pub fn fit(
     if structures.is_empty() {
         return Err(Error::Length { name: "equations".into(), expected: 1, found: 0 });
     }
-    let clean: Vec<Record> = records.iter().map(Record::cleaned).collect();
+    let clean: Vec<Record> = records.iter().map(Record::clean_record).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
     let problem = Problem::new(records, &clean, structures, (fixed, initial), &exponents)?;
-    let mut best: Option<Ended> = None;
+    let mut best: Option<RefinementResult> = None;
     let mut failure = None;
-    // Ends of all equations together, by cost; from one start the equations one by one may come out unstable, from
-    // another not.
-    let mut together: Option<coupled::Ended> = None;
-    for multiple in PREFILTERS {
-        // A start that cannot be made, or whose instruments fail, leaves the others.
+    // Best refinement of all equations together. Whether the separate estimates are stable depends on the initial
+    // guess.
+    let mut together: Option<coupled::CoupledEstimate> = None;
+    for multiple in PREFILTER_CUTOFF_RATIOS {
+        // An initial guess that fails does not affect the others.
         match problem.start(multiple).and_then(|solutions| {
             let ended = problem.iterate(solutions.clone(), settings)?;
             Ok((solutions, ended))
@@ -110,7 +112,7 @@ pub fn fit(
             Ok((start, ended)) => {
                 if structures.len() > 1 {
                     for from in [&ended.solutions, &start] {
-                        let Some(found) = problem.together(from, settings)? else { continue };
+                        let Some(found) = problem.refine_together(from, settings)? else { continue };
                         if together.as_ref().is_none_or(|t| found.cost < t.cost) {
                             together = Some(found);
                         }
@@ -128,7 +130,7 @@ pub fn fit(
         return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
     };
     if let Some(found) = together {
-        ended = Ended {
+        ended = RefinementResult {
             error: ended.error,
             solutions: found.solutions,
             covariances: found.covariances,
@@ -159,15 +161,15 @@ struct Problem<'a> {
     structures: &'a [Structure],
     fixed: &'a [Vec<Option<f64>>],
     exponents: &'a [Vec<f64>],
-    /// Initial terms left out, per equation.
+    /// Initial terms that are excluded, per equation.
     dropped: Vec<Dropped>,
-    /// Per equation and record: what no step changes, and what the clean signals make of its terms.
-    shelves: Vec<Vec<Shelf<'a>>>,
+    /// Spectra that do not change between iterations, by equation and record.
+    spectra: Vec<Vec<EquationSpectra<'a>>>,
     substitutes: Vec<Vec<Vec<Option<Kernel>>>>,
 }
 
-/// Where one start ended.
-struct Ended {
+/// Result of the refinement from one initial guess.
+struct RefinementResult {
     error: f64,
     solutions: Vec<Solution>,
     covariances: Vec<Vec<f64>>,
@@ -188,24 +190,25 @@ impl<'a> Problem<'a> {
             Ok(least_squares::fit(records, structure, fixed, initial)?.dropped)
         };
         let dropped = structures.iter().zip(fixed).map(plain).collect::<Result<Vec<Dropped>>>()?;
-        let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<Shelf<'a>> {
-            records.iter().map(|record| Shelf::new(record, structure, exponents)).collect()
+        let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<EquationSpectra<'a>> {
+            records.iter().map(|record| EquationSpectra::new(record, structure, exponents)).collect()
         };
-        let shelves: Vec<Vec<Shelf<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
-        let substituted = |shelves: &Vec<Shelf<'a>>| -> Vec<Vec<Option<Kernel>>> {
-            shelves.iter().zip(clean).map(|(shelf, clean)| shelf.clean(clean, |_| true)).collect()
+        let shelves: Vec<Vec<EquationSpectra<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
+        let substituted = |shelves: &Vec<EquationSpectra<'a>>| -> Vec<Vec<Option<Kernel>>> {
+            shelves.iter().zip(clean).map(|(shelf, clean)| shelf.substitute_spectra(clean, |_| true)).collect()
         };
         let substitutes = shelves.iter().map(substituted).collect();
-        Ok(Self { records, clean, structures, fixed, exponents, dropped, shelves, substitutes })
+        Ok(Self { records, clean, structures, fixed, exponents, dropped, spectra: shelves, substitutes })
     }
 
-    /// Two-stage least squares: one step with the clean signals as instruments, behind a low-pass at a multiple of each
-    /// output's own band if one is given.
+    /// Two-stage least squares: one step with the noise-free signals as instruments.
+    ///
+    /// The signals are prefiltered by a low-pass at `multiple` times the bandwidth of the output, if given.
     fn start(&self, multiple: Option<f64>) -> Result<Vec<Solution>> {
         let mut scratch = Scratch::default();
         let mut solutions = Vec::with_capacity(self.structures.len());
         for (i, (structure, fixed)) in self.structures.iter().zip(self.fixed).enumerate() {
-            let pairs = self.shelves[i].iter().zip(&self.substitutes[i]);
+            let pairs = self.spectra[i].iter().zip(&self.substitutes[i]);
             let sources: Vec<Source<'_>> = pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
             let low_passed = |r: &Record, multiple: f64| {
                 low_pass(multiple * power_frequency(r.signal(structure.output), r.step()), r)
@@ -218,20 +221,20 @@ impl<'a> Problem<'a> {
         Ok(solutions)
     }
 
-    fn iterate(&self, mut solutions: Vec<Solution>, settings: Settings) -> Result<Ended> {
+    fn iterate(&self, mut solutions: Vec<Solution>, settings: Settings) -> Result<RefinementResult> {
         let mut scratch = Scratch::default();
         let mut best = (f64::INFINITY, solutions.clone());
         let (mut iterations, mut converged, mut shortened) = (0, false, 0);
         loop {
-            let (responses, damped) = coupled(self.clean, self.structures, self.exponents, &solutions)?;
+            let (responses, damped) = simulate_coupled(self.clean, self.structures, self.exponents, &solutions)?;
             let error = output_error(self.records, self.structures, &responses);
             if error < best.0 {
                 best = (error, solutions.clone());
                 shortened = 0;
             }
             let last = converged || iterations == settings.iterations;
-            if !last && shortened < SHORTENED && (error.is_nan() || error > WORSE * best.0) {
-                // A step too far: half-way back to the best.
+            if !last && shortened < MAX_STEP_HALVINGS && (error.is_nan() || error > MAX_ERROR_RATIO * best.0) {
+                // The step is too long: move half-way back to the best iterate.
                 for (x, y) in solutions.iter_mut().flatten().zip(best.1.iter().flatten()) {
                     *x = 0.5 * (*x + y);
                 }
@@ -240,27 +243,26 @@ impl<'a> Problem<'a> {
                 continue;
             }
             if last && !converged && solutions != best.1 {
-                // Once more, for the covariance of what is handed out.
+                // One more step computes the covariance at the returned solution.
                 solutions.clone_from(&best.1);
                 continue;
             }
             let (next, covariances) = self.step(&solutions, &responses, last, &mut scratch)?;
             if last {
-                return Ok(Ended { error, solutions, covariances, iterations, converged, damped });
+                return Ok(RefinementResult { error, solutions, covariances, iterations, converged, damped });
             }
             iterations += 1;
             converged = solutions
                 .iter()
                 .zip(&next)
                 .zip(self.structures)
-                .all(|((a, b), s)| unmoved(a, b, s.terms.len(), settings.tolerance));
+                .all(|((a, b), s)| has_converged(a, b, s.terms.len(), settings.tolerance));
             solutions = next;
         }
     }
 
-    /// All equations together from a start ([`crate::estimation::instrumental_variables::coupled`]); None where that
-    /// cannot be done.
-    fn together(&self, start: &[Solution], settings: Settings) -> Result<Option<coupled::Ended>> {
+    /// Refine all equations together; None if they cannot be refined together.
+    fn refine_together(&self, start: &[Solution], settings: Settings) -> Result<Option<coupled::CoupledEstimate>> {
         let problem = coupled::Problem {
             records: self.records,
             clean: self.clean,
@@ -275,7 +277,7 @@ impl<'a> Problem<'a> {
         }
     }
 
-    /// One step of every equation with the instruments of one coupled free run.
+    /// Step every equation once, with instruments from one coupled simulation.
     fn step(
         &self,
         solutions: &[Solution],
@@ -298,13 +300,14 @@ impl<'a> Problem<'a> {
         let mut out = (Vec::new(), Vec::new());
         for (i, fixed) in self.fixed.iter().enumerate() {
             let driven = |signal: usize| self.structures.iter().any(|e| e.output == signal);
-            let pairs = self.shelves[i].iter().zip(&simulated);
-            let made: Vec<Vec<Option<Kernel>>> = pairs.map(|(shelf, record)| shelf.clean(record, driven)).collect();
+            let pairs = self.spectra[i].iter().zip(&simulated);
+            let made: Vec<Vec<Option<Kernel>>> =
+                pairs.map(|(shelf, record)| shelf.substitute_spectra(record, driven)).collect();
             let terms = &self.structures[i].terms;
             let sources: Vec<Source<'_>> = (0..made.len())
                 .map(|r| {
                     let of = |k: usize| if driven(terms[k].signal) { &made[r][k] } else { &self.substitutes[i][r][k] };
-                    self.shelves[i][r].source(|k| of(k).as_ref())
+                    self.spectra[i][r].source(|k| of(k).as_ref())
                 })
                 .collect();
             let filters = sources
@@ -321,7 +324,7 @@ impl<'a> Problem<'a> {
     }
 }
 
-/// Σ ‖y − ŷ‖²/‖y‖² over records and equations.
+/// Relative output error Σ ‖y − ŷ‖²/‖y‖² over records and equations.
 fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<Vec<f64>>]) -> f64 {
     let mut total = 0.0;
     for (record, outputs) in records.iter().zip(responses) {
@@ -334,8 +337,8 @@ fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<V
     total
 }
 
-/// Free runs of all equations together on every record, damped where they grow.
-fn coupled(
+/// Simulate all equations together on every record, with damping if they are unstable.
+fn simulate_coupled(
     clean: &[Record],
     structures: &[Structure],
     exponents: &[Vec<f64>],
@@ -346,14 +349,14 @@ fn coupled(
     let mut out = Vec::with_capacity(clean.len());
     for (r, record) in clean.iter().enumerate() {
         let initial = initial_terms(r, structures, exponents, solutions);
-        // A run that grows with its input is no instability; one that passes all measured sizes is.
+        // A response that grows with its input is no instability; one far beyond the measured range is.
         let bounded = |outputs: &[Vec<f64>]| {
             outputs.iter().zip(structures).all(|(response, s)| {
                 let measured = record.signal(s.output).iter().fold(0.0_f64, |a, v| a.max(v.abs()));
                 response.iter().all(|v| v.abs() <= 10.0 * measured.max(f64::MIN_POSITIVE))
             })
         };
-        let (outputs, grown) = System::new(&equations, record)?.bounded(&initial, bounded)?;
+        let (outputs, grown) = System::new(&equations, record)?.respond_stabilized(&initial, bounded)?;
         damped |= grown;
         out.push(outputs);
     }

@@ -1,9 +1,9 @@
-//! Refined instrumental variables at given orders (Young and Jakeman; fractional orders: Victor, Malti, Garnier and
-//! Oustaloup, doi:10.1016/j.automatica.2012.12.006).
+//! Instrumental-variable estimation at given orders (refined IV, Young and Jakeman; fractional orders: Victor, Malti,
+//! Garnier and Oustaloup, doi:10.1016/j.automatica.2012.12.006).
 //!
-//! Least squares on the equation error is biased because a measured output is its own noise. Instruments hold none: they
-//! are what the inputs alone make of the equations ([`prefilter`], [`single`]). Several equations that drive each other
-//! are refined one by one and then together ([`coupled`]); [`fit()`] does all of it from raw records.
+//! Least squares on the equation error is biased because a measured output enters its own regressors with its noise.
+//! Instruments are free of noise: they follow from the inputs and the model alone. Coupled equations are refined one by
+//! one and then together. [`fit()`] runs all steps from raw records.
 
 pub mod coupled;
 pub mod fit;

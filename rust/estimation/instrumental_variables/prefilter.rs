@@ -1,6 +1,4 @@
-//! The filters that stand before regressors and instruments: 1/D̂, damped where it grows, and low-passes.
-//!
-//! Clean substitutes for measured outputs: their projections on what the inputs excite.
+//! Prefilters 1/D̂ and low-pass filters of instrumental variables, and noise-free projections of measured outputs.
 
 use super::solution::dot;
 use crate::equation::Filter;
@@ -12,37 +10,40 @@ use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{self, reciprocal, Buffers, Kernel};
 
-/// A free run whose second half exceeds the first by this factor is unstable: its instruments would drown the rest.
-const GROWTH: f64 = 2.0;
+/// Ratio of the peaks of the second and first half above which a response counts as unstable.
+const INSTABILITY_PEAK_RATIO: f64 = 2.0;
 
-/// 1/D mod z^m, or of D(ρz) with the largest ρ = e^{−γ/m}, γ = 0, 4, 8, …, that keeps it from growing.
+/// Return 1/D mod z^m, or 1/D(ρz) with the largest ρ = e^{−γ/m}, γ = 0, 4, 8, …, that is stable.
+///
+/// The flag is true if ρ < 1.
 ///
 /// # Errors
-/// [`LeadingZero`](crate::error::Error::LeadingZero) where D starts with zero.
+/// [`LeadingZero`](crate::error::Error::LeadingZero) if the leading coefficient of D is zero.
 #[allow(clippy::cast_precision_loss)]
 pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
     let m = divisor.len();
     let one = unit(m);
     let quotient = series::divide(&one, divisor)?;
-    if !grows(&quotient) {
+    if !is_unstable(&quotient) {
         return Ok((quotient, false));
     }
     let finite = quotient.iter().all(|q| q.is_finite());
     let mut gamma = 4.0;
     loop {
         let rho = libm::exp(-gamma / m as f64);
-        // The quotient of a divisor read at ρz is the quotient read at ρz, as long as numbers hold it.
-        let damped = if finite { read_at(rho, &quotient) } else { series::divide(&one, &read_at(rho, divisor))? };
-        // At γ = 64 m nothing is left of D but its first term.
-        if !grows(&damped) || gamma > 64.0 * m as f64 {
+        // 1/D(ρz) is the series of 1/D at ρz, unless that series overflows.
+        let damped =
+            if finite { scale_argument(rho, &quotient) } else { series::divide(&one, &scale_argument(rho, divisor))? };
+        // At γ = 64 m only the first term of D remains.
+        if !is_unstable(&damped) || gamma > 64.0 * m as f64 {
             return Ok((damped, true));
         }
         gamma *= 2.0;
     }
 }
 
-/// A series read at ρz.
-fn read_at(rho: f64, series: &[f64]) -> Vec<f64> {
+/// Return the coefficients of a(ρz) for the series a(z).
+fn scale_argument(rho: f64, series: &[f64]) -> Vec<f64> {
     let mut power = 1.0;
     series
         .iter()
@@ -54,12 +55,12 @@ fn read_at(rho: f64, series: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-pub(super) fn grows(response: &[f64]) -> bool {
+pub(super) fn is_unstable(response: &[f64]) -> bool {
     let (first, second) = response.split_at(response.len() / 2);
     let peak =
         |part: &[f64]| part.iter().fold(0.0_f64, |a, v| if v.is_finite() { a.max(v.abs()) } else { f64::INFINITY });
     let later = peak(second);
-    later.is_infinite() || later > GROWTH * peak(first)
+    later.is_infinite() || later > INSTABILITY_PEAK_RATIO * peak(first)
 }
 
 /// Frequency [rad/s] below which 90 % of a signal's power lies.
@@ -69,7 +70,7 @@ pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
     let m = signal.len();
     let mean = signal.iter().sum::<f64>() / m.max(1) as f64;
     let power = fft::power_spectrum(signal.iter().enumerate().map(|(k, v)| {
-        // Hann's window: what an open end leaks would count as high frequency.
+        // Hann window: leakage from the ends would count as high frequency.
         let window = 0.5 - 0.5 * libm::cos(2.0 * std::f64::consts::PI * k as f64 / m as f64);
         window * (v - mean)
     }));
@@ -84,7 +85,9 @@ pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
     std::f64::consts::PI / step * at.unwrap_or(0).max(1) as f64 / bins
 }
 
-/// A second-order low-pass as a series: behind it the equation between all signals stays the same.
+/// Second-order low-pass filter as a series, with cutoff frequency `omega` in rad/s.
+///
+/// The equation holds unchanged between signals that all pass this filter.
 ///
 /// # Errors
 /// As [`Filter::series`].
@@ -103,48 +106,50 @@ pub(super) fn unit(m: usize) -> Vec<f64> {
     one
 }
 
-/// Resonators of [`project`] a decade and input, and their damping ratio: broad enough to leave no gap between them.
-const RESONATORS: usize = 8;
+/// Resonators of [`project`] per decade and input. Their damping ratio makes neighbors overlap.
+const RESONATORS_PER_DECADE: usize = 8;
 const RESONATOR_DAMPING: f64 = 0.2;
 
-/// Where less than this share of every column of [`project`] is new the others are left out: what inputs excite has next to
-/// nothing along them, noise as much as along any, and rounding (10⁻¹¹ of columns of a thousand pulses) would choose them.
-const SPANNED: f64 = 1e-6;
+/// Relative norm below which the remaining columns of [`project`] are linearly dependent and excluded. The responses
+/// have almost no component along such directions, noise has as much as along any other, and rounding errors (10⁻¹¹ for
+/// columns of a thousand pulses) would determine them.
+const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 
-/// A record with clean substitutes ([`project`]) for all signals that are no inputs; inputs stand for themselves.
+/// Return a record with noise-free substitutes ([`project`]) for all signals except the inputs.
 ///
 /// # Errors
 /// As [`project`], [`Error::Interrupted`].
 pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &Stop) -> Result<Record> {
     let known: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
     // One basis for all signals; none where all are inputs.
-    let basis = if known.len() < record.len() { excited(&record, &known, at_rest, stop)? } else { Vec::new() };
+    let basis =
+        if known.len() < record.len() { input_response_basis(&record, &known, at_rest, stop)? } else { Vec::new() };
     let clean = (0..record.len()).map(|s| {
         let signal = record.signal(s);
         if known.contains(&s) {
             signal.to_vec()
         } else {
-            along(&basis, signal)
+            project_on_basis(&basis, signal)
         }
     });
     let clean = clean.collect();
     record.with_clean(clean)
 }
 
-/// A measured signal without most of its noise: its least-squares projection on what the inputs excite.
+/// Project a measured signal on the space of responses to the inputs, which removes most of its noise.
 ///
-/// The basis holds each input's first two integrals and, eight a decade, its response through resonators: k directions
-/// leave k/m of the noise power, whatever the signal's dynamics. Deterministic powers of t (offset, ramp) are added
-/// where the record does not start at rest.
+/// The basis contains the first two integrals of each input and its responses through resonators, eight per decade.
+/// A basis of k directions passes k/m of the noise power, whatever the dynamics. Powers of t (offset, ramp) are added
+/// if the record has nonzero initial conditions.
 ///
 /// # Errors
-/// No input, a record of fewer than 8 pulses.
+/// [`Error::Structure`] without an input or for a record of fewer than 8 pulses.
 pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) -> Result<Vec<f64>> {
-    Ok(along(&excited(record, inputs, at_rest, &Stop::default())?, record.signal(signal)))
+    Ok(project_on_basis(&input_response_basis(record, inputs, at_rest, &Stop::default())?, record.signal(signal)))
 }
 
-/// The sum of a signal's parts along orthonormal directions.
-fn along(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
+/// Project a signal on an orthonormal basis.
+fn project_on_basis(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; signal.len()];
     for direction in basis {
         let along = dot(direction, signal);
@@ -153,9 +158,9 @@ fn along(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
     out
 }
 
-/// An orthonormal basis of what the inputs excite.
+/// Orthonormal basis of the integrals of the inputs and their responses through resonators.
 #[allow(clippy::cast_precision_loss)]
-fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Result<Vec<Vec<f64>>> {
+fn input_response_basis(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Result<Vec<Vec<f64>>> {
     let (m, h) = (record.m(), record.step());
     if m < 8 || inputs.is_empty() {
         return Err(Error::Structure {
@@ -167,7 +172,7 @@ fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Res
     let (low, high) = (std::f64::consts::PI / duration, std::f64::consts::PI / (4.0 * h));
     let decades = libm::log10(high / low);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let count = ((decades * RESONATORS as f64) as usize).clamp(2, (m / (8 * inputs.len())).max(2));
+    let count = ((decades * RESONATORS_PER_DECADE as f64) as usize).clamp(2, (m / (8 * inputs.len())).max(2));
     let mut columns = Vec::new();
     if !at_rest {
         columns.extend([0.0, 1.0].map(|e| record.initial_term(e)));
@@ -185,7 +190,7 @@ fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Res
         columns.extend(integrals);
         for i in 0..count {
             stop.check()?;
-            // s u and u over s² + 2ζωs + ω² are I u and I² u over 1 + 2ζω I + ω² I², whatever their sizes.
+            // s u and u over s² + 2ζωs + ω² are I u and I² u over 1 + 2ζω I + ω² I², up to a factor.
             let omega = low * libm::pow(10.0, decades * i as f64 / (count - 1) as f64);
             let resonator =
                 once.iter().zip(&twice).map(|(a, b)| 2.0 * RESONATOR_DAMPING * omega * a + omega * omega * b);
@@ -199,5 +204,5 @@ fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Res
             }));
         }
     }
-    orthonormal_basis(columns, SPANNED, stop)
+    orthonormal_basis(columns, BASIS_RANK_TOLERANCE, stop)
 }

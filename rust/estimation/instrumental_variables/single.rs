@@ -1,25 +1,28 @@
-//! One equation: the regression of a step, and steps until they stand still.
+//! Instrumental variables for one equation: the regression of one step, and the iteration to convergence.
 //!
-//! The equation is filtered by 1/D̂, which leaves about the white noise of the output, and correlated with instruments
-//! that hold no noise: the inputs and the simulated output. Both follow from the last estimate, so the step is repeated.
+//! The equation is filtered by 1/D̂, so that its error is close to the white noise of the output. It is correlated with
+//! instruments without noise: the inputs and the simulated output. Both depend on the last estimate, so the step is
+//! iterated.
 
 use super::prefilter::damped_inverse;
-use super::solution::{dot, long_run, orthonormal, unmoved, Instruments, Settings, Solution};
+use super::solution::{
+    add_long_run_covariance, dot, has_converged, orthonormalize_instruments, RecordInstruments, Settings, Solution,
+};
 use crate::equation::Structure;
 use crate::error::Result;
 use crate::fractional::kernels;
-use crate::linalg::small::Scaled;
+use crate::linalg::small::EquilibratedLu;
 use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
 
-/// What a step reads of one record for one equation: spectra good for products of two series of m terms.
+/// Data of one record for one equation: spectra padded for products of two series of m terms.
 pub struct Source<'a> {
-    /// Per term: kernel of I^η and its spectrum where the term is the output's own.
+    /// Per term: kernel of I^η and its spectrum for terms of the output itself; None for other terms.
     pub own: Vec<Option<(&'a [f64], &'a Kernel)>>,
     /// Per term: I^η s as measured.
     pub measured: Vec<&'a Kernel>,
-    /// Per term: I^η s without noise, the same object where it is no other; not read for own terms.
+    /// Per term: I^η s without noise; the same object as `measured` if there is no substitute. Unused for own terms.
     pub clean: Vec<&'a Kernel>,
     /// Initial terms.
     pub initial: Vec<&'a Kernel>,
@@ -29,17 +32,17 @@ pub struct Source<'a> {
     pub output: &'a [f64],
 }
 
-/// Spectra that the sources of one record share, whatever solution they are for.
-pub(super) struct Shelf<'a> {
+/// Spectra of one record and equation that do not depend on the solution.
+pub(super) struct EquationSpectra<'a> {
     record: &'a Record,
     output: usize,
-    terms: Vec<Shelved>,
+    terms: Vec<TermSpectra>,
     initial: Vec<Kernel>,
     target: Kernel,
 }
 
-/// One term: its signal and order, its kernel, that one's spectrum and that of I^η s as measured.
-struct Shelved {
+/// Spectra of one term: kernel of I^η, its spectrum, and the spectrum of the measured I^η s.
+struct TermSpectra {
     signal: usize,
     eta: f64,
     kernel: Vec<f64>,
@@ -47,9 +50,9 @@ struct Shelved {
     measured: Kernel,
 }
 
-impl Shelved {
-    /// Spectrum of I^η of another signal.
-    fn of(&self, signal: &[f64]) -> Kernel {
+impl TermSpectra {
+    /// Spectrum of I^η of the given signal.
+    fn integral_spectrum(&self, signal: &[f64]) -> Kernel {
         if self.eta == 0.0 {
             Kernel::new(signal)
         } else {
@@ -58,14 +61,14 @@ impl Shelved {
     }
 }
 
-impl<'a> Shelf<'a> {
+impl<'a> EquationSpectra<'a> {
     pub(super) fn new(record: &'a Record, structure: &Structure, exponents: &[f64]) -> Self {
         let term = |k: usize| {
             let (signal, eta) = (structure.terms[k].signal, structure.integration(k));
             let kernel = kernels::kernel(eta, record.m(), record.step());
             let spectrum = Kernel::new(&kernel);
             let measured = Kernel::new(&record.integral(signal, eta));
-            Shelved { signal, eta, kernel, spectrum, measured }
+            TermSpectra { signal, eta, kernel, spectrum, measured }
         };
         Self {
             record,
@@ -76,16 +79,21 @@ impl<'a> Shelf<'a> {
         }
     }
 
-    /// What substitutes make of the terms of other signals than the output, where `wanted` and where they are no other
-    /// than what was measured.
-    pub(super) fn clean(&self, substitute: &Record, wanted: impl Fn(usize) -> bool) -> Vec<Option<Kernel>> {
+    /// Spectra of the terms of other signals than the output, with the signals of `substitute`.
+    ///
+    /// None for signals that are not `wanted` or that equal the measured ones.
+    pub(super) fn substitute_spectra(
+        &self,
+        substitute: &Record,
+        wanted: impl Fn(usize) -> bool,
+    ) -> Vec<Option<Kernel>> {
         let other = |s: usize| s != self.output && wanted(s) && substitute.signal(s) != self.record.signal(s);
-        self.terms.iter().map(|t| other(t.signal).then(|| t.of(substitute.signal(t.signal)))).collect()
+        self.terms.iter().map(|t| other(t.signal).then(|| t.integral_spectrum(substitute.signal(t.signal)))).collect()
     }
 
-    /// With what a substitute makes of each term, as measured where that is none.
+    /// Source of a step with the given substitute spectra; measured spectra for terms without one.
     pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> Source<'b> {
-        let own = |t: &Shelved| t.signal == self.output;
+        let own = |t: &TermSpectra| t.signal == self.output;
         let terms = || self.terms.iter();
         Source {
             own: terms().map(|t| own(t).then_some((&t.kernel[..], &t.spectrum))).collect(),
@@ -98,7 +106,7 @@ impl<'a> Shelf<'a> {
     }
 }
 
-/// D = 1 − Σ c F^η over the own terms.
+/// Divisor D = 1 − Σ c F^η over the terms of the output itself.
 pub(super) fn divisor(source: &Source<'_>, coefficients: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; source.output.len()];
     for (kernel, c) in source.own.iter().zip(coefficients) {
@@ -110,7 +118,7 @@ pub(super) fn divisor(source: &Source<'_>, coefficients: &[f64]) -> Vec<f64> {
     out
 }
 
-/// Memory of the steps of one thread.
+/// Work buffers of the steps of one thread.
 #[derive(Default)]
 pub struct Scratch {
     buffers: Buffers,
@@ -118,21 +126,21 @@ pub struct Scratch {
 }
 
 impl Scratch {
-    /// Of steps that end with [`Interrupted`](crate::error::Error::Interrupted) once they are told to stop.
+    /// Buffers of steps that return [`Interrupted`](crate::error::Error::Interrupted) after a stop request.
     #[must_use]
     pub fn until(stop: &Stop) -> Self {
         Self { buffers: Buffers::default(), stop: stop.clone() }
     }
 }
 
-/// One step for one equation: new coefficients from filters 1/D̂ and simulated outputs, one of each a record.
+/// Compute new coefficients of one equation from filters 1/D̂ and simulated outputs, one of each per record.
 ///
-/// `dropped` lists (record, position) of initial terms to leave out. Returns the solution and, if asked for, the
+/// `dropped` lists (record, position) of excluded initial terms. Returns the solution and, if requested, the
 /// covariance of the free coefficients.
 ///
 /// # Errors
-/// [`Singular`](crate::error::Error::Singular) where the instruments do not tell the regressors apart,
-/// [`Interrupted`](crate::error::Error::Interrupted) once the scratch's stop is set.
+/// [`Singular`](crate::error::Error::Singular) if the instruments do not identify the coefficients,
+/// [`Interrupted`](crate::error::Error::Interrupted) after a stop request.
 #[allow(clippy::cast_precision_loss)]
 pub fn step(
     sources: &[Source<'_>],
@@ -179,12 +187,14 @@ pub fn step(
             phi.push(column);
             places.push(free.len() + place);
         }
-        filtered.push(Filtered { phi, target });
-        instruments.push(Instruments { columns: psi, places });
+        filtered.push(FilteredRegression { phi, target });
+        instruments.push(RecordInstruments { columns: psi, unknown_indices: places });
     }
-    orthonormal(&mut instruments, k)?;
+    orthonormalize_instruments(&mut instruments, k)?;
     let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
-    for (Filtered { phi, target }, Instruments { columns, places }) in filtered.iter().zip(&instruments) {
+    for (FilteredRegression { phi, target }, RecordInstruments { columns, unknown_indices: places }) in
+        filtered.iter().zip(&instruments)
+    {
         for (instrument, &a) in columns.iter().zip(places) {
             rhs[a] += dot(instrument, target);
             for (regressor, &b) in phi.iter().zip(places) {
@@ -192,7 +202,7 @@ pub fn step(
             }
         }
     }
-    let solved = Scaled::new(&cross, k)?;
+    let solved = EquilibratedLu::new(&cross, k)?;
     let x = solved.solve(&rhs);
     let mut solution: Solution = fixed.iter().map(|f| f.unwrap_or(0.0)).collect();
     for (&j, &value) in free.iter().zip(&x) {
@@ -206,7 +216,7 @@ pub fn step(
     if with_covariance {
         let mut meat = vec![0.0; k * k];
         for (part, instruments) in filtered.iter().zip(&instruments) {
-            long_run(&part.scores(instruments, &x), &instruments.places, &mut meat, k);
+            add_long_run_covariance(&part.scores(instruments, &x), &instruments.unknown_indices, &mut meat, k);
         }
         let (n, inverse) = (free.len(), solved.inverse());
         covariance = vec![0.0; n * n];
@@ -225,24 +235,24 @@ pub fn step(
     Ok((solution, covariance))
 }
 
-/// Regressors and target of one record behind the filter.
-struct Filtered {
+/// Regressors and target of one record after the prefilter.
+struct FilteredRegression {
     phi: Vec<Vec<f64>>,
     target: Vec<f64>,
 }
 
-impl Filtered {
-    /// ψ e at a solution, a row each instrument.
-    fn scores(&self, instruments: &Instruments, x: &[f64]) -> Vec<Vec<f64>> {
+impl FilteredRegression {
+    /// Scores ψ e at a solution, one row per instrument.
+    fn scores(&self, instruments: &RecordInstruments, x: &[f64]) -> Vec<Vec<f64>> {
         let mut rest = self.target.clone();
-        for (column, &place) in self.phi.iter().zip(&instruments.places) {
+        for (column, &place) in self.phi.iter().zip(&instruments.unknown_indices) {
             rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
         }
         instruments.columns.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect()
     }
 }
 
-/// First m terms of a product of two cached series.
+/// First m coefficients of the product of two series.
 fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Vec<f64>> {
     scratch.stop.check()?;
     let mut out = vec![0.0; m];
@@ -250,10 +260,10 @@ fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Ve
     Ok(out)
 }
 
-/// One equation refined from a start, its output simulated from the clean signals of its sources.
+/// Refine one equation from an initial guess, with its output simulated from the noise-free signals of its sources.
 ///
 /// `start` holds the coefficients of the terms, then of the initial terms record by record. Returns the last solution,
-/// the steps made and whether the last moved nothing.
+/// the number of iterations and whether they converged.
 ///
 /// # Errors
 /// As [`step`] and [`damped_inverse`].
@@ -289,7 +299,7 @@ pub fn refine(
             responses.push(response);
         }
         let (next, _) = step(sources, &filters, &responses, fixed, dropped, false, scratch)?;
-        let still = unmoved(&solution, &next, fixed.len(), settings.tolerance);
+        let still = has_converged(&solution, &next, fixed.len(), settings.tolerance);
         solution = next;
         if still {
             return Ok((solution, made, true));

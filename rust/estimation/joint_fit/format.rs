@@ -1,8 +1,7 @@
-//! Numbers in words, as few digits as tell them apart.
+//! Formatting of numbers with few significant digits.
 
-/// A number in so many significant digits without zeros behind them, by a power of ten where it is large or small: what
-/// C and Python call the format `g`.
-pub(crate) fn short(value: f64, digits: usize) -> String {
+/// Format a number like `g` in C and Python: significant digits without trailing zeros, with an exponent if needed.
+pub(crate) fn format_general(value: f64, digits: usize) -> String {
     if !value.is_finite() {
         return if value.is_nan() {
             "nan".into()
@@ -18,20 +17,20 @@ pub(crate) fn short(value: f64, digits: usize) -> String {
     let Some((mantissa, exponent)) = rounded.split_once('e') else { return rounded };
     let power: i64 = exponent.parse().unwrap_or(0);
     match usize::try_from(power) {
-        Ok(whole) if whole <= most => trimmed(&format!("{value:.*}", most - whole)).into(),
+        Ok(whole) if whole <= most => trim_zeros(&format!("{value:.*}", most - whole)).into(),
         Err(_) if power >= -4 => {
             let places = usize::try_from(-power).unwrap_or(0) + most;
-            trimmed(&format!("{value:.places$}")).into()
+            trim_zeros(&format!("{value:.places$}")).into()
         }
         _ => {
             let sign = if power < 0 { '-' } else { '+' };
-            format!("{}e{sign}{:02}", trimmed(mantissa), power.abs())
+            format!("{}e{sign}{:02}", trim_zeros(mantissa), power.abs())
         }
     }
 }
 
-/// Without zeros behind the point, and without a point before nothing.
-fn trimmed(text: &str) -> &str {
+/// Remove trailing zeros after the decimal point, and a trailing point.
+fn trim_zeros(text: &str) -> &str {
     if text.contains('.') {
         text.trim_end_matches('0').trim_end_matches('.')
     } else {
@@ -41,10 +40,10 @@ fn trimmed(text: &str) -> &str {
 
 #[cfg(test)]
 mod tests {
-    use super::short;
+    use super::format_general;
 
     #[test]
-    fn numbers_are_written_as_python_writes_them() {
+    fn format_matches_python() {
         let three = [
             (1e-5, "1e-05"),
             (0.000_123_456, "0.000123"),
@@ -67,7 +66,7 @@ mod tests {
             (f64::NEG_INFINITY, "-inf"),
             (f64::NAN, "nan"),
         ];
-        three.iter().for_each(|(value, text)| assert_eq!(short(*value, 3), *text));
+        three.iter().for_each(|(value, text)| assert_eq!(format_general(*value, 3), *text));
         let six = [
             (1e-5, "1e-05"),
             (0.25, "0.25"),
@@ -83,6 +82,6 @@ mod tests {
             (2.0 / 3.0, "0.666667"),
             (-1e-4, "-0.0001"),
         ];
-        six.iter().for_each(|(value, text)| assert_eq!(short(*value, 6), *text));
+        six.iter().for_each(|(value, text)| assert_eq!(format_general(*value, 6), *text));
     }
 }

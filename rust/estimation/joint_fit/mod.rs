@@ -1,12 +1,10 @@
-//! A joint fit of all equations on all runs by output error: one call from a structure, its runs and settings to an optimum
-//! with its covariance.
+//! Joint fit of all equations to all runs by output error, from a structure to an optimum with its covariance.
 //!
-//! [`parameter_set::Free`] says what is free in a structure. [`initial_guesses::Lattices`] finds where to start from,
-//! [`multistart::race`] sends the starts over laps on thinned samples, [`reweighting::settled`] descends until each
-//! output weighs by its own residuals, [`stability_preference::steadied`] keeps free runs that grow only where the runs
-//! force them, and [`step_refinement::refined`] halves the step until that moves the estimate by little of its standard
-//! error, and tells the limit. [`fit::fit`] is all of it. What is compared with comes from a [`Source`], which samples
-//! runs as finely as it is asked.
+//! A `ParameterSet` lists the free parameters of a structure. Initial guesses come from coarse order grids. A
+//! multistart with successive halving optimizes them on subsampled records. Iterative reweighting then estimates the
+//! noise level of each output. An unstable optimum is kept only if it fits significantly better than a stable one.
+//! Finally the step is halved until the estimate changes by a small part of its standard error, and extrapolated to
+//! zero step. [`fit::fit`] runs all of it. The runs come from a [`Source`], which samples them at the requested step.
 
 pub mod covariance;
 pub mod fit;
@@ -23,12 +21,12 @@ pub mod stability_preference;
 pub mod step_refinement;
 pub mod structure;
 
-pub use fit::{JointFit, Outset, Settings, Size, Sought};
-pub use multistart::Starts;
-pub use objective::{Grid, Weights};
-pub use parameter_set::Clock;
-pub use problem::{Attempt, Place, Problem, Runner};
-pub use reweighting::{settled, Loss, Robust};
-pub use source::{Recordings, Sampled, Sampling, Signal, Source};
-pub use stability_preference::Growth;
-pub use step_refinement::{freed, refined, Finished, Optimum};
+pub use fit::{FitProblem, Initialization, JointFit, OutputScale, Settings};
+pub use multistart::InitialGuessSource;
+pub use objective::{Objective, Weights};
+pub use parameter_set::TimeScaling;
+pub use problem::{Candidate, Iterate, OptimizationResult, Problem};
+pub use reweighting::{fit_reweighted, Loss, RobustSummary};
+pub use source::{Recordings, SampledRuns, Sampling, Signal, Source};
+pub use stability_preference::StabilityComparison;
+pub use step_refinement::{best_alternative, refine_step, Optimum, OptimumStatistics};

@@ -1,53 +1,53 @@
-//! A problem on its runs, sampled so finely, and what each output weighs.
+//! Objective of a joint fit: a problem on sampled runs, with output weights and robust weights.
 
 use std::sync::Arc;
 
-use super::problem::{Attempt, Place, Problem};
+use super::problem::{Iterate, OptimizationResult, Problem};
 use super::source::{Sampling, Source};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{Experiment, Settings};
 use crate::parallel::Stop;
 use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 
-/// A descent ends where a whole step would lower the cost by a smaller share than this.
-pub const TOLERANCE: f64 = 1e-9;
-/// Discretisation that a fit may leave, in standard deviations of the noise.
-const NOTICED: f64 = 0.3;
-/// Finest grid: pulses a sample interval.
-pub const FINEST: usize = 16;
+/// Relative cost decrease predicted for a full step below which an optimization has converged.
+pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
+/// Largest acceptable discretization error, in standard deviations of the noise.
+const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
+/// Finest grid, in block pulses per sampling interval.
+pub const MAX_PULSES_PER_SAMPLE: usize = 16;
 
-/// What each output weighs, 1/σ, and the shares of these weights by run and output that a robust loss leaves.
+/// Weights 1/σ of the outputs, and robust weights of the samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Weights {
-    /// Of each output.
+    /// Weight 1/σ of each output.
     pub outputs: Vec<f64>,
-    /// Of each compared sample of each output of each run; none: all count alike.
-    pub shares: Option<Vec<Vec<Vec<f64>>>>,
+    /// Robust weight of each compared sample, by run and output; None for unit weights.
+    pub robust_weights: Option<Vec<Vec<Vec<f64>>>>,
 }
 
-/// A problem on its runs. On a steady one no descent goes from a free run that dies away to one that grows.
+/// Objective of a joint fit: weighted residuals of a problem on sampled runs.
 #[derive(Clone)]
-pub struct Grid<'a> {
-    /// What is free.
+pub struct Objective<'a> {
+    /// The optimization problem.
     pub problem: &'a Problem,
     source: &'a dyn Source,
     stop: &'a Stop,
-    /// What each output weighs.
+    /// Weights of outputs and samples.
     pub weights: Weights,
-    /// How finely the runs are sampled.
+    /// Sampling of the runs.
     pub sampling: Sampling,
-    /// Whether a free run that grows is no place to go.
-    pub steady: bool,
-    /// What was read, by run and output, where something was not.
-    read: Arc<Vec<Vec<Vec<f64>>>>,
+    /// True if an optimization must not go from a stable model to an unstable one.
+    pub requires_stability: bool,
+    /// Mask of the present samples, by run and output; empty without missing samples.
+    sample_mask: Arc<Vec<Vec<Vec<f64>>>>,
     experiments: Arc<Vec<Experiment>>,
 }
 
-impl<'a> Grid<'a> {
-    /// The runs of a source on a grid.
+impl<'a> Objective<'a> {
+    /// Objective of a problem on the runs of a source.
     ///
     /// # Errors
-    /// Those of the source; [`Error::Length`] for weights or shares of another number.
+    /// As the source; [`Error::Length`] for a wrong number of weights.
     pub fn new(
         (problem, source, stop): (&'a Problem, &'a dyn Source, &'a Stop),
         weights: Weights,
@@ -58,31 +58,39 @@ impl<'a> Grid<'a> {
         sampling.check()?;
         let experiments = source.experiments(sampling)?;
         stop.check()?;
-        let read = Arc::new(experiments.iter().map(|e| e.shares.clone()).collect());
-        let blank = Weights { outputs: Vec::new(), shares: None };
-        let grid =
-            Self { problem, source, stop, weights: blank, sampling, steady, read, experiments: Arc::new(experiments) };
-        grid.reweighed(weights)
+        let read = Arc::new(experiments.iter().map(|e| e.sample_weights.clone()).collect());
+        let blank = Weights { outputs: Vec::new(), robust_weights: None };
+        let grid = Self {
+            problem,
+            source,
+            stop,
+            weights: blank,
+            sampling,
+            requires_stability: steady,
+            sample_mask: read,
+            experiments: Arc::new(experiments),
+        };
+        grid.with_weights(weights)
     }
 
-    /// The same runs with other weights.
+    /// Objective with other weights.
     ///
     /// # Errors
-    /// [`Error::Length`] for shares of another number.
-    pub fn reweighed(&self, weights: Weights) -> Result<Self> {
+    /// [`Error::Length`] for a wrong number of robust weights.
+    pub fn with_weights(&self, weights: Weights) -> Result<Self> {
         let mut experiments = Vec::clone(&self.experiments);
-        if let Some(shares) = &weights.shares {
+        if let Some(shares) = &weights.robust_weights {
             check_length("runs with shares", experiments.len(), shares.len())?;
         }
         for (k, experiment) in experiments.iter_mut().enumerate() {
             experiment.weights.clone_from(&weights.outputs);
-            experiment.shares.clone_from(&self.read[k]);
-            let Some(shares) = weights.shares.as_ref().map(|of| &of[k]) else { continue };
+            experiment.sample_weights.clone_from(&self.sample_mask[k]);
+            let Some(shares) = weights.robust_weights.as_ref().map(|of| &of[k]) else { continue };
             check_length("outputs with shares", self.problem.outputs.len(), shares.len())?;
-            if experiment.shares.is_empty() {
-                experiment.shares.clone_from(shares);
+            if experiment.sample_weights.is_empty() {
+                experiment.sample_weights.clone_from(shares);
             } else {
-                for (row, by) in experiment.shares.iter_mut().zip(shares) {
+                for (row, by) in experiment.sample_weights.iter_mut().zip(shares) {
                     check_length("shares of samples", row.len(), by.len())?;
                     row.iter_mut().zip(by).for_each(|(share, by)| *share *= by);
                 }
@@ -91,110 +99,109 @@ impl<'a> Grid<'a> {
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
     }
 
-    /// The same on half the step.
+    /// Objective on half the step.
     ///
     /// # Errors
-    /// Those of the source.
+    /// As the source.
     pub fn finer(&self) -> Result<Self> {
-        let sampling = Sampling { every: 2 * self.sampling.every, ..self.sampling };
-        Self::new((self.problem, self.source, self.stop), self.weights.clone(), sampling, self.steady)
+        let sampling = Sampling { pulses_per_sample: 2 * self.sampling.pulses_per_sample, ..self.sampling };
+        Self::new((self.problem, self.source, self.stop), self.weights.clone(), sampling, self.requires_stability)
     }
 
-    /// The same runs for another problem of the same outputs.
+    /// Objective of another problem with the same outputs.
     #[must_use]
-    pub fn of(&self, problem: &'a Problem) -> Self {
+    pub fn with_problem(&self, problem: &'a Problem) -> Self {
         Self { problem, ..self.clone() }
     }
 
-    /// The same where no descent goes from a free run that dies away to one that grows.
+    /// Objective whose optimization does not go from a stable model to an unstable one.
     #[must_use]
-    pub fn steadily(&self) -> Self {
-        Self { steady: true, ..self.clone() }
+    pub fn with_stability_constraint(&self) -> Self {
+        Self { requires_stability: true, ..self.clone() }
     }
 
-    /// The runs as they are compared with.
+    /// The sampled runs.
     #[must_use]
     pub fn experiments(&self) -> &[Experiment] {
         &self.experiments
     }
 
-    /// Where the runs come from.
+    /// Source of the runs.
     #[must_use]
     pub fn source(&self) -> &'a dyn Source {
         self.source
     }
 
-    /// Whom to ask whether to go on.
+    /// Cancellation flag.
     #[must_use]
     pub fn stop(&self) -> &'a Stop {
         self.stop
     }
 
-    /// The unit of time of the runs.
+    /// Time scaling of the problem on these runs.
     #[must_use]
-    pub fn clock(&self) -> super::parameter_set::Clock {
-        super::parameter_set::Clock::of(self.problem, &self.source.spans())
+    pub fn time_scaling(&self) -> super::parameter_set::TimeScaling {
+        super::parameter_set::TimeScaling::from_runs(self.problem, &self.source.spans())
     }
 
-    /// Levenberg–Marquardt from a place.
+    /// Minimize the cost from an iterate by Levenberg–Marquardt.
     ///
     /// # Errors
-    /// See [`Problem::descend`].
-    pub fn descend(&self, start: &Place, evaluations: usize) -> Result<Attempt> {
-        let settings = Settings { evaluations, tolerance: TOLERANCE };
-        self.problem.descend(&self.experiments, start, settings, self.steady, self.stop)
+    /// As [`Problem::minimize`].
+    pub fn minimize(&self, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
+        let settings = Settings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        self.problem.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
-    /// The same in the coordinates of a problem turned towards a start, see [`super::parameter_set::Free::turned`].
+    /// Minimize the cost in the coordinates of another problem, see `ParameterSet::problem_at`.
     ///
     /// # Errors
-    /// See [`Problem::descend`].
-    pub fn descend_in(&self, turned: &Problem, start: &Place, evaluations: usize) -> Result<Attempt> {
-        let settings = Settings { evaluations, tolerance: TOLERANCE };
-        turned.descend(&self.experiments, start, settings, self.steady, self.stop)
+    /// As [`Problem::minimize`].
+    pub fn minimize_in(&self, turned: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
+        let settings = Settings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
-    /// Whether halving the step moves the simulated samples by a share of the residuals that a fit would notice.
+    /// True if halving the step changes the simulated samples significantly relative to the residuals.
     ///
-    /// What is left over is noise at least; of a structure that is not all of the machine's physics it is more.
+    /// The residuals contain at least the noise, and the model error of an incomplete structure.
     ///
     /// # Errors
-    /// Those of the source, [`Error::Interrupted`].
-    pub fn matters(&self, place: &Place) -> Result<bool> {
-        self.noticed(place, &self.finer()?)
+    /// As the source; [`Error::Interrupted`].
+    pub fn is_discretization_significant(&self, place: &Iterate) -> Result<bool> {
+        self.is_refinement_significant(place, &self.finer()?)
     }
 
-    /// The same, half the step at hand.
+    /// True if the simulated samples differ significantly from those on the given finer grid.
     ///
     /// # Errors
     /// [`Error::Interrupted`].
-    pub fn noticed(&self, place: &Place, finer: &Self) -> Result<bool> {
-        let (Some(here), Some(there)) = (self.evaluated(place)?, finer.evaluated(place)?) else {
-            // Finite on one grid and not on the other: it matters.
+    pub fn is_refinement_significant(&self, place: &Iterate, finer: &Self) -> Result<bool> {
+        let (Some(here), Some(there)) = (self.evaluate(place)?, finer.evaluate(place)?) else {
+            // The simulation is finite on one grid only: the difference is significant.
             return Ok(true);
         };
         let moved: Vec<f64> = there.residuals.iter().zip(&here.residuals).map(|(a, b)| (a - b).powi(2)).collect();
         let left = mean(&there.residuals.iter().map(|e| e * e).collect::<Vec<_>>()).max(1.0);
-        // Squares beyond the numbers belong to a free run that one of the grids does not carry.
-        Ok(!left.is_finite() || mean(&moved) > NOTICED * NOTICED * left)
+        // Overflow of the squares means that the simulation diverges on one of the grids.
+        Ok(!left.is_finite() || mean(&moved) > MAX_DISCRETIZATION_NOISE_RATIO * MAX_DISCRETIZATION_NOISE_RATIO * left)
     }
 
-    /// Places of attempts in the order of their cost on the grid that they come from or on this finer one, whichever is
-    /// the larger.
+    /// Indices of results, sorted by the larger of their costs on their own grid and on this finer one.
     ///
-    /// The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit may use it to follow
-    /// noise, at the cost of a free run that no other grid has.
+    /// The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit can use this mode to
+    /// follow noise, but its simulation is not reproduced on any other grid.
     ///
     /// # Errors
     /// [`Error::Interrupted`].
-    pub fn ranked(&self, attempts: &[&Attempt]) -> Result<Vec<usize>> {
-        let worse = |attempt: &&Attempt| {
-            let there = self.evaluated(&attempt.place)?;
-            Ok(there.map_or(f64::INFINITY, |there| attempt.level().max(there.level())))
+    pub fn rank_results(&self, attempts: &[&OptimizationResult]) -> Result<Vec<usize>> {
+        let worse = |attempt: &&OptimizationResult| {
+            let there = self.evaluate(&attempt.iterate)?;
+            Ok(there.map_or(f64::INFINITY, |there| attempt.cost_per_residual().max(there.cost_per_residual())))
         };
         let costs: Vec<f64> = attempts.iter().map(worse).collect::<Result<_>>()?;
         let any = costs.iter().any(|cost| cost.is_finite());
-        let key = |i: usize| (if any { costs[i] } else { 0.0 }, attempts[i].level());
+        let key = |i: usize| (if any { costs[i] } else { 0.0 }, attempts[i].cost_per_residual());
         let mut order: Vec<usize> = (0..attempts.len()).collect();
         order.sort_by(|&i, &j| {
             let ((a, b), (c, d)) = (key(i), key(j));
@@ -203,31 +210,33 @@ impl<'a> Grid<'a> {
         Ok(order)
     }
 
-    /// A place with its residuals and its cost on this grid, without derivatives; none where it has no finite free run.
+    /// Residuals and cost of an iterate, without derivatives; None if its simulation is not finite.
     ///
     /// # Errors
     /// [`Error::Interrupted`].
-    pub fn evaluated(&self, place: &Place) -> Result<Option<Attempt>> {
-        match self.descend(place, 0) {
+    pub fn evaluate(&self, place: &Iterate) -> Result<Option<OptimizationResult>> {
+        match self.minimize(place, 0) {
             Ok(found) => Ok(Some(found)),
             Err(Error::Interrupted) => Err(Error::Interrupted),
             Err(_) => Ok(None),
         }
     }
 
-    /// Shares with which the compared samples count, by run and output; none: all count alike.
-    fn shares(&self) -> impl Iterator<Item = (&Experiment, usize, Option<&[f64]>)> {
+    /// Weights of the compared samples, by run and output; None for unit weights.
+    fn sample_weights(&self) -> impl Iterator<Item = (&Experiment, usize, Option<&[f64]>)> {
         let outputs = self.problem.outputs.len();
-        self.experiments.iter().flat_map(move |e| (0..outputs).map(move |i| (e, i, e.shares.get(i).map(Vec::as_slice))))
+        self.experiments
+            .iter()
+            .flat_map(move |e| (0..outputs).map(move |i| (e, i, e.sample_weights.get(i).map(Vec::as_slice))))
     }
 
-    /// Residuals of an attempt over the noise by run and output, whatever their shares; not a number where none was read.
+    /// Residuals in units of the noise by run and output, without robust weights; NaN for missing samples.
     #[must_use]
-    pub fn residuals(&self, attempt: &Attempt) -> Vec<Vec<Vec<f64>>> {
+    pub fn residuals(&self, attempt: &OptimizationResult) -> Vec<Vec<Vec<f64>>> {
         let outputs = self.problem.outputs.len();
         let (mut parts, mut rest) = (Vec::new(), attempt.residuals.as_slice());
-        for (experiment, i, shares) in self.shares() {
-            let (own, others) = rest.split_at(experiment.compared().min(rest.len()));
+        for (experiment, i, shares) in self.sample_weights() {
+            let (own, others) = rest.split_at(experiment.compared_count().min(rest.len()));
             rest = others;
             if i == 0 {
                 parts.push(Vec::with_capacity(outputs));
@@ -245,36 +254,38 @@ impl<'a> Grid<'a> {
         parts
     }
 
-    /// Share of every residual, as they are strung together.
+    /// Weight of every residual, in the order of the residual vector.
     #[must_use]
-    pub fn every_share(&self) -> Vec<f64> {
+    pub fn flat_sample_weights(&self) -> Vec<f64> {
         let of = |(experiment, _, shares): (&Experiment, usize, Option<&[f64]>)| {
-            shares.map_or_else(|| vec![1.0; experiment.compared()], <[f64]>::to_vec)
+            shares.map_or_else(|| vec![1.0; experiment.compared_count()], <[f64]>::to_vec)
         };
-        self.shares().flat_map(of).collect()
+        self.sample_weights().flat_map(of).collect()
     }
 
-    /// Weighted residuals that are there by output, all runs one after another.
+    /// Residuals of the present samples by output, in units of the noise, all runs concatenated.
     #[must_use]
-    pub fn pooled(&self, attempt: &Attempt) -> Vec<Vec<f64>> {
+    pub fn residuals_by_output(&self, attempt: &OptimizationResult) -> Vec<Vec<f64>> {
         let parts = self.residuals(attempt);
         let of = |i: usize| parts.iter().flat_map(|part| &part[i]).copied().filter(|e| !e.is_nan()).collect();
         (0..self.problem.outputs.len()).map(of).collect()
     }
 
-    /// Root mean square of the weighted residuals by output, over all runs; infinite beyond the numbers.
+    /// Root mean square of the weighted residuals by output, over all runs; infinite on overflow.
     #[must_use]
-    pub fn levels(&self, attempt: &Attempt) -> Vec<f64> {
-        self.pooled(attempt).iter().map(|e| root_mean_square(e)).collect()
+    pub fn residual_root_mean_squares(&self, attempt: &OptimizationResult) -> Vec<f64> {
+        self.residuals_by_output(attempt).iter().map(|e| root_mean_square(e)).collect()
     }
 
-    /// Deviation of the usual residuals by output, in units of the weights; of all where half of them are none.
+    /// Robust standard deviation of the residuals by output, in units of the weights.
+    ///
+    /// If more than half of the residuals are zero, the root mean square of all.
     #[must_use]
-    pub fn scales(&self, attempt: &Attempt) -> Vec<f64> {
+    pub fn residual_scales(&self, attempt: &OptimizationResult) -> Vec<f64> {
         let of = |e: &Vec<f64>| match robust_deviation(e) {
             0.0 => root_mean_square(e),
             deviation => deviation,
         };
-        self.pooled(attempt).iter().map(of).collect()
+        self.residuals_by_output(attempt).iter().map(of).collect()
     }
 }

@@ -1,54 +1,52 @@
-//! Everything that is free in a structure, with bounds and coordinates.
+//! Parameter set of a joint fit: free parameters with bounds, coordinates and time scaling.
 //!
-//! Numbers of a fit in a unit of time of the runs' own, so that nothing hangs on the unit in which time is told.
-//!
-//! A coefficient before D^ν y beside D^α y is a time to the power of −(α − ν), which free orders change.
+//! A coefficient of D^ν y in an equation for D^α y has the unit time^−(α − ν), which changes with the free orders.
 
 use std::collections::BTreeMap;
 
-use super::problem::{Place, Problem};
+use super::problem::{Iterate, Problem};
 use super::structure::{unique, Coefficient, Equation, Input, Law, Structure};
 use crate::equation::Initial;
 use crate::error::Result;
-use crate::estimation::output_error::parameterization::Clock as Unit;
+use crate::estimation::output_error::parameterization::TimeUnit as Unit;
 use crate::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial};
 use crate::fractional::kernels::MAX_ORDER;
-use crate::friction::FreeLaw;
+use crate::friction::FreeFrictionLaw;
 use crate::signal::statistics::median;
 
-/// Highest order that a fit tries of itself, where the structure holds none above it.
+/// Default upper bound of free orders, unless the structure contains a higher order.
 pub const SEARCHED_ORDER: f64 = 3.0;
-/// Own bounds of highest orders where the structure gives none.
+/// Default bounds of the highest orders.
 pub const ALPHA_BOUNDS: (f64, f64) = (0.05, SEARCHED_ORDER);
-/// The same beside friction.
+/// Default bounds of the highest orders of equations with friction.
 const FRICTION_BOUNDS: (f64, f64) = (1.001, 2.0);
-/// Least distance of a ratio from what it exceeds, and its largest value, where equations tell it; and where none does.
-const LEAST_RATIO: f64 = 0.05;
-const LARGEST_RATIO: f64 = 20.0;
-const USUAL_RATIO: f64 = 0.5;
+/// Ratios estimated from the equations lie at least this far above their lower bound, and below [`MAX_RATIO`].
+/// [`DEFAULT_RATIO_EXCESS`] above the lower bound is the initial guess if no equation determines the ratio.
+const MIN_RATIO_EXCESS: f64 = 0.05;
+const MAX_RATIO: f64 = 20.0;
+const DEFAULT_RATIO_EXCESS: f64 = 0.5;
 
-/// A structure, its initial terms decided, and what is free in it: orders are affine in free ones, coefficients products of
-/// free ones.
+/// Set of free parameters of a structure: orders are affine in the free orders, coefficients are products of free ones.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Free {
+pub struct ParameterSet {
     /// The structure.
     pub structure: Structure,
     /// Names of the free orders.
     pub orders: Vec<String>,
-    /// Names of the free coefficients, those of a law among them.
+    /// Names of the free coefficients, including the factors of laws.
     pub coefficients: Vec<String>,
-    /// Coefficients that a law gives.
+    /// Coefficients determined by a law.
     pub products: Vec<Law>,
-    /// As descents take it.
+    /// The optimization problem.
     pub problem: Problem,
 }
 
-impl Free {
-    /// What is free in a structure.
+impl ParameterSet {
+    /// Parameter set of a structure.
     ///
     /// # Errors
-    /// Those of [`Structure::check`] and of [`Problem::new`].
-    pub fn of(structure: Structure) -> Result<Self> {
+    /// As [`Structure::check`] and [`Problem::new`].
+    pub fn from_structure(structure: Structure) -> Result<Self> {
         structure.check()?;
         let named = structure.coefficient_names();
         let law = |name: &String| structure.laws.iter().rev().find(|law| law.name == *name).cloned();
@@ -86,8 +84,8 @@ impl Free {
                 .collect(),
         };
         let frictions = structure.equations.iter().enumerate().filter_map(|(place, e)| {
-            let [coulomb, stribeck, speed] = e.friction.as_ref()?.numbers().map(|(factor, c)| monomial(c, *factor));
-            Some((place, FreeLaw { coulomb, stribeck, speed }))
+            let [coulomb, stribeck, speed] = e.friction.as_ref()?.parameters().map(|(factor, c)| monomial(c, *factor));
+            Some((place, FreeFrictionLaw { coulomb, stribeck, speed }))
         });
         let model = FreeModel {
             equations: structure.equations.iter().map(equation).collect(),
@@ -102,35 +100,37 @@ impl Free {
         Ok(Self { orders, coefficients, products, problem, structure })
     }
 
-    /// Least and largest value of each free order.
+    /// Lower and upper bound of each free order.
     #[must_use]
     pub fn bounds(&self) -> &[(f64, f64)] {
         &self.problem.model.order_bounds
     }
 
-    /// Whether signals are compared or followed through friction.
+    /// True if an equation has friction.
     #[must_use]
     pub fn has_friction(&self) -> bool {
         !self.problem.frictions.is_empty()
     }
 
-    /// Everything that is free: orders, coefficients, then numbers of inputs.
+    /// Names of all free parameters: orders, coefficients, then input parameters.
     pub fn names(&self) -> impl Iterator<Item = &String> {
         let inputs = self.structure.inputs.iter().map(|Input { name, .. }| name);
         self.orders.iter().chain(&self.coefficients).chain(inputs)
     }
 
-    /// The problem from a start, coefficients in logarithms where it allows them unless they are to be plain, and some
-    /// numbers, by their places, held where they are.
+    /// Problem with coordinates for an optimization from `start`.
+    ///
+    /// Nonzero coefficients use logarithms unless `plain`. The parameters with the indices `held` are fixed at their
+    /// values.
     #[must_use]
-    pub fn turned(&self, start: &Place, plain: bool, held: &[usize]) -> Problem {
+    pub fn problem_at(&self, start: &Iterate, plain: bool, held: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
         let named = self.structure.coefficient_names();
         for (j, (name, &value)) in self.coefficients.iter().zip(&start.point.coefficients).enumerate() {
             let is_speed = problem.frictions.iter().any(|(_, law)| law.speed.powers.iter().any(|&(i, _)| i == j));
-            let ratio = !named.contains(name) && self.exceeds(name) == 1.0;
+            let ratio = !named.contains(name) && self.ratio_lower_bound(name) == 1.0;
             problem.model.coordinates[j] = match () {
-                // A speed is positive, wherever it goes.
+                // The Stribeck velocity is always positive.
                 () if (plain || value == 0.0) && !is_speed => Coordinate::Plain,
                 () if ratio && value > 1.0 => Coordinate::ExcessLogarithm,
                 () => Coordinate::Logarithm,
@@ -140,7 +140,7 @@ impl Free {
         for &number in held {
             match number.checked_sub(orders) {
                 None => problem.model.order_bounds[number] = (start.point.orders[number], start.point.orders[number]),
-                Some(j) if j < coefficients => problem.model.coordinates[j] = Coordinate::Held,
+                Some(j) if j < coefficients => problem.model.coordinates[j] = Coordinate::Fixed,
                 Some(j) => {
                     let value = start.point.inputs[j - coefficients];
                     problem.model.inputs[j - coefficients].bounds = (value, value);
@@ -150,9 +150,9 @@ impl Free {
         problem
     }
 
-    /// Every coefficient of the structure, by name, from the free ones.
+    /// All coefficients of the structure, by name, from the values of the free coefficients.
     #[must_use]
-    pub fn named(&self, values: &[f64]) -> BTreeMap<String, f64> {
+    pub fn coefficients_by_name(&self, values: &[f64]) -> BTreeMap<String, f64> {
         let free: BTreeMap<&String, f64> = self.coefficients.iter().zip(values.iter().copied()).collect();
         let at = |name: &String| free.get(name).copied().unwrap_or(f64::NAN);
         let of = |name: String| {
@@ -163,23 +163,23 @@ impl Free {
         self.structure.coefficient_names().into_iter().map(of).collect()
     }
 
-    /// Free coefficients from freely estimated ones; ratios as the median of what the equations can say.
+    /// Free coefficients from unconstrained estimates. Ratios are medians over the equations that determine them.
     #[must_use]
     pub fn free_from(&self, estimated: &BTreeMap<String, f64>) -> Vec<f64> {
         let of = |name: &String| {
             if let Some(&value) = estimated.get(name) {
                 return value;
             }
-            let least = self.exceeds(name);
+            let least = self.ratio_lower_bound(name);
             let said = self.products.iter().filter(|law| law.factors.contains(name)).filter_map(|law| {
                 let others = law.factors.iter().filter(|factor| *factor != name);
                 let product: f64 = others.filter_map(|factor| estimated.get(factor)).product();
                 (product != 0.0).then(|| law.sign * estimated.get(&law.name).copied().unwrap_or(f64::NAN) / product)
             });
             let usable: Vec<f64> =
-                said.filter(|v| v.is_finite() && *v > least + LEAST_RATIO && *v < LARGEST_RATIO).collect();
+                said.filter(|v| v.is_finite() && *v > least + MIN_RATIO_EXCESS && *v < MAX_RATIO).collect();
             if usable.is_empty() {
-                least + USUAL_RATIO
+                least + DEFAULT_RATIO_EXCESS
             } else {
                 median(usable)
             }
@@ -187,37 +187,37 @@ impl Free {
         self.coefficients.iter().map(of).collect()
     }
 
-    /// Second order with one derivative of the output, everything else as it is, as far as the bounds allow.
+    /// Integer orders within the bounds: second order with first and zeroth derivatives.
     #[must_use]
-    pub fn whole_orders(&self) -> Vec<f64> {
+    pub fn integer_orders(&self) -> Vec<f64> {
         let mut usual: BTreeMap<&String, f64> = BTreeMap::new();
         for equation in &self.structure.equations {
             usual.extend(equation.order.names().map(|name| (name, 2.0)));
-            let own = equation.own().flat_map(|term| term.order.names()).enumerate();
+            let own = equation.autoregressive_terms().flat_map(|term| term.order.names()).enumerate();
             let value = |i| if i == 0 { 1.0 } else { 0.0 };
             let own: Vec<_> = own.map(|(i, name)| (name, usual.get(name).copied().unwrap_or(value(i)))).collect();
             usual.extend(own);
         }
         let pairs = self.orders.iter().zip(self.bounds());
-        // Bounds that meet the wrong way round are refused before.
+        // `clamp` would panic on crossed bounds, which are rejected elsewhere.
         pairs.map(|(name, (low, high))| usual.get(name).copied().unwrap_or(0.0).max(*low).min(*high)).collect()
     }
 
-    /// The same equations with other initial terms, what else a run starts with as it is.
+    /// Parameter set with other initial terms.
     ///
     /// # Errors
-    /// Those of [`Free::of`].
-    pub fn starting(&self, initial: Initial, history: bool) -> Result<Self> {
-        Self::of(Structure { initial, history, ..self.structure.clone() })
+    /// As [`ParameterSet::from_structure`].
+    pub fn with_initial_terms(&self, initial: Initial, history: bool) -> Result<Self> {
+        Self::from_structure(Structure { initial, history, ..self.structure.clone() })
     }
 
-    /// What a ratio of the coefficient law exceeds.
-    fn exceeds(&self, ratio: &String) -> f64 {
-        self.structure.hints.exceeds.get(ratio).copied().unwrap_or(1.0)
+    /// Lower bound of a ratio of the coefficient law.
+    fn ratio_lower_bound(&self, ratio: &String) -> f64 {
+        self.structure.hints.ratio_lower_bounds.get(ratio).copied().unwrap_or(1.0)
     }
 }
 
-/// Bounds of free orders: those that were given, else as wide as a fit looks by itself.
+/// Bounds of the free orders: given ones, else defaults.
 fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
     let highest: Vec<&String> =
         structure.equations.iter().filter(|e| e.order.is_single()).flat_map(|e| e.order.names()).collect();
@@ -229,10 +229,10 @@ fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
         .collect();
     let of = |name: &String| {
         let above = highest.contains(&name);
-        let own = || (if above { ALPHA_BOUNDS.0 } else { 0.0 }, reach(structure, name, above));
+        let own = || (if above { ALPHA_BOUNDS.0 } else { 0.0 }, upper_order_bound(structure, name, above));
         let (low, high) = structure.bounds.get(name).copied().unwrap_or_else(own);
         if inertia.contains(&name) {
-            // A velocity needs inertia, and friction of it an order of 2 at most.
+            // Friction needs a velocity state, and is defined for orders up to 2.
             return (low.max(FRICTION_BOUNDS.0), high.min(FRICTION_BOUNDS.1));
         }
         (low, high)
@@ -240,30 +240,31 @@ fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
     orders.iter().map(of).collect()
 }
 
-/// How high a free order is sought: 3, or past the highest number in its equations where that is more.
-fn reach(structure: &Structure, name: &String, above: bool) -> f64 {
+/// Default upper bound of a free order: 3, or one above the highest fixed order of its equations if that is larger.
+fn upper_order_bound(structure: &Structure, name: &String, above: bool) -> f64 {
     let beside = structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
     let numbers = beside.flat_map(Equation::orders).filter(|order| !order.is_free()).map(|order| order.constant);
     numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
 }
 
-/// The unit of time of some runs, and which numbers of a problem are powers of it.
+/// Time scaling of a problem: the unit of time of its runs, and the power of it in each parameter.
 #[derive(Debug, Clone)]
-pub struct Clock {
+pub struct TimeScaling {
     unit: Unit,
     orders: usize,
     coefficients: usize,
     size: usize,
 }
 
-impl Clock {
-    /// The unit is that of a frequency half way, in logarithms, between that of the runs and Nyquist's; each run is told
-    /// by its sample interval and its duration.
+impl TimeScaling {
+    /// Time scaling for runs of the given (sampling interval, duration).
+    ///
+    /// The unit belongs to the geometric mean of the lowest frequency of the runs and the Nyquist frequency.
     #[must_use]
-    pub fn of(problem: &Problem, spans: &[(f64, f64)]) -> Self {
+    pub fn from_runs(problem: &Problem, spans: &[(f64, f64)]) -> Self {
         let spans: Vec<f64> = spans.iter().map(|(step, duration)| libm::log(*step) + libm::log(*duration)).collect();
         Self {
-            unit: Unit::of_spans(&problem.model, &spans),
+            unit: Unit::from_log_spans(&problem.model, &spans),
             orders: problem.model.order_bounds.len(),
             coefficients: problem.model.coordinates.len(),
             size: problem.size(),
@@ -273,11 +274,10 @@ impl Clock {
     /// ln of the unit of time.
     #[must_use]
     pub fn unit(&self) -> f64 {
-        self.unit.unit()
+        self.unit.log_unit()
     }
 
-    /// By what each number is to be multiplied for its value in the unit; only orders change that, and they are the same
-    /// in any unit.
+    /// Factor of each parameter for its value in the unit. It depends on the orders only, which have no unit.
     fn factors(&self, values: &[f64]) -> Vec<f64> {
         let of = |i: usize| match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => self.unit.factor(j, &values[..self.orders]),
@@ -286,39 +286,39 @@ impl Clock {
         (0..self.size).map(of).collect()
     }
 
-    /// Share of itself by which each number falls with a step of the orders, its value in the unit kept.
-    fn fall(&self, i: usize, moved: &[f64]) -> f64 {
+    /// Relative decrease of parameter i with a step of the orders, at a constant value in the unit.
+    fn relative_decrease(&self, i: usize, moved: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => {
-                moved[..self.orders].iter().enumerate().map(|(k, by)| self.unit.fall(j, k) * by).sum()
+                moved[..self.orders].iter().enumerate().map(|(k, by)| self.unit.relative_decrease(j, k) * by).sum()
             }
             _ => 0.0,
         }
     }
 
-    /// Parameters in the unit.
+    /// Convert parameters to the unit.
     #[must_use]
-    pub fn told(&self, values: &[f64]) -> Vec<f64> {
+    pub fn to_scaled(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v * f).collect()
     }
 
-    /// Parameters from those in the unit.
+    /// Convert parameters back from the unit.
     #[must_use]
-    pub fn untold(&self, values: &[f64]) -> Vec<f64> {
+    pub fn from_scaled(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v / f).collect()
     }
 
-    /// A small step of the parameters at some values, from the one in the unit.
+    /// Convert a small step in the unit to a step of the parameters at the given values.
     #[must_use]
     pub fn step(&self, values: &[f64], moved: &[f64]) -> Vec<f64> {
         let factors = self.factors(values);
-        let of = |(i, value): (usize, &f64)| moved[i] / factors[i] - value * self.fall(i, moved);
+        let of = |(i, value): (usize, &f64)| moved[i] / factors[i] - value * self.relative_decrease(i, moved);
         values.iter().enumerate().map(of).collect()
     }
 
-    /// Standard errors in the unit, from a covariance by rows; infinite where the runs do not see all that takes part.
+    /// Standard errors in the unit, from a row-major covariance; infinite for a parameter that is not identifiable.
     #[must_use]
-    pub fn errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
+    pub fn standard_errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
         let (n, factors) = (values.len(), self.factors(values));
         let seen: Vec<bool> = (0..n).map(|i| covariance[i * n + i].is_finite()).collect();
         let of = |i: usize| {
@@ -327,7 +327,7 @@ impl Clock {
             for (k, by) in row.iter_mut().enumerate().take(self.orders) {
                 let mut one = vec![0.0; self.orders];
                 one[k] = 1.0;
-                *by += factors[i] * values[i] * self.fall(i, &one);
+                *by += factors[i] * values[i] * self.relative_decrease(i, &one);
             }
             if row.iter().zip(&seen).any(|(by, seen)| !seen && *by != 0.0) {
                 return f64::INFINITY;

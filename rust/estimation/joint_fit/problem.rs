@@ -1,38 +1,32 @@
-//! What is free in a joint fit, with friction and without.
-//!
-//! A point in the space of parameters, and what a descent said about it.
-//!
-//! How far an extrapolated estimate may go: bounds, and orders that stay below the highest of their equation.
-//!
-//! An attempt in a race: where it is, and where it came from.
+//! Problem of a joint fit with and without friction: iterates, optimization, candidates and feasible steps.
 
 use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{
     fit_until, Coordinate, Experiment, FreeModel, Monomial, Point, Settings, Status,
 };
-use crate::friction::{self, FreeLaw, FrictionModel, Start};
+use crate::friction::{self, FreeFrictionLaw, FrictionModel, Start};
 use crate::linalg::dense;
 use crate::parallel::Stop;
 use crate::signal::statistics::inner;
 
-/// Equations on their runs, and the friction of their bodies.
+/// Optimization problem: parameterized equations and their friction laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
-    /// Names of the outputs, an equation each, for words about them.
+    /// Names of the outputs, one per equation, for messages.
     pub outputs: Vec<String>,
-    /// The equations; an optimum is followed in its coordinates.
+    /// The equations and the coordinates of the optimization.
     pub model: FreeModel,
-    /// Which equations have friction, and how much.
-    pub frictions: Vec<(usize, FreeLaw)>,
+    /// Friction laws by index of their equation.
+    pub frictions: Vec<(usize, FreeFrictionLaw)>,
 }
 
 impl Problem {
-    /// Equations whose coefficients have coordinates of their own, but for speeds, which are positive wherever they go.
+    /// Problem in the coordinates of the model; Stribeck velocities are positive and use logarithms.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::Structure`] where something is named that is not there, or bounds do not rise.
-    pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeLaw)>) -> Result<Self> {
+    /// [`Error::Length`], [`Error::Structure`] for an unknown coefficient or equation, or crossed bounds.
+    pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeFrictionLaw)>) -> Result<Self> {
         check_length("outputs", model.equations.len(), outputs.len())?;
         let (orders, coefficients) = (model.order_bounds.len(), model.coordinates.len());
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
@@ -63,13 +57,13 @@ impl Problem {
         Ok(Self { outputs, model, frictions })
     }
 
-    /// How many orders, coefficients and numbers of inputs are free.
+    /// Number of free orders, coefficients and input parameters.
     #[must_use]
     pub fn size(&self) -> usize {
         self.model.order_bounds.len() + self.model.coordinates.len() + self.model.inputs.len()
     }
 
-    /// Values of everything free as a point.
+    /// Convert the values of all free parameters to a point.
     ///
     /// # Errors
     /// [`Error::Length`].
@@ -80,7 +74,7 @@ impl Problem {
         Ok(Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() })
     }
 
-    /// Bounds of everything that is free; those of coefficients are infinite, but friction takes energy.
+    /// Bounds of all free parameters. Coefficients are unbounded, except that friction must dissipate energy.
     #[must_use]
     pub fn bounds(&self) -> Vec<(f64, f64)> {
         let mut coefficients = vec![(f64::NEG_INFINITY, f64::INFINITY); self.model.coordinates.len()];
@@ -96,28 +90,28 @@ impl Problem {
         self.model.order_bounds.iter().copied().chain(coefficients).chain(ends).collect()
     }
 
-    /// Whether the free run of an equation grows at a point, and initial terms may take away what it becomes.
+    /// True if an equation is unstable at a point and free initial terms may compensate the growth.
     #[must_use]
-    pub fn grows(&self, point: &Point) -> bool {
-        self.frictions.is_empty() && !self.model.initial.at_rest() && self.model.grows(point)
+    pub fn is_unstable(&self, point: &Point) -> bool {
+        self.frictions.is_empty() && !self.model.initial.is_at_rest() && self.model.is_unstable(point)
     }
 
-    /// Levenberg–Marquardt from a place; a steady one goes from a free run that dies away to none that grows.
+    /// Minimize the cost by Levenberg–Marquardt; if `steady`, a stable iterate does not become unstable.
     ///
     /// # Errors
-    /// Those of [`fit_until`] and, with friction, of [`crate::friction::fit_until`].
-    pub fn descend(
+    /// As [`fit_until`] and, with friction, [`friction::fit_until`].
+    pub fn minimize(
         &self,
         experiments: &[Experiment],
-        start: &Place,
+        start: &Iterate,
         settings: Settings,
         steady: bool,
         stop: &Stop,
-    ) -> Result<Attempt> {
+    ) -> Result<OptimizationResult> {
         if self.frictions.is_empty() {
             let found = fit_until(&self.model, experiments, &start.point, settings, steady, stop)?;
-            return Ok(Attempt {
-                place: Place { point: found.point, states: Vec::new() },
+            return Ok(OptimizationResult {
+                iterate: Iterate { point: found.point, states: Vec::new() },
                 cost: found.cost,
                 residuals: found.residuals,
                 jacobian: found.jacobian,
@@ -133,15 +127,15 @@ impl Problem {
             order_bounds: self.model.order_bounds.clone(),
             coordinates: self.model.coordinates.clone(),
             initial: self.model.initial.clone(),
-            filtered: friction::passing(experiments),
+            filtered: friction::filtered_outputs(experiments),
         };
-        let Place { point: Point { orders, coefficients, inputs }, states } = start.clone();
+        let Iterate { point: Point { orders, coefficients, inputs }, states } = start.clone();
         let start = Start { orders, coefficients, inputs, states };
         let found = friction::fit_until(&model, experiments, &start, settings, stop)?;
         let point = Point { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };
-        Ok(Attempt {
+        Ok(OptimizationResult {
             initial: found.states.iter().map(|states| vec![states.clone()]).collect(),
-            place: Place { point, states: found.states },
+            iterate: Iterate { point, states: found.states },
             cost: found.cost,
             residuals: found.residuals,
             jacobian: found.jacobian,
@@ -151,82 +145,84 @@ impl Problem {
     }
 }
 
-/// Where a descent starts.
+/// Iterate of an optimization: parameters and initial states.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Place {
-    /// Free orders, coefficients and numbers of inputs.
+pub struct Iterate {
+    /// Free orders, coefficients and input parameters.
     pub point: Point,
-    /// States of each run with friction, where they are known.
+    /// Initial states of each run with friction; empty if unknown.
     pub states: Vec<Vec<f64>>,
 }
 
-/// Where it ended.
+/// Result of an optimization.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Attempt {
-    /// The point.
-    pub place: Place,
+pub struct OptimizationResult {
+    /// The final iterate.
+    pub iterate: Iterate,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Weighted residuals, runs one after the other, outputs within.
+    /// Vector of weighted residuals, ordered by run, then by output.
     pub residuals: Vec<f64>,
-    /// Their derivatives, a row a parameter; none where only residuals were asked for.
+    /// Derivatives of the residuals, one row per parameter; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
-    /// Coefficients of the initial terms by run and equation; of bodies with friction their states.
+    /// Coefficients of the initial terms by run and equation; initial states if there is friction.
     pub initial: Vec<Vec<Vec<f64>>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Reason of termination.
     pub status: Status,
 }
 
-impl Attempt {
-    /// A place before any descent: none costs more.
+impl OptimizationResult {
+    /// Result before any optimization, with infinite cost.
     #[must_use]
-    pub fn unrun(place: Place) -> Self {
+    pub fn initial_result(iterate: Iterate) -> Self {
         let (cost, evaluations, status) = (f64::INFINITY, 0, Status::Exhausted);
         let (residuals, jacobian, initial) = (Vec::new(), Vec::new(), Vec::new());
-        Self { place, cost, residuals, jacobian, initial, evaluations, status }
+        Self { iterate, cost, residuals, jacobian, initial, evaluations, status }
     }
 
     /// Cost per residual: 1 at the noise floor if the weights are right.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
-    pub fn level(&self) -> f64 {
+    pub fn cost_per_residual(&self) -> f64 {
         2.0 * self.cost / self.residuals.len() as f64
     }
 
-    /// Whether the gradient vanished, but for what pushes out of a bound; a fit stopped at a wall has not.
+    /// True if the gradient vanished, except for components that point out of an active bound.
+    ///
+    /// An optimization that stopped at the limit of its domain has not converged.
     #[must_use]
-    pub fn converged(&self) -> bool {
+    pub fn has_converged(&self) -> bool {
         self.status == Status::Converged
     }
 
-    /// Orders, coefficients, numbers of inputs.
+    /// All parameters: orders, coefficients, input parameters.
     #[must_use]
     pub fn values(&self) -> Vec<f64> {
-        let Point { orders, coefficients, inputs } = &self.place.point;
+        let Point { orders, coefficients, inputs } = &self.iterate.point;
         [orders.as_slice(), coefficients, inputs].concat()
     }
 
-    /// The same place at other values.
+    /// Iterate with other parameter values and the same states.
     #[must_use]
-    pub fn at(&self, values: &[f64]) -> Place {
-        let point = &self.place.point;
+    pub fn iterate_at(&self, values: &[f64]) -> Iterate {
+        let point = &self.iterate.point;
         let (orders, rest) = values.split_at(point.orders.len());
         let (coefficients, inputs) = rest.split_at(point.coefficients.len());
         let point = Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
-        Place { point, states: self.place.states.clone() }
+        Iterate { point, states: self.iterate.states.clone() }
     }
 }
 
-/// What the core keeps between the highest order of an equation and those of its own terms.
-const LEAST_INTEGRATION: f64 = 1e-3;
-/// Orders of a model are rounded to 1e-9, two of them apart; another signal's may reach the highest but not pass it.
-const ROUNDED: f64 = 2e-9;
-/// A direction shorter than this share of the longest is none.
-const ALONG: f64 = 1e-9;
+/// Smallest difference between the highest order of an equation and the orders of its autoregressive terms.
+const MIN_INTEGRATION_ORDER: f64 = 1e-3;
+/// Rounding error of the difference of two orders, each rounded to 1e-9. Orders of other signals may equal the highest.
+const ORDER_ROUNDING_TOLERANCE: f64 = 2e-9;
+/// Relative singular value below which a constraint normal is linearly dependent.
+const DIRECTION_RANK_TOLERANCE: f64 = 1e-9;
 
-/// a·x + b ≥ m.
+/// Affine constraint a·x + b ≥ m.
 struct Constraint {
     normal: Vec<f64>,
     offset: f64,
@@ -234,28 +230,29 @@ struct Constraint {
 }
 
 impl Problem {
-    /// The last point on the way from a feasible one to another that keeps the bounds and the constraints of orders.
+    /// Last point between a feasible point and another that satisfies the bounds and the constraints of the orders.
     ///
-    /// A constraint that already holds with equality is kept by going along it. Every constraint is affine, so the last
-    /// point is exact.
+    /// The step is projected on the active constraints. All constraints are affine, so the result is exact.
     ///
     /// # Errors
     /// [`Error::Length`].
-    pub fn feasible(&self, at: &[f64], towards: &[f64]) -> Result<Vec<f64>> {
+    pub fn last_feasible_point(&self, at: &[f64], towards: &[f64]) -> Result<Vec<f64>> {
         check_length("values to go from", self.size(), at.len())?;
         check_length("values to go to", self.size(), towards.len())?;
         let constraints = self.constraints();
         let room: Vec<f64> = (constraints.iter())
             .map(|c| {
                 let room = inner(&c.normal, at) + c.offset;
-                // A point that the core let pass closer than a margin keeps what it has.
+                // A point accepted within the margin keeps its distance.
                 (room - c.margin.min(room)).max(0.0)
             })
             .collect();
         let mut step: Vec<f64> = towards.iter().zip(at).map(|(b, a)| b - a).collect();
         let mut active = vec![false; constraints.len()];
         loop {
-            let blocked = |i: usize| room[i] <= ROUNDED && inner(&constraints[i].normal, &step) < -1e-15 && !active[i];
+            let blocked = |i: usize| {
+                room[i] <= ORDER_ROUNDING_TOLERANCE && inner(&constraints[i].normal, &step) < -1e-15 && !active[i]
+            };
             let more: Vec<usize> = (0..constraints.len()).filter(|&i| blocked(i)).collect();
             if more.is_empty() {
                 break;
@@ -263,10 +260,12 @@ impl Problem {
             more.iter().for_each(|&i| active[i] = true);
             let kept = constraints.iter().zip(&active).filter(|(_, active)| **active);
             let normals: Vec<Vec<f64>> = kept.map(|(c, _)| c.normal.clone()).collect();
-            let dense::Singular { left: basis, sizes, .. } = dense::singular(&normals)
+            let dense::SingularValues { left: basis, values: sizes, .. } = dense::singular_values(&normals)
                 .ok_or_else(|| Error::Internal { what: "constraints of orders without a basis".into() })?;
             let whole = step.clone();
-            for (direction, _) in basis.iter().zip(&sizes).filter(|(_, size)| **size > ALONG * sizes[0]) {
+            for (direction, _) in
+                basis.iter().zip(&sizes).filter(|(_, size)| **size > DIRECTION_RANK_TOLERANCE * sizes[0])
+            {
                 let along = inner(direction, &whole);
                 step.iter_mut().zip(direction).for_each(|(s, d)| *s -= along * d);
             }
@@ -301,7 +300,7 @@ impl Problem {
                 found.push(Constraint {
                     normal: wide(&|k| of(&equation.order, k) - of(order, k)),
                     offset: equation.order.constant - order.constant,
-                    margin: if own { LEAST_INTEGRATION } else { ROUNDED },
+                    margin: if own { MIN_INTEGRATION_ORDER } else { ORDER_ROUNDING_TOLERANCE },
                 });
                 if own {
                     found.push(Constraint { normal: wide(&|k| of(order, k)), offset: order.constant, margin: 0.0 });
@@ -313,33 +312,33 @@ impl Problem {
     }
 }
 
-/// An attempt with the start that led to it, and those of others that came to the same place.
+/// Candidate of the multistart: optimization result, origin, and origins of merged duplicates.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Runner {
-    /// Where it is.
-    pub attempt: Attempt,
-    /// Its start, in words.
+pub struct Candidate {
+    /// Current optimization result.
+    pub result: OptimizationResult,
+    /// Description of its initial guess.
     pub origin: String,
-    /// Those of the others.
-    pub alike: Vec<String>,
+    /// Origins of merged duplicates.
+    pub duplicates: Vec<String>,
 }
 
-impl Runner {
-    /// Before its first descent.
+impl Candidate {
+    /// Candidate before its first optimization.
     #[must_use]
-    pub fn at(place: Place, origin: impl Into<String>) -> Self {
-        Self { attempt: Attempt::unrun(place), origin: origin.into(), alike: Vec::new() }
+    pub fn at(place: Iterate, origin: impl Into<String>) -> Self {
+        Self { result: OptimizationResult::initial_result(place), origin: origin.into(), duplicates: Vec::new() }
     }
 
-    /// The same where a descent led it.
+    /// Candidate with a new optimization result.
     #[must_use]
-    pub fn moved(&self, attempt: Attempt) -> Self {
-        Self { attempt, ..self.clone() }
+    pub fn with_result(&self, attempt: OptimizationResult) -> Self {
+        Self { result: attempt, ..self.clone() }
     }
 
     /// Cost per residual.
     #[must_use]
-    pub fn level(&self) -> f64 {
-        self.attempt.level()
+    pub fn cost_per_residual(&self) -> f64 {
+        self.result.cost_per_residual()
     }
 }

@@ -1,57 +1,57 @@
-//! How much of a fit is done, told as it goes; it never goes back.
+//! Progress of a fit, which never decreases.
 
 use crate::error::Result;
 
-/// Parts of a whole that has no count of its own.
-pub const PARTS: usize = 1000;
+/// Number of parts into which the progress of a fit is divided.
+pub const PROGRESS_PARTS: usize = 1000;
 
-/// Who is told (parts done, [`PARTS`]); an error ends the fit.
-pub type Listener<'a> = dyn Fn(usize, usize) -> Result<()> + 'a;
+/// Progress callback of (parts done, [`PROGRESS_PARTS`]); an error ends the fit.
+pub type ProgressListener<'a> = dyn Fn(usize, usize) -> Result<()> + 'a;
 
-/// The share of a whole that is done, of work whose parts do not know each other.
-pub struct Pace<'a> {
-    told: &'a Listener<'a>,
+/// Progress of a fit as a share of 1, over phases of unknown length.
+pub struct FitProgress<'a> {
+    told: &'a ProgressListener<'a>,
     reached: f64,
     said: Option<usize>,
     begun: f64,
     last: f64,
 }
 
-impl<'a> Pace<'a> {
-    /// Nothing is done yet.
+impl<'a> FitProgress<'a> {
+    /// Progress 0, with a callback.
     #[must_use]
-    pub fn new(told: &'a Listener<'a>) -> Self {
+    pub fn new(told: &'a ProgressListener<'a>) -> Self {
         Self { told, reached: 0.0, said: None, begun: 0.0, last: 0.0 }
     }
 
-    /// So much of the whole is done.
+    /// Advance to a share of the whole.
     ///
     /// # Errors
-    /// What whoever is told ends with.
+    /// The error of the callback.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    pub fn at(&mut self, share: f64) -> Result<()> {
+    pub fn advance_to(&mut self, share: f64) -> Result<()> {
         self.reached = self.reached.max(share.min(1.0));
-        let parts = (PARTS as f64 * self.reached).round_ties_even() as usize;
+        let parts = (PROGRESS_PARTS as f64 * self.reached).round_ties_even() as usize;
         if self.said.is_some_and(|said| parts <= said) {
             return Ok(());
         }
         self.said = Some(parts);
-        (self.told)(parts, PARTS)
+        (self.told)(parts, PROGRESS_PARTS)
     }
 
-    /// So much of a part that ends at a share of the whole is done. Where it begins to count anew, each sweep takes the same
-    /// share of what is left.
+    /// Advance within a phase that ends at a share of the whole. A phase can count from zero repeatedly; each sweep
+    /// takes the share `sweep` of the rest.
     ///
     /// # Errors
-    /// See [`Pace::at`].
+    /// As [`FitProgress::advance_to`].
     #[allow(clippy::cast_precision_loss)]
-    pub fn until(&mut self, share: f64, sweep: f64, done: usize, of: usize) -> Result<()> {
+    pub fn advance_within(&mut self, share: f64, sweep: f64, done: usize, of: usize) -> Result<()> {
         let fraction = done as f64 / of.max(1) as f64;
         if fraction < self.last {
             self.begun = self.reached;
         }
         self.last = fraction;
-        self.at(self.begun + sweep * (share - self.begun) * fraction)
+        self.advance_to(self.begun + sweep * (share - self.begun) * fraction)
     }
 }
 
@@ -61,17 +61,17 @@ mod tests {
     use std::cell::RefCell;
 
     #[test]
-    fn it_only_goes_on_and_sweeps_share_what_is_left() {
+    fn progress_is_monotone_and_sweeps_share_the_rest() {
         let heard = RefCell::new(Vec::new());
         let told = |done: usize, of: usize| {
             heard.borrow_mut().push((done, of));
             Ok(())
         };
-        let mut pace = Pace::new(&told);
+        let mut pace = FitProgress::new(&told);
         for (done, of) in [(0, 4), (2, 4), (4, 4), (0, 2), (1, 2), (1, 2)] {
-            assert_eq!(pace.until(0.5, 0.3, done, of), Ok(()));
+            assert_eq!(pace.advance_within(0.5, 0.3, done, of), Ok(()));
         }
-        assert_eq!((pace.at(0.5), pace.at(0.2)), (Ok(()), Ok(())));
+        assert_eq!((pace.advance_to(0.5), pace.advance_to(0.2)), (Ok(()), Ok(())));
         let parts: Vec<usize> = heard.borrow().iter().map(|(done, _)| *done).collect();
         assert_eq!(parts, [0, 75, 150, 202, 500]);
     }

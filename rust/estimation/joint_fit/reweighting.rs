@@ -1,67 +1,65 @@
-//! Huber's loss: squares for usual residuals, sizes for the others, so that a few that are far off decide nothing.
+//! Iteratively reweighted noise levels and Huber weights.
 //!
-//! The minimum is found by least squares with weights that follow the residuals until they stand still (doi:10.1214/aoms/
-//! 1177703732, doi:10.1080/03610927708827533). The scale is the median of the sizes, which outliers do not move.
-//!
-//! Descents until each output weighs by its own residuals.
+//! The minimum of Huber's loss is found by iteratively reweighted least squares (doi:10.1214/aoms/1177703732,
+//! doi:10.1080/03610927708827533). The scale is the median absolute residual, which is robust to outliers.
 
-use super::objective::{Grid, Weights};
-use super::problem::{Attempt, Place};
+use super::objective::{Objective, Weights};
+use super::problem::{Iterate, OptimizationResult};
 use crate::error::{Error, Result};
-use crate::signal::statistics::BEND;
+use crate::signal::statistics::HUBER_THRESHOLD;
 
-/// Residuals beyond so many deviations are outliers: of normal noise one in two millions is.
-const FAR: f64 = 5.0;
-/// Shares are settled when none moves by more than this.
+/// Standard deviations above which a residual is an outlier: one in two million for normal noise.
+const OUTLIER_DEVIATIONS: f64 = 5.0;
+/// Change of the robust weights below which they have converged.
 const ROBUST_WEIGHT_TOLERANCE: f64 = 2e-3;
-/// Deviations below this are none.
-const TINY: f64 = 1e-300;
+/// Lower limit of a standard deviation in a quotient.
+const MIN_DEVIATION: f64 = 1e-300;
 
-/// What residuals cost.
+/// Loss function of the residuals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Loss {
-    /// Their squares.
+    /// Least squares.
     Squares,
-    /// Squares of usual ones, sizes of the others.
+    /// Huber's loss.
     Huber,
 }
 
-/// What a robust loss did.
+/// Counts of downweighted residuals and outliers of a robust loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Robust {
-    /// Residuals beyond 1.345 deviations, which count less; of normal noise 18 % are.
-    pub lowered: usize,
-    /// Those beyond five.
+pub struct RobustSummary {
+    /// Residuals beyond 1.345 standard deviations, which are downweighted; 18 % of normal noise.
+    pub reduced_weight_count: usize,
+    /// Residuals beyond five standard deviations.
     pub outliers: usize,
-    /// Residuals in all.
+    /// Number of residuals.
     pub samples: usize,
 }
 
-impl Robust {
-    /// Counted at an optimum.
+impl RobustSummary {
+    /// Counts at an optimum.
     #[must_use]
-    pub fn of(grid: &Grid<'_>, attempt: &Attempt) -> Self {
-        let mut counted = Self { lowered: 0, outliers: 0, samples: 0 };
-        for (residuals, level) in grid.pooled(attempt).iter().zip(grid.scales(attempt)) {
-            let beyond = |most: f64| residuals.iter().filter(|e| (*e / level.max(TINY)).abs() > most).count();
-            counted.lowered += beyond(BEND);
-            counted.outliers += beyond(FAR);
+    pub fn from_result(grid: &Objective<'_>, attempt: &OptimizationResult) -> Self {
+        let mut counted = Self { reduced_weight_count: 0, outliers: 0, samples: 0 };
+        for (residuals, level) in grid.residuals_by_output(attempt).iter().zip(grid.residual_scales(attempt)) {
+            let beyond = |most: f64| residuals.iter().filter(|e| (*e / level.max(MIN_DEVIATION)).abs() > most).count();
+            counted.reduced_weight_count += beyond(HUBER_THRESHOLD);
+            counted.outliers += beyond(OUTLIER_DEVIATIONS);
             counted.samples += residuals.len();
         }
         counted
     }
 }
 
-/// Roots of Huber's weights of the compared samples, by run and output; 1 where nothing was read.
-pub(super) fn huber(grid: &Grid<'_>, attempt: &Attempt, levels: &[f64]) -> Vec<Vec<Vec<f64>>> {
-    let root = |size: f64| if size > BEND { (BEND / size).sqrt() } else { 1.0 };
-    let of = |(e, level): (Vec<f64>, &f64)| e.iter().map(|e| root(e.abs() / level.max(TINY))).collect();
+/// Square roots of Huber's weights of the compared samples, by run and output; 1 for missing samples.
+pub(super) fn huber_weights(grid: &Objective<'_>, attempt: &OptimizationResult, levels: &[f64]) -> Vec<Vec<Vec<f64>>> {
+    let root = |size: f64| if size > HUBER_THRESHOLD { (HUBER_THRESHOLD / size).sqrt() } else { 1.0 };
+    let of = |(e, level): (Vec<f64>, &f64)| e.iter().map(|e| root(e.abs() / level.max(MIN_DEVIATION))).collect();
     let parts = grid.residuals(attempt).into_iter();
     parts.map(|part| part.into_iter().zip(levels).map(of).collect()).collect()
 }
 
-/// Whether shares have settled.
-pub(super) fn same(before: Option<&Vec<Vec<Vec<f64>>>>, after: Option<&Vec<Vec<Vec<f64>>>>) -> bool {
+/// True if robust weights have converged.
+pub(super) fn are_weights_equal(before: Option<&Vec<Vec<Vec<f64>>>>, after: Option<&Vec<Vec<Vec<f64>>>>) -> bool {
     let flat = |shares: &Vec<Vec<Vec<f64>>>| shares.iter().flatten().flatten().copied().collect::<Vec<_>>();
     match (before, after) {
         (None, None) => true,
@@ -70,35 +68,43 @@ pub(super) fn same(before: Option<&Vec<Vec<Vec<f64>>>>, after: Option<&Vec<Vec<V
     }
 }
 
-/// Evaluations of each descent.
-pub const LAST_LAP: usize = 120;
-/// Descents to settled weights, and to those of a robust loss, which settle by a factor of some four each.
-const ROUNDS: usize = 4;
-const ROBUST_ROUNDS: usize = 15;
-/// Weights are settled when no output's residuals differ from their weight by more than this share.
+/// Maximum evaluations of each optimization.
+pub const EVALUATIONS_PER_REWEIGHTING: usize = 120;
+/// Maximum number of reweightings. Robust weights converge by a factor of about four each.
+const MAX_REWEIGHTINGS: usize = 4;
+const MAX_ROBUST_REWEIGHTINGS: usize = 15;
+/// Relative difference between noise levels and weights below which the weights have converged.
 const NOISE_LEVEL_TOLERANCE: f64 = 0.01;
 
-/// Descends on a grid until the weights are those of the residuals, pooled over runs, and so are robust shares.
+/// Fit by iteratively reweighted least squares, until weights and robust weights match the residuals over all runs.
 ///
 /// # Errors
-/// Those of [`Grid::descend`]; [`Error::Beyond`] where it ends beyond the range of numbers.
-pub fn settled<'a>(start: &Place, grid: Grid<'a>, loss: Loss) -> Result<(Attempt, Grid<'a>)> {
-    let rounds = if loss == Loss::Huber { ROBUST_ROUNDS } else { ROUNDS };
+/// As [`Objective::minimize`]; [`Error::Beyond`] if the residuals overflow.
+pub fn fit_reweighted<'a>(
+    start: &Iterate,
+    grid: Objective<'a>,
+    loss: Loss,
+) -> Result<(OptimizationResult, Objective<'a>)> {
+    let rounds = if loss == Loss::Huber { MAX_ROBUST_REWEIGHTINGS } else { MAX_REWEIGHTINGS };
     let (mut place, mut grid, mut turn) = (start.clone(), grid, 0);
     loop {
         turn += 1;
-        let attempt = grid.descend(&place, LAST_LAP)?;
-        let levels = if loss == Loss::Huber { grid.scales(&attempt) } else { grid.levels(&attempt) };
+        let attempt = grid.minimize(&place, EVALUATIONS_PER_REWEIGHTING)?;
+        let levels = if loss == Loss::Huber {
+            grid.residual_scales(&attempt)
+        } else {
+            grid.residual_root_mean_squares(&attempt)
+        };
         if let Some(beyond) = levels.iter().position(|level| !level.is_finite()) {
             return Err(Error::Beyond { output: grid.problem.outputs[beyond].clone() });
         }
         let still = levels.iter().all(|level| (level - 1.0).abs() < NOISE_LEVEL_TOLERANCE);
-        let shares = (loss == Loss::Huber).then(|| huber(&grid, &attempt, &levels));
-        if turn == rounds || (still && same(grid.weights.shares.as_ref(), shares.as_ref())) {
+        let shares = (loss == Loss::Huber).then(|| huber_weights(&grid, &attempt, &levels));
+        if turn == rounds || (still && are_weights_equal(grid.weights.robust_weights.as_ref(), shares.as_ref())) {
             return Ok((attempt, grid));
         }
         let outputs = grid.weights.outputs.iter().zip(&levels).map(|(w, level)| w / level.max(1e-300)).collect();
-        grid = grid.reweighed(Weights { outputs, shares })?;
-        place = attempt.place;
+        grid = grid.with_weights(Weights { outputs, robust_weights: shares })?;
+        place = attempt.iterate;
     }
 }

@@ -1,40 +1,44 @@
-//! Where the runs of a joint fit come from: sampled as finely as it is asked.
+//! Source of the runs of a joint fit, sampled on a requested grid.
 
 use crate::error::{check_length, check_points, check_step, Error, Result};
-use crate::estimation::output_error::{Experiment, Instant};
+use crate::estimation::output_error::{Experiment, PointValues};
 use crate::regressors::Record;
 use crate::signal::block_pulse::{pulse_means, Intersample};
 
-/// Runs that can be sampled on any grid. Weights of what it gives are not looked at; shares say what was read.
+/// Source of runs that can be sampled on any grid.
+///
+/// The output weights of its experiments are ignored. Their sample weights mark missing samples.
 pub trait Source {
-    /// Sample interval and duration of each run \[s\].
+    /// Sampling interval and duration of each run \[s\].
     fn spans(&self) -> Vec<(f64, f64)>;
 
-    /// The runs sampled so.
+    /// Sample the runs.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// If the runs cannot be sampled.
     fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>>;
 }
 
-/// How finely runs are sampled.
+/// Sampling of the runs: step, decimation and length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Sampling {
-    /// Pulses a sample interval.
-    pub every: usize,
-    /// Of how many samples one counts.
+    /// Block pulses per sampling interval.
+    pub pulses_per_sample: usize,
+    /// Decimation factor of the samples.
     pub decimation: usize,
-    /// So many sample intervals from the beginning of each run on; none: all.
-    pub first: Option<usize>,
+    /// Number of leading sampling intervals of each run to use; None for all.
+    pub leading_intervals: Option<usize>,
 }
 
 impl Sampling {
-    /// Refuses a sampling of nothing, and one finer than memory.
+    /// Check that pulses and decimation are positive and not excessive.
     ///
     /// # Errors
     /// [`Error::OutOfRange`].
     pub fn check(self) -> Result<()> {
-        for (name, number) in [("pulses a sample interval", self.every), ("samples that become one", self.decimation)] {
+        for (name, number) in
+            [("pulses a sample interval", self.pulses_per_sample), ("samples that become one", self.decimation)]
+        {
             check_points(name, number)?;
             if number == 0 {
                 let (value, range) = (0.0, "[1, ∞)".into());
@@ -47,61 +51,63 @@ impl Sampling {
 
 impl Default for Sampling {
     fn default() -> Self {
-        Self { every: 1, decimation: 1, first: None }
+        Self { pulses_per_sample: 1, decimation: 1, leading_intervals: None }
     }
 }
 
-/// Runs of which starts can be made, too: what was read, and records for estimators on the equation error.
+/// Source of runs that also supplies samples and block-pulse records for initial guesses.
 pub trait Recordings: Source {
-    /// Which signals are inputs of the runs, and which of them hold between samples.
+    /// Intersample behavior of the signals that are inputs; None for other signals.
     fn inputs(&self) -> Vec<Option<Intersample>>;
 
-    /// What was read of a signal by run, at regular times; not a number where nothing was.
+    /// Uniform samples of a signal by run; NaN for missing samples.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// If the samples are not available.
     fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>>;
 
-    /// Each run on so many pulses, every signal behind the sensor filter, equations driven by what was measured, free
-    /// numbers of inputs at these values.
+    /// Record of each run with `m` block pulses.
+    ///
+    /// All signals have passed the sensor filter, the inputs are the measured ones, and `inputs` are the values of the
+    /// free input parameters.
     ///
     /// # Errors
-    /// Whatever keeps it from that.
+    /// If the records are not available.
     fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>>;
 }
 
-/// A signal that was read at regular times.
+/// Uniformly sampled signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signal {
-    /// What was read.
+    /// Sample values.
     pub samples: Vec<f64>,
-    /// What it does in between.
-    pub between: Intersample,
+    /// Behavior between the samples.
+    pub intersample: Intersample,
 }
 
-/// Runs whose signals were all read at the same regular times, throughout, without a filter.
+/// Runs of signals sampled at the same uniform times, without gaps and without a sensor filter.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
-/// use ftlm::estimation::joint_fit::{Sampled, Sampling, Signal, Source};
+/// use ftlm::estimation::joint_fit::{SampledRuns, Sampling, Signal, Source};
 /// use ftlm::signal::block_pulse::Intersample;
-/// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], between: Intersample::Linear };
-/// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], between: Intersample::Hold };
-/// let runs = Sampled::new(0.1, vec![0], vec![vec![y, u]])?;
-/// let fine = runs.experiments(Sampling { every: 2, ..Sampling::default() })?;
+/// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], intersample: Intersample::Linear };
+/// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], intersample: Intersample::Hold };
+/// let runs = SampledRuns::new(0.1, vec![0], vec![vec![y, u]])?;
+/// let fine = runs.experiments(Sampling { pulses_per_sample: 2, ..Sampling::default() })?;
 /// assert_eq!(fine[0].record.signal(1), [1.0, 1.0, 2.0, 2.0, 2.0, 2.0]);
 /// # Ok(())
 /// # }
 /// ```
 #[derive(Debug, Clone, PartialEq)]
-pub struct Sampled {
+pub struct SampledRuns {
     step: f64,
     outputs: Vec<usize>,
     runs: Vec<Vec<Signal>>,
 }
 
-impl Sampled {
-    /// Runs of one sample interval, signals in one order, and which of them are the outputs of the equations.
+impl SampledRuns {
+    /// Runs of one sampling interval, with the signals in the same sequence and the indices of the outputs.
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::OutOfRange`], [`Error::Structure`].
@@ -119,7 +125,7 @@ impl Sampled {
     }
 }
 
-impl Source for Sampled {
+impl Source for SampledRuns {
     #[allow(clippy::cast_precision_loss)]
     fn spans(&self) -> Vec<(f64, f64)> {
         self.runs.iter().map(|run| (self.step, run[0].samples.len() as f64 * self.step)).collect()
@@ -127,29 +133,31 @@ impl Source for Sampled {
 
     #[allow(clippy::cast_precision_loss)]
     fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>> {
-        let Sampling { every, decimation, first } = sampling;
+        let Sampling { pulses_per_sample: every, decimation, leading_intervals: first } = sampling;
         let decimation = decimation.max(1);
         let of = |run: &Vec<Signal>| {
             let all = run[0].samples.len() - 1;
             let intervals = first.map_or(all, |first| first.min(all)) / decimation;
             let rows = intervals * decimation + 1;
-            let means = run.iter().map(|s| pulse_means(&s.samples[..rows], intervals * every, s.between));
+            let means = run.iter().map(|s| pulse_means(&s.samples[..rows], intervals * every, s.intersample));
             let step = self.step * decimation as f64 / every.max(1) as f64;
             let record = Record::new(step, means.collect::<Result<_>>()?, None)?;
             let kept = |s: &Signal| s.samples[..rows].iter().copied().step_by(decimation).collect::<Vec<_>>();
-            let instants = run.iter().map(|s| Instant { values: Some(kept(s)), held: s.between == Intersample::Hold });
+            let instants = run
+                .iter()
+                .map(|s| PointValues { values: Some(kept(s)), is_zero_order_hold: s.intersample == Intersample::Hold });
             let instants = instants.collect();
             let samples = self.outputs.iter().map(|&output| kept(&run[output])).collect();
-            Experiment::new(record, every, samples, vec![1.0; self.outputs.len()])?.with_instants(instants)
+            Experiment::new(record, every, samples, vec![1.0; self.outputs.len()])?.with_point_values(instants)
         };
         self.runs.iter().map(of).collect()
     }
 }
 
-impl Recordings for Sampled {
+impl Recordings for SampledRuns {
     fn inputs(&self) -> Vec<Option<Intersample>> {
         let signals = self.runs.first().into_iter().flatten().enumerate();
-        signals.map(|(i, signal)| (!self.outputs.contains(&i)).then_some(signal.between)).collect()
+        signals.map(|(i, signal)| (!self.outputs.contains(&i)).then_some(signal.intersample)).collect()
     }
 
     fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>> {
@@ -162,7 +170,7 @@ impl Recordings for Sampled {
     fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
         check_length("free numbers of inputs", 0, inputs.len())?;
         let of = |run: &Vec<Signal>| {
-            let means = run.iter().map(|s| pulse_means(&s.samples, m, s.between)).collect::<Result<_>>()?;
+            let means = run.iter().map(|s| pulse_means(&s.samples, m, s.intersample)).collect::<Result<_>>()?;
             let duration = self.step * (run[0].samples.len() - 1) as f64;
             Record::new(duration / m.max(1) as f64, means, None)
         };

@@ -1,110 +1,134 @@
-//! Optima whose free run grows: kept where the runs force them, not where one that dies away explains them as well.
+//! Choice between an unstable optimum and a stable one: the unstable one must fit significantly better.
 //!
-//! A run that starts in motion gives an equation initial terms of its own. They cost a growing mode nothing: fitted, they
-//! take away all that it becomes until the end of the run, and what is left runs backwards in time. Such an equation
-//! answers its inputs before they come, which no machine does, and where residuals are coloured it may well leave less.
+//! With nonzero initial conditions an equation has free initial terms for each run. They can cancel an unstable mode up
+//! to the end of the run, which makes the response noncausal: the output reacts before the input. No machine does that,
+//! but with autocorrelated residuals such a model can fit better.
 
 use std::collections::BTreeMap;
 
-use super::multistart::{held as known_orders, Held};
-use super::objective::Grid;
-use super::parameter_set::Free;
-use super::problem::{Attempt, Runner};
+use super::multistart::{fixed_order_problems as known_orders, FixedOrderProblem};
+use super::objective::Objective;
+use super::parameter_set::ParameterSet;
+use super::problem::{Candidate, OptimizationResult};
 use super::structure::Coefficient;
 use crate::error::{Error, Result};
 use crate::signal::statistics::mean;
 
-/// Stretches of the runs whose sums of squares are compared, and the 99 % quantile of Student's t of one less.
-const STRETCHES: f64 = 20.0;
-const STUDENT_99: f64 = 2.54;
-/// Residuals larger by this factor force what no stretch may show: a run that grows is seen at its end alone.
-const FAR_LARGER: f64 = 2.0;
-/// Optima of the race that are looked at, and evaluations of each.
-const LOOKED_AT: usize = 3;
-const EVALUATIONS: usize = 60;
+/// Number of segments of the runs whose sums of squares are compared; then the 99 % quantile of Student's t for one
+/// degree of freedom less.
+const COMPARISON_SEGMENTS: f64 = 20.0;
+const STUDENT_T_QUANTILE_99: f64 = 2.54;
+/// Ratio of the residuals above which the better optimum is chosen without a test: instability can show up only at the
+/// end of a run.
+const DECISIVE_RESIDUAL_RATIO: f64 = 2.0;
+/// Maximum number of stable candidates of the multistart to try, and evaluations of each.
+const MAX_STABLE_CANDIDATES: usize = 3;
+const EVALUATIONS_PER_CANDIDATE: usize = 60;
 
-/// An optimum whose free run grows beside the best one found whose free run does not.
+/// Comparison of an unstable optimum with the best stable one.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Growth {
-    /// Whether the growing one is the fit's, because the runs force it or there was no other.
-    pub kept: bool,
-    /// Share by which residuals of the other one are larger (root mean square); infinite where there was none, below 0
-    /// where the growing one was no optimum.
-    pub excess: f64,
-    /// Whether the other one stands where free runs begin to grow, no optimum of its own.
-    pub at_limit: bool,
+pub struct StabilityComparison {
+    /// True if the unstable optimum is the result, because it fits significantly better or no stable one exists.
+    pub keeps_unstable: bool,
+    /// Relative excess of the root mean square residual of the stable one. Infinite if there is none, negative if the
+    /// unstable one was no optimum.
+    pub residual_excess: f64,
+    /// True if the stable one lies on the stability limit and is no local optimum.
+    pub at_stability_limit: bool,
 }
 
-/// The optimum to go on from, on a grid that stays where free runs die away if it does, and what was compared.
+/// Choose between the best optimum and a stable one; return it with its objective and the comparison.
+///
+/// The objective requires stability if the stable optimum is chosen.
 ///
 /// # Errors
-/// Those of the source, [`Error::Interrupted`].
-pub fn steadied<'a>(
-    free: &Free,
-    best: Runner,
-    grid: Grid<'a>,
-    reached: &[Runner],
-) -> Result<(Runner, Grid<'a>, Option<Growth>)> {
-    if !grows(free, &best) {
+/// As the source, [`Error::Interrupted`].
+pub fn prefer_stable<'a>(
+    free: &ParameterSet,
+    best: Candidate,
+    grid: Objective<'a>,
+    reached: &[Candidate],
+) -> Result<(Candidate, Objective<'a>, Option<StabilityComparison>)> {
+    if !is_unstable(free, &best) {
         return Ok((best, grid, None));
     }
-    let held = grid.steadily();
-    let mut ends = Ends { free, grid: held.clone() }.stable(&best, reached)?;
-    let unit = grid.clock();
+    let held = grid.with_stability_constraint();
+    let mut ends = StableSearch { free, grid: held.clone() }.stable_optima(&best, reached)?;
+    let unit = grid.time_scaling();
     for one in known_orders(free) {
-        // What the equation explains with an order known without growing, it explains with that order free.
-        let there = known(&one, free, &held, |runner| one.without(runner, &unit), &best, reached)?;
+        // A stable optimum with one order fixed is a candidate for the full equation.
+        let there = stable_with_fixed_order(&one, free, &held, |runner| one.restrict(runner, &unit), &best, reached)?;
         if let Some(there) = there {
-            let there = one.embedded(&there, free);
-            ends.extend(caught(Ends { free, grid: held.clone() }.steadily(&there))?);
+            let there = one.embed(&there, free);
+            ends.extend(ignore_failure(StableSearch { free, grid: held.clone() }.minimize_stable(&there))?);
         }
     }
     if ends.is_empty() {
-        return Ok((best, grid, Some(Growth { kept: true, excess: f64::INFINITY, at_limit: false })));
+        return Ok((
+            best,
+            grid,
+            Some(StabilityComparison {
+                keeps_unstable: true,
+                residual_excess: f64::INFINITY,
+                at_stability_limit: false,
+            }),
+        ));
     }
-    let other = Ends { free, grid: held.clone() }.nearest(&ends)?;
-    let excess = if best.level() > 0.0 { (other.level() / best.level()).sqrt() - 1.0 } else { f64::INFINITY };
-    if forced(&grid, &best.attempt, &other.attempt) {
-        return Ok((best, grid, Some(Growth { kept: true, excess, at_limit: false })));
+    let other = StableSearch { free, grid: held.clone() }.select_optimum(&ends)?;
+    let excess = if best.cost_per_residual() > 0.0 {
+        (other.cost_per_residual() / best.cost_per_residual()).sqrt() - 1.0
+    } else {
+        f64::INFINITY
+    };
+    if is_significantly_better(&grid, &best.result, &other.result) {
+        return Ok((
+            best,
+            grid,
+            Some(StabilityComparison { keeps_unstable: true, residual_excess: excess, at_stability_limit: false }),
+        ));
     }
-    let at_limit = !other.attempt.converged();
-    Ok((other, held, Some(Growth { kept: false, excess, at_limit })))
+    let at_limit = !other.result.has_converged();
+    Ok((
+        other,
+        held,
+        Some(StabilityComparison { keeps_unstable: false, residual_excess: excess, at_stability_limit: at_limit }),
+    ))
 }
 
-/// Where the problem with one order known stands without growing, if there is such a place.
-fn known(
-    one: &Held,
-    free: &Free,
-    held: &Grid<'_>,
-    without: impl Fn(&Runner) -> Runner,
-    best: &Runner,
-    reached: &[Runner],
-) -> Result<Option<Runner>> {
+/// Stable optimum of the problem with one order fixed, if any.
+fn stable_with_fixed_order(
+    one: &FixedOrderProblem,
+    free: &ParameterSet,
+    held: &Objective<'_>,
+    without: impl Fn(&Candidate) -> Candidate,
+    best: &Candidate,
+    reached: &[Candidate],
+) -> Result<Option<Candidate>> {
     debug_assert!(one.order < free.orders.len());
-    let narrow = Ends { free: &one.free, grid: held.of(&one.free.problem) };
-    let inside = narrow.stable(&without(best), &reached.iter().map(without).collect::<Vec<_>>())?;
+    let narrow = StableSearch { free: &one.free, grid: held.with_problem(&one.free.problem) };
+    let inside = narrow.stable_optima(&without(best), &reached.iter().map(without).collect::<Vec<_>>())?;
     if inside.is_empty() {
         return Ok(None);
     }
-    Ok(caught(narrow.nearest(&inside).map(Some))?.flatten())
+    Ok(ignore_failure(narrow.select_optimum(&inside).map(Some))?.flatten())
 }
 
-/// What a computation found; nothing where it ended with any error but a stop.
-fn caught<T>(found: Result<T>) -> Result<Option<T>> {
+/// Convert any error except [`Error::Interrupted`] to None.
+fn ignore_failure<T>(found: Result<T>) -> Result<Option<T>> {
     match found {
         Err(Error::Interrupted) => Err(Error::Interrupted),
         found => Ok(found.ok()),
     }
 }
 
-/// Whether the free run of an equation grows where an attempt is.
-fn grows(free: &Free, runner: &Runner) -> bool {
-    free.problem.grows(&runner.attempt.place.point)
+/// True if an equation is unstable at a candidate.
+fn is_unstable(free: &ParameterSet, runner: &Candidate) -> bool {
+    free.problem.is_unstable(&runner.result.iterate.point)
 }
 
-/// Free coefficients before own terms, with the factor that they are multiplied by.
-fn own_terms(free: &Free) -> BTreeMap<&String, f64> {
-    let own = free.structure.equations.iter().flat_map(|equation| equation.own());
+/// Names of the free autoregressive coefficients, with their fixed factors.
+fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
+    let own = free.structure.equations.iter().flat_map(|equation| equation.autoregressive_terms());
     own.filter_map(|term| match &term.coefficient {
         Coefficient::Free(name) => Some((name, term.factor)),
         Coefficient::Known(_) => None,
@@ -112,13 +136,14 @@ fn own_terms(free: &Free) -> BTreeMap<&String, f64> {
     .collect()
 }
 
-/// The point with own terms that all pull back, whose free run dies away up to order 2, and which of them turned.
+/// Candidate with all autoregressive coefficients negative, which is stable up to order 2, and the changed indices.
 ///
-/// Those are held where the rest follows first: released at once, what drives would be that of the growing optimum.
+/// The changed coefficients are first kept fixed while the others adapt, because the input coefficients still belong to
+/// the unstable optimum.
 #[must_use]
-pub fn dissipative(free: &Free, runner: &Runner) -> (Runner, Vec<usize>) {
-    let own = own_terms(free);
-    let mut place = runner.attempt.place.clone();
+pub fn dissipative_candidate(free: &ParameterSet, runner: &Candidate) -> (Candidate, Vec<usize>) {
+    let own = autoregressive_factors(free);
+    let mut place = runner.result.iterate.clone();
     let mut turned = Vec::new();
     for (k, (name, value)) in free.coefficients.iter().zip(&mut place.point.coefficients).enumerate() {
         if own.get(name).is_some_and(|factor| *value * factor > 0.0) {
@@ -126,20 +151,18 @@ pub fn dissipative(free: &Free, runner: &Runner) -> (Runner, Vec<usize>) {
             turned.push(free.orders.len() + k);
         }
     }
-    (elsewhere(runner, place, "all own terms pulling back"), turned)
+    (candidate_at(runner, place, "all own terms pulling back"), turned)
 }
 
-/// The point without one own term after the other, each held at 0 where the rest follows first.
-///
-/// What a term less explains without growing, the whole equation explains, too.
+/// Candidates with one autoregressive coefficient at 0 each, which is first kept fixed while the others adapt.
 #[must_use]
-pub fn lacking(free: &Free, runner: &Runner) -> Vec<(Runner, Vec<usize>)> {
-    let places = own_places(free);
+pub fn candidates_without_term(free: &ParameterSet, runner: &Candidate) -> Vec<(Candidate, Vec<usize>)> {
+    let places = autoregressive_indices(free);
     let without = |&k: &usize| {
-        let mut place = runner.attempt.place.clone();
+        let mut place = runner.result.iterate.clone();
         place.point.coefficients[k] = 0.0;
         let words = format!("from {} = 0", free.coefficients[k]);
-        (elsewhere(runner, place, &words), vec![free.orders.len() + k])
+        (candidate_at(runner, place, &words), vec![free.orders.len() + k])
     };
     if places.len() > 1 {
         places.iter().map(without).collect()
@@ -148,98 +171,107 @@ pub fn lacking(free: &Free, runner: &Runner) -> Vec<(Runner, Vec<usize>)> {
     }
 }
 
-/// Places of the coefficients before own terms.
-fn own_places(free: &Free) -> Vec<usize> {
-    let own = own_terms(free);
+/// Indices of the free autoregressive coefficients.
+fn autoregressive_indices(free: &ParameterSet) -> Vec<usize> {
+    let own = autoregressive_factors(free);
     (0..free.coefficients.len()).filter(|&k| own.contains_key(&free.coefficients[k])).collect()
 }
 
-fn elsewhere(runner: &Runner, place: super::problem::Place, words: &str) -> Runner {
+fn candidate_at(runner: &Candidate, place: super::problem::Iterate, words: &str) -> Candidate {
     let origin = format!("{}, {words}", runner.origin);
-    Runner { origin, attempt: Attempt { place, ..runner.attempt.clone() }, ..runner.clone() }
+    Candidate { origin, result: OptimizationResult { iterate: place, ..runner.result.clone() }, ..runner.clone() }
 }
 
-/// A problem on a grid where no descent goes to a free run that grows.
-struct Ends<'f, 'g> {
-    free: &'f Free,
-    grid: Grid<'g>,
+/// Search for stable optima of a problem.
+struct StableSearch<'f, 'g> {
+    free: &'f ParameterSet,
+    grid: Objective<'g>,
 }
 
-impl Ends<'_, '_> {
-    fn descend(&self, start: &Runner, held: &[usize]) -> Result<Runner> {
-        let place = &start.attempt.place;
-        Ok(start.moved(self.grid.descend_in(&self.free.turned(place, true, held), place, EVALUATIONS)?))
+impl StableSearch<'_, '_> {
+    fn minimize(&self, start: &Candidate, held: &[usize]) -> Result<Candidate> {
+        let place = &start.result.iterate;
+        Ok(start.with_result(self.grid.minimize_in(
+            &self.free.problem_at(place, true, held),
+            place,
+            EVALUATIONS_PER_CANDIDATE,
+        )?))
     }
 
-    /// Where attempts end whose free runs die away: those of a race, and what is nearest to a growing optimum.
-    fn stable(&self, best: &Runner, reached: &[Runner]) -> Result<Vec<Runner>> {
-        let raced = reached.iter().filter(|runner| !grows(self.free, runner)).take(LOOKED_AT);
-        let mut starts: Vec<(Runner, Vec<usize>)> = raced.map(|runner| (runner.clone(), Vec::new())).collect();
-        starts.push(dissipative(self.free, best));
-        starts.extend(lacking(self.free, best));
+    /// Stable optima from stable candidates of the multistart and from modifications of the unstable optimum.
+    fn stable_optima(&self, best: &Candidate, reached: &[Candidate]) -> Result<Vec<Candidate>> {
+        let raced = reached.iter().filter(|runner| !is_unstable(self.free, runner)).take(MAX_STABLE_CANDIDATES);
+        let mut starts: Vec<(Candidate, Vec<usize>)> = raced.map(|runner| (runner.clone(), Vec::new())).collect();
+        starts.push(dissipative_candidate(self.free, best));
+        starts.extend(candidates_without_term(self.free, best));
         let mut ends = Vec::new();
-        for (start, turned) in starts.into_iter().filter(|(start, _)| !grows(self.free, start)) {
-            let near = if turned.is_empty() { Ok(start) } else { self.descend(&start, &turned) };
-            // Some have no finite free run on this grid; the others have one.
-            ends.extend(caught(near.and_then(|near| self.steadily(&near)))?);
+        for (start, turned) in starts.into_iter().filter(|(start, _)| !is_unstable(self.free, start)) {
+            let near = if turned.is_empty() { Ok(start) } else { self.minimize(&start, &turned) };
+            // Candidates without a finite simulation on this grid are skipped.
+            ends.extend(ignore_failure(near.and_then(|near| self.minimize_stable(&near)))?);
         }
         Ok(ends)
     }
 
-    /// Where a descent ends that goes to no free run that grows, along the limit of growth if it comes there.
-    fn steadily(&self, start: &Runner) -> Result<Runner> {
-        let end = self.descend(start, &[])?;
-        if end.attempt.converged() {
+    /// Minimize over stable models, along the stability limit if it is reached.
+    fn minimize_stable(&self, start: &Candidate) -> Result<Candidate> {
+        let end = self.minimize(start, &[])?;
+        if end.result.has_converged() {
             return Ok(end);
         }
-        self.along_limit(end)
+        self.minimize_along_limit(end)
     }
 
-    /// The lowest point beside one at the limit of growth: from there on with one own term held after the other.
+    /// Minimize along the stability limit, with one autoregressive coefficient fixed at a time.
     ///
-    /// A descent stands where a step of all numbers would grow, though the rest may still fall along the limit.
-    fn along_limit(&self, end: Runner) -> Result<Runner> {
-        let status = end.attempt.status;
+    /// An optimization stops if a step of all parameters would be unstable, although the cost can still decrease along
+    /// the limit.
+    fn minimize_along_limit(&self, end: Candidate) -> Result<Candidate> {
+        let status = end.result.status;
         let mut best = end.clone();
-        for k in own_places(self.free) {
-            let there = caught(self.descend(&end, &[self.free.orders.len() + k]))?;
-            best = there.filter(|there| there.level() < best.level()).unwrap_or(best);
+        for k in autoregressive_indices(self.free) {
+            let there = ignore_failure(self.minimize(&end, &[self.free.orders.len() + k]))?;
+            best = there.filter(|there| there.cost_per_residual() < best.cost_per_residual()).unwrap_or(best);
         }
-        // Held, it stood still in fewer numbers than the fit has.
-        best.attempt.status = status;
+        // With a fixed coefficient it converged in fewer parameters than the fit has.
+        best.result.status = status;
         Ok(best)
     }
 
-    /// The end that a growing optimum is compared with.
+    /// Stable candidate to compare with the unstable optimum.
     ///
-    /// Where free runs begin to grow a descent stands at a wall, which is no optimum: one of those is taken instead, but
-    /// for where the runs refuse all of them for the wall.
-    fn nearest(&self, ends: &[Runner]) -> Result<Runner> {
-        let attempts: Vec<&Attempt> = ends.iter().map(|runner| &runner.attempt).collect();
-        let order = self.grid.finer()?.ranked(&attempts)?;
+    /// A converged optimum is preferred over a candidate on the stability limit, unless the latter fits significantly
+    /// better than all of them.
+    fn select_optimum(&self, ends: &[Candidate]) -> Result<Candidate> {
+        let attempts: Vec<&OptimizationResult> = ends.iter().map(|runner| &runner.result).collect();
+        let order = self.grid.finer()?.rank_results(&attempts)?;
         let first = order.first().copied().unwrap_or(0);
-        let settled = |&&i: &&usize| attempts[i].converged() && !forced(&self.grid, attempts[first], attempts[i]);
+        let settled = |&&i: &&usize| {
+            attempts[i].has_converged() && !is_significantly_better(&self.grid, attempts[first], attempts[i])
+        };
         Ok(ends[order.iter().find(settled).copied().unwrap_or(first)].clone())
     }
 }
 
-/// Whether the best point leaves less than another one by more than chance, neither of them inside the other.
+/// Vuong's test of non-nested models: true if the best fits significantly better than the other.
 ///
-/// The means of the squares over stretches of the runs are compared (Vuong, doi:10.2307/1912557; for coloured residuals
+/// The mean squares over segments of the runs are compared (Vuong, doi:10.2307/1912557; for autocorrelated residuals
 /// Rivers & Vuong, doi:10.1111/1368-423X.t01-1-00071).
 #[must_use]
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub fn forced(grid: &Grid<'_>, best: &Attempt, other: &Attempt) -> bool {
-    if other.level() > FAR_LARGER * FAR_LARGER * best.level() {
+pub fn is_significantly_better(grid: &Objective<'_>, best: &OptimizationResult, other: &OptimizationResult) -> bool {
+    if other.cost_per_residual() > DECISIVE_RESIDUAL_RATIO * DECISIVE_RESIDUAL_RATIO * best.cost_per_residual() {
         return true;
     }
-    let squares = |attempt: &Attempt| grid.residuals(attempt).iter().map(|run| summed(run)).collect::<Vec<_>>();
+    let squares = |attempt: &OptimizationResult| {
+        grid.residuals(attempt).iter().map(|run| squares_by_sample(run)).collect::<Vec<_>>()
+    };
     let (ours, theirs) = (squares(best), squares(other));
     let samples: usize = theirs.iter().map(Vec::len).sum();
     let mut less = Vec::new();
     for (one, two) in theirs.iter().zip(&ours) {
         let fall: Vec<f64> = one.iter().zip(two).map(|(a, b)| a - b).collect();
-        let count = (STRETCHES * fall.len() as f64 / samples as f64).round_ties_even().max(1.0) as usize;
+        let count = (COMPARISON_SEGMENTS * fall.len() as f64 / samples as f64).round_ties_even().max(1.0) as usize;
         let (short, longer) = (fall.len() / count, fall.len() % count);
         let mut rest = fall.as_slice();
         for k in 0..count {
@@ -255,11 +287,11 @@ pub fn forced(grid: &Grid<'_>, best: &Attempt, other: &Attempt) -> bool {
     }
     let (middle, count) = (mean(&less), less.len() as f64);
     let spread = less.iter().map(|v| (v - middle).powi(2)).sum::<f64>() / (count - 1.0);
-    middle > STUDENT_99 * (spread / count).sqrt()
+    middle > STUDENT_T_QUANTILE_99 * (spread / count).sqrt()
 }
 
-/// Squares of weighted residuals of all outputs, sample by sample; what was not read counts nothing.
-fn summed(outputs: &[Vec<f64>]) -> Vec<f64> {
+/// Sum of squared weighted residuals of all outputs, by sample; missing samples count 0.
+fn squares_by_sample(outputs: &[Vec<f64>]) -> Vec<f64> {
     let mut total = vec![0.0; outputs.first().map_or(0, Vec::len)];
     for residuals in outputs {
         let squares = residuals.iter().map(|e| if e.is_nan() { 0.0 } else { e * e });

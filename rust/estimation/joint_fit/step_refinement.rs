@@ -1,86 +1,91 @@
-//! Halving the step until that moves the estimate by little of its standard error.
+//! Step refinement: the step is halved until the estimate changes by a small part of its standard error.
 
 use super::covariance::covariance;
-use super::objective::{Grid, Weights, FINEST};
-use super::parameter_set::Clock;
-use super::problem::{Attempt, Place};
-use super::reweighting::{settled, Loss, Robust};
+use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
+use super::parameter_set::TimeScaling;
+use super::problem::{Iterate, OptimizationResult};
+use super::reweighting::{fit_reweighted, Loss, RobustSummary};
 use crate::error::{Error, Result};
 use crate::estimation::output_error::Status;
 use crate::signal::statistics::inner;
 
-/// Refinement ends when halving the step moves no estimate, or none extrapolated to step 0, by this share of its standard
-/// error.
-const REFINED: f64 = 0.1;
-/// Logarithm of residuals by which halving the step may raise them before other starts have their way on the finer grid.
-const ROSE: f64 = 5e-4;
+/// Change of an estimate, or of its extrapolation to zero step, below which the refinement has converged.
+const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
+/// Increase of the log residuals by halving the step above which other survivors are tried on the finer grid.
+const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
-/// Where a fit ended on its finest grid, and its estimate at step 0.
+/// Optimum on the finest grid, and its extrapolation to zero step.
 #[derive(Clone)]
 pub struct Optimum<'a> {
     /// The optimum of the finest grid.
-    pub attempt: Attempt,
+    pub attempt: OptimizationResult,
     /// That grid.
-    pub grid: Grid<'a>,
-    /// Parameters at step 0, as far as two grids tell them.
+    pub grid: Objective<'a>,
+    /// Parameters extrapolated to zero step from two grids.
     pub estimate: Vec<f64>,
-    /// Whether halving the step moved no estimate by a tenth of its standard error.
-    pub settled: bool,
+    /// True if halving the step changed no estimate by more than a tenth of its standard error.
+    pub step_converged: bool,
     covariance: Vec<f64>,
 }
 
-/// An optimum with all that describes it.
+/// Optimum with its covariance, noise levels and residuals.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Finished {
+pub struct OptimumStatistics {
     /// The optimum of the finest grid.
-    pub attempt: Attempt,
-    /// Its weights.
+    pub attempt: OptimizationResult,
+    /// Weights at the optimum.
     pub weights: Weights,
-    /// Pulses a sample interval of that grid.
-    pub every: usize,
-    /// Parameters at step 0, within bounds.
+    /// Block pulses per sampling interval of that grid.
+    pub pulses_per_sample: usize,
+    /// Parameters extrapolated to zero step, within bounds.
     pub estimate: Vec<f64>,
-    /// Whether halving the step moved no estimate by a tenth of its standard error.
-    pub settled: bool,
-    /// Of the parameters, by rows.
+    /// True if halving the step changed no estimate by more than a tenth of its standard error.
+    pub step_converged: bool,
+    /// Row-major covariance of the parameters.
     pub covariance: Vec<f64>,
-    /// Standard deviation of the residuals by output; under a robust loss from the median of their sizes.
+    /// Standard deviation of the residuals by output; with a robust loss from the median absolute residual.
     pub noise: Vec<f64>,
-    /// Residuals over the noise by run and output; not a number where none was read.
+    /// Residuals in units of the noise by run and output; NaN for missing samples.
     pub residuals: Vec<Vec<Vec<f64>>>,
-    /// What a robust loss did; none for squares.
-    pub robust: Option<Robust>,
+    /// Counts of downweighted residuals of a robust loss; None for squares.
+    pub robust: Option<RobustSummary>,
 }
 
-/// Halves the step until that moves the estimate by little of its standard error.
+/// Halve the step until the estimate changes by a small part of its standard error.
 ///
-/// A coarse grid may lead along a flat valley to where equations end, and there a finer one leads nowhere: then others have
-/// their way on it as well.
+/// On a coarse grid an optimization can follow a flat valley to the limit of its domain, where a finer grid makes no
+/// progress. Then the other survivors are optimized on the finer grid as well.
 ///
 /// # Errors
-/// Those of [`settled`] and of [`covariance`].
-pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) -> Result<Optimum<'a>> {
-    let clock = grid.clock();
+/// As [`fit_reweighted`] and [`covariance`].
+pub fn refine_step<'a>(
+    best: OptimizationResult,
+    grid: Objective<'a>,
+    loss: Loss,
+    others: &[Iterate],
+) -> Result<Optimum<'a>> {
+    let clock = grid.time_scaling();
     let (mut best, mut grid, mut others) = (best, grid, others);
-    let (mut estimate, mut still, mut before) = (best.values(), false, None::<Attempt>);
+    let (mut estimate, mut still, mut before) = (best.values(), false, None::<OptimizationResult>);
     let mut spread = None;
-    while !still && grid.sampling.every < FINEST {
-        // On a finer grid residuals may shrink to their noise, so weights follow anew.
+    while !still && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+        // Residuals can shrink to the noise on a finer grid, so the weights are iterated again.
         let half = grid.finer()?;
-        let start = expected(&half, &clock, &best, before.as_ref())?;
-        let (finer, fine) = match settled(&start, half.clone(), loss) {
-            // Where two grids point there may be no free run.
-            Err(error) if error != Error::Interrupted => settled(&best.place, half, loss)?,
+        let start = extrapolated_start(&half, &clock, &best, before.as_ref())?;
+        let (finer, fine) = match fit_reweighted(&start, half.clone(), loss) {
+            // The extrapolated start may have no finite simulation.
+            Err(error) if error != Error::Interrupted => fit_reweighted(&best.iterate, half, loss)?,
             found => found?,
         };
-        let rose = likelihood(&finer, &fine) > likelihood(&best, &grid) + ROSE;
+        let rose =
+            negative_log_likelihood(&finer, &fine) > negative_log_likelihood(&best, &grid) + MAX_LOG_RESIDUAL_INCREASE;
         let mut fine = fine;
-        if (finer.status == Status::Wall && before.is_none()) || (rose && !others.is_empty()) {
-            let freed = freed(&finer, &fine, others, loss)?;
-            // They have had their way.
+        if (finer.status == Status::DomainLimit && before.is_none()) || (rose && !others.is_empty()) {
+            let freed = best_alternative(&finer, &fine, others, loss)?;
+            // The other survivors are tried once.
             others = &[];
             if let Some((other, there)) = freed {
-                // Two grids have two optima, of which they tell nothing together.
+                // The two grids have different optima, so they cannot be extrapolated.
                 (before, spread) = (None, None);
                 estimate = other.values();
                 (best, grid) = (other, there);
@@ -90,127 +95,149 @@ pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) 
         std::mem::swap(&mut grid, &mut fine);
         let (there, here) = (finer.values(), best.values());
         let found = covariance(&finer, &grid)?;
-        let errors = clock.errors(&there, &found);
-        // The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so. Of a
-        // flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
+        let errors = clock.standard_errors(&there, &found);
+        // The scheme is of second order: Richardson extrapolation of two grids gives the limit, a third grid confirms
+        // it. Optimizations that did not converge cannot be extrapolated.
         let mut limit = there.clone();
-        if finer.converged() && best.converged() {
-            limit = beyond(&grid, &clock, &there, &here, 3.0)?;
+        if finer.has_converged() && best.has_converged() {
+            limit = extrapolate(&grid, &clock, &there, &here, 3.0)?;
         }
         let moved = |one: &[f64], other: &[f64]| {
-            let ways = clock.told(one).into_iter().zip(clock.told(other));
-            ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= REFINED * error)
+            let ways = clock.to_scaled(one).into_iter().zip(clock.to_scaled(other));
+            ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
         };
         still = moved(&limit, &estimate) || moved(&there, &here);
         estimate = limit;
         (before, best, spread) = (Some(best), finer, Some(found));
     }
     let spread = spread.map_or_else(|| covariance(&best, &grid), Ok)?;
-    let estimate = nearer(&best, &grid, estimate, &clock, still)?;
-    Ok(Optimum { attempt: best, grid, estimate, settled: still, covariance: spread })
+    let estimate = select_limit_or_optimum(&best, &grid, estimate, &clock, still)?;
+    Ok(Optimum { attempt: best, grid, estimate, step_converged: still, covariance: spread })
 }
 
 impl<'a> Optimum<'a> {
-    /// An optimum of a grid that is not refined.
+    /// Optimum of a grid without refinement.
     ///
     /// # Errors
-    /// Those of [`covariance`].
-    pub fn unrefined(attempt: Attempt, grid: Grid<'a>) -> Result<Self> {
+    /// As [`covariance`].
+    pub fn without_refinement(attempt: OptimizationResult, grid: Objective<'a>) -> Result<Self> {
         let covariance = covariance(&attempt, &grid)?;
-        Ok(Self { estimate: attempt.values(), settled: true, covariance, attempt, grid })
+        Ok(Self { estimate: attempt.values(), step_converged: true, covariance, attempt, grid })
     }
 
-    /// The optimum with its covariance, its noise and its residuals.
+    /// Compute covariance, noise levels and residuals of the optimum.
     #[must_use]
-    pub fn finished(self) -> Finished {
-        let Self { attempt, grid, estimate, settled, covariance } = self;
-        let robust = grid.weights.shares.is_some();
-        let levels = if robust { grid.scales(&attempt) } else { grid.levels(&attempt) };
+    pub fn into_statistics(self) -> OptimumStatistics {
+        let Self { attempt, grid, estimate, step_converged: settled, covariance } = self;
+        let robust = grid.weights.robust_weights.is_some();
+        let levels = if robust { grid.residual_scales(&attempt) } else { grid.residual_root_mean_squares(&attempt) };
         let inside = |(value, (low, high)): (f64, (f64, f64))| value.clamp(low, high);
-        Finished {
+        OptimumStatistics {
             estimate: estimate.into_iter().zip(grid.problem.bounds()).map(inside).collect(),
             noise: levels.iter().zip(&grid.weights.outputs).map(|(level, weight)| level / weight).collect(),
             residuals: grid.residuals(&attempt),
-            robust: robust.then(|| Robust::of(&grid, &attempt)),
+            robust: robust.then(|| RobustSummary::from_result(&grid, &attempt)),
             weights: grid.weights,
-            every: grid.sampling.every,
+            pulses_per_sample: grid.sampling.pulses_per_sample,
             attempt,
-            settled,
+            step_converged: settled,
             covariance,
         }
     }
 }
 
-/// Where two grids point from the finer one, a share of the way that led there.
-fn beyond(grid: &Grid<'_>, clock: &Clock, fine: &[f64], coarse: &[f64], share: f64) -> Result<Vec<f64>> {
-    let (fine, coarse) = (clock.told(fine), clock.told(coarse));
+/// Extrapolate two grids beyond the finer one, by the difference divided by `share`.
+fn extrapolate(
+    grid: &Objective<'_>,
+    clock: &TimeScaling,
+    fine: &[f64],
+    coarse: &[f64],
+    share: f64,
+) -> Result<Vec<f64>> {
+    let (fine, coarse) = (clock.to_scaled(fine), clock.to_scaled(coarse));
     let ahead: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
-    Ok(clock.untold(&grid.problem.feasible(&fine, &ahead)?))
+    Ok(clock.from_scaled(&grid.problem.last_feasible_point(&fine, &ahead)?))
 }
 
-/// Where to begin on half the step: what moved the optimum from the last grid to this moves it a quarter as far.
-fn expected(grid: &Grid<'_>, clock: &Clock, best: &Attempt, before: Option<&Attempt>) -> Result<Place> {
+/// Start on half the step: the optimum is expected to move a quarter as far as at the last halving.
+fn extrapolated_start(
+    grid: &Objective<'_>,
+    clock: &TimeScaling,
+    best: &OptimizationResult,
+    before: Option<&OptimizationResult>,
+) -> Result<Iterate> {
     match before {
-        Some(before) if best.converged() && before.converged() => {
-            Ok(best.at(&beyond(grid, clock, &best.values(), &before.values(), 4.0)?))
+        Some(before) if best.has_converged() && before.has_converged() => {
+            Ok(best.iterate_at(&extrapolate(grid, clock, &best.values(), &before.values(), 4.0)?))
         }
-        _ => Ok(best.place.clone()),
+        _ => Ok(best.iterate.clone()),
     }
 }
 
-/// Another attempt on the grid of one that a wall stopped, its weights settled, if that leaves less; none that grows where
-/// the grid is steady.
+/// Best other candidate, with converged weights, if it fits better than one stopped at the limit of its domain.
+///
+/// Unstable candidates are excluded if the objective requires stability.
 ///
 /// # Errors
 /// [`Error::Interrupted`].
-pub fn freed<'a>(
-    stuck: &Attempt,
-    grid: &Grid<'a>,
-    others: &[Place],
+pub fn best_alternative<'a>(
+    stuck: &OptimizationResult,
+    grid: &Objective<'a>,
+    others: &[Iterate],
     loss: Loss,
-) -> Result<Option<(Attempt, Grid<'a>)>> {
-    let (mut best, mut least) = (None, likelihood(stuck, grid));
+) -> Result<Option<(OptimizationResult, Objective<'a>)>> {
+    let (mut best, mut least) = (None, negative_log_likelihood(stuck, grid));
     for other in others {
-        let there = match settled(other, grid.clone(), loss) {
+        let there = match fit_reweighted(other, grid.clone(), loss) {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Err(_) => continue,
             Ok(there) => there,
         };
-        let level = likelihood(&there.0, &there.1);
-        if level < least && !(grid.steady && grid.problem.grows(&there.0.place.point)) {
+        let level = negative_log_likelihood(&there.0, &there.1);
+        if level < least && !(grid.requires_stability && grid.problem.is_unstable(&there.0.iterate.point)) {
             (best, least) = (Some(there), level);
         }
     }
     Ok(best)
 }
 
-/// Minus the logarithm of the likelihood per sample, but for a constant.
-fn likelihood(attempt: &Attempt, grid: &Grid<'_>) -> f64 {
-    grid.levels(attempt).iter().zip(&grid.weights.outputs).map(|(level, w)| libm::log(level.max(1e-300) / w)).sum()
+/// Negative log-likelihood per sample, up to a constant.
+fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -> f64 {
+    grid.residual_root_mean_squares(attempt)
+        .iter()
+        .zip(&grid.weights.outputs)
+        .map(|(level, w)| libm::log(level.max(1e-300) / w))
+        .sum()
 }
 
-/// What is nearer to the truth on half the step, the limit that two grids tell or the optimum of the finer one.
+/// Select the extrapolated limit or the optimum of the finer grid, whichever fits better on half the step.
 ///
-/// Along the bottom of a flat and curved valley, where numbers cannot be told apart, a straight line leads out of it. Where
-/// the residuals follow it there is none, and a limit on which grids agree is nearer.
-fn nearer(best: &Attempt, grid: &Grid<'_>, limit: Vec<f64>, clock: &Clock, settled: bool) -> Result<Vec<f64>> {
+/// Extrapolation along a straight line leaves a flat curved valley of poorly determined parameters. If the residuals
+/// are linear along the line and the grids agree, the limit is better.
+fn select_limit_or_optimum(
+    best: &OptimizationResult,
+    grid: &Objective<'_>,
+    limit: Vec<f64>,
+    clock: &TimeScaling,
+    settled: bool,
+) -> Result<Vec<f64>> {
     let here = best.values();
-    let moved: Vec<f64> = clock.told(&limit).iter().zip(clock.told(&here)).map(|(a, b)| a - b).collect();
+    let moved: Vec<f64> = clock.to_scaled(&limit).iter().zip(clock.to_scaled(&here)).map(|(a, b)| a - b).collect();
     let mut way = vec![0.0; best.residuals.len()];
     for (by, column) in clock.step(&here, &moved).iter().zip(&best.jacobian) {
         way.iter_mut().zip(column).for_each(|(sum, slope)| *sum += by * slope);
     }
     let length = |row: &[f64]| inner(row, row).sqrt();
-    if inner(&way, &way) <= REFINED * REFINED {
-        // Both leave the same.
+    if inner(&way, &way) <= MAX_CHANGE_STANDARD_ERRORS * MAX_CHANGE_STANDARD_ERRORS {
+        // Both have the same residuals.
         return Ok(limit);
     }
-    let ahead = best.at(&limit);
+    let ahead = best.iterate_at(&limit);
     if settled {
-        if let Some(there) = grid.evaluated(&ahead)? {
+        if let Some(there) = grid.evaluate(&ahead)? {
             let told = best.residuals.iter().zip(&way).map(|(e, w)| e + w);
             let bent: Vec<f64> = there.residuals.iter().zip(told).map(|(e, told)| e - told).collect();
-            if length(&bent) <= REFINED * length(&way) {
+            if length(&bent) <= MAX_CHANGE_STANDARD_ERRORS * length(&way) {
                 return Ok(limit);
             }
         }
@@ -218,12 +245,12 @@ fn nearer(best: &Attempt, grid: &Grid<'_>, limit: Vec<f64>, clock: &Clock, settl
     let finer = match grid.finer() {
         Ok(finer) => finer,
         Err(Error::Interrupted) => return Err(Error::Interrupted),
-        // Neither has a free run there.
+        // Neither can be simulated on half the step.
         Err(_) => return Ok(limit),
     };
     let mut costs = [f64::INFINITY; 2];
-    for (cost, place) in costs.iter_mut().zip([&ahead, &best.place]) {
-        if let Some(there) = finer.evaluated(place)? {
+    for (cost, place) in costs.iter_mut().zip([&ahead, &best.iterate]) {
+        if let Some(there) = finer.evaluate(place)? {
             *cost = there.cost;
         }
     }

@@ -1,8 +1,4 @@
-//! Equations over numbered signals whose orders and coefficients go by names.
-//!
-//! Orders as affine functions of named free ones.
-//!
-//! What is free in a joint fit, by name: structures that lose terms, orders and coefficients on the way to simpler ones.
+//! Structure of a joint fit: equations over numbered signals with named orders and coefficients.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,10 +7,10 @@ use crate::error::{Error, Result};
 use crate::estimation::output_error::FreeInput;
 use crate::fractional::kernels::{MAX_EXCESS, MIN_INPUT_ORDER};
 
-/// Orders closer than this are one order.
-const GRAIN: f64 = 1e-9;
+/// Difference below which two orders are equal.
+const ORDER_TOLERANCE: f64 = 1e-9;
 
-/// A coefficient: to be estimated, or a number.
+/// Coefficient of a term: free or fixed.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Coefficient {
     /// Its name.
@@ -24,7 +20,7 @@ pub enum Coefficient {
 }
 
 impl Coefficient {
-    /// Its name where it is free.
+    /// Name of a free coefficient; None if fixed.
     #[must_use]
     pub fn name(&self) -> Option<&String> {
         match self {
@@ -33,12 +29,12 @@ impl Coefficient {
         }
     }
 
-    fn with(&self, values: &BTreeMap<String, f64>) -> Self {
+    fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
         self.name().and_then(|name| values.get(name)).map_or_else(|| self.clone(), |&value| Self::Known(value))
     }
 }
 
-/// factor · coefficient · D^order signal.
+/// Term factor · coefficient · D^order signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Term {
     /// Index of the signal.
@@ -52,9 +48,9 @@ pub struct Term {
 }
 
 impl Term {
-    /// factor · coefficient, where that is known.
+    /// Value of factor · coefficient if fixed; None if free.
     #[must_use]
-    pub fn fixed(&self) -> Option<f64> {
+    pub fn fixed_coefficient(&self) -> Option<f64> {
         match self.coefficient {
             Coefficient::Known(value) => Some(self.factor * value),
             Coefficient::Free(_) => None,
@@ -62,24 +58,24 @@ impl Term {
     }
 }
 
-/// Friction of an equation's own output: fc, fs and vs as a factor times a coefficient.
+/// Friction parameters fc, fs and vs of the output of an equation, each a factor times a coefficient.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Rubs {
+pub struct FrictionParameters {
     /// fc.
     pub coulomb: (f64, Coefficient),
-    /// fs; 0 where it does not fall with speed.
+    /// fs; 0 without a Stribeck effect.
     pub stribeck: (f64, Coefficient),
     /// vs.
     pub speed: (f64, Coefficient),
 }
 
-impl Rubs {
-    pub(super) fn numbers(&self) -> [&(f64, Coefficient); 3] {
+impl FrictionParameters {
+    pub(super) fn parameters(&self) -> [&(f64, Coefficient); 3] {
         [&self.coulomb, &self.stribeck, &self.speed]
     }
 }
 
-/// D^order output = Σ terms.
+/// Equation D^order output = Σ terms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Equation {
     /// Index of the output.
@@ -88,14 +84,14 @@ pub struct Equation {
     pub order: Order,
     /// The right-hand side.
     pub terms: Vec<Term>,
-    /// Friction of the output's velocity, if there is some.
-    pub friction: Option<Rubs>,
+    /// Friction on the velocity of the output, if any.
+    pub friction: Option<FrictionParameters>,
 }
 
 impl Equation {
-    /// Free coefficients in order of appearance, those of friction last.
+    /// Names of the free coefficients in order of appearance, friction last.
     pub fn coefficient_names(&self) -> impl Iterator<Item = &String> {
-        let rubs = self.friction.iter().flat_map(|rubs| rubs.numbers()).filter_map(|(_, number)| number.name());
+        let rubs = self.friction.iter().flat_map(|rubs| rubs.parameters()).filter_map(|(_, number)| number.name());
         self.terms.iter().filter_map(|term| term.coefficient.name()).chain(rubs)
     }
 
@@ -104,13 +100,13 @@ impl Equation {
         std::iter::once(&self.order).chain(self.terms.iter().map(|term| &term.order))
     }
 
-    /// Terms of its output.
-    pub fn own(&self) -> impl Iterator<Item = &Term> {
+    /// Terms of its own output.
+    pub fn autoregressive_terms(&self) -> impl Iterator<Item = &Term> {
         self.terms.iter().filter(|term| term.signal == self.output)
     }
 
     /// Terms of other signals.
-    pub fn driving(&self) -> impl Iterator<Item = &Term> {
+    pub fn input_terms(&self) -> impl Iterator<Item = &Term> {
         self.terms.iter().filter(|term| term.signal != self.output)
     }
 
@@ -131,7 +127,7 @@ impl Equation {
             let fits = if term.signal == self.output {
                 (0.0..alpha).contains(&order)
             } else {
-                order >= MIN_INPUT_ORDER && order < alpha + MAX_EXCESS - GRAIN
+                order >= MIN_INPUT_ORDER && order < alpha + MAX_EXCESS - ORDER_TOLERANCE
             };
             if !fits {
                 let what = format!("order {order} of signal {} beside alpha = {alpha}", term.signal);
@@ -142,68 +138,68 @@ impl Equation {
     }
 }
 
-/// A free number of an input, and what it is called.
+/// Free parameter of an input and its name.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Input {
     /// Its name, such as `delay_u`.
     pub name: String,
-    /// Where it acts.
+    /// Kind of the parameter and its input.
     pub free: FreeInput,
 }
 
-/// A coefficient that others give: sign · Π factors.
+/// Coefficient law: a coefficient that equals sign · Π factors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Law {
     /// The coefficient.
     pub name: String,
     /// ±1.
     pub sign: f64,
-    /// Names of the factors, one more than once where it stands in a power.
+    /// Names of the factors, repeated for powers.
     pub factors: Vec<String>,
 }
 
-/// What is known of where orders lie; it tells a fit where to start, and bounds nothing.
+/// Prior knowledge of orders and coefficients for initial guesses; it does not bound the fit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Hints {
-    /// Usual interval of highest orders.
+    /// Typical interval of the highest orders.
     pub highest: Option<(f64, f64)>,
-    /// Values beside the whole orders of its physics, by order.
+    /// Typical values besides integer orders, by order name.
     pub natural: BTreeMap<String, Vec<f64>>,
-    /// What a ratio of the coefficient law exceeds by its physics; 1 where nothing is said.
-    pub exceeds: BTreeMap<String, f64>,
-    /// Coefficients that the law ties to another equation's and physics makes positive.
+    /// Physical lower bound of each ratio of the coefficient law; default 1.
+    pub ratio_lower_bounds: BTreeMap<String, f64>,
+    /// Coefficients tied by the law to another equation and positive by physics.
     pub positive: BTreeSet<String>,
-    /// Values of coefficients by a physics that is nearly right.
+    /// Approximate physical values of coefficients.
     pub known: BTreeMap<String, f64>,
 }
 
-/// Equations with what is known about them; some orders or coefficients may be free.
+/// Structure of a joint fit: equations, bounds, initial terms, input nonlinearities and laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
-    /// Names of the signals, for words about them.
+    /// Names of the signals, for messages.
     pub signals: Vec<String>,
-    /// One for each output.
+    /// One equation per output.
     pub equations: Vec<Equation>,
-    /// Least and largest value of free orders that have been given some.
+    /// Lower and upper bound of free orders, if given.
     pub bounds: BTreeMap<String, (f64, f64)>,
-    /// Whether outputs drive each other as simulated, or as measured.
+    /// True if outputs enter other equations as simulated; false if as measured.
     pub coupled: bool,
-    /// Whether an input acts later by a known time.
+    /// True if an input has a fixed delay.
     pub delayed: bool,
-    /// Initial terms, decided.
+    /// Initial terms.
     pub initial: Initial,
-    /// Whether their powers of time stand for what a run did before its start.
+    /// True if the initial terms represent inputs before the start of a run.
     pub history: bool,
-    /// Free numbers of inputs.
+    /// Free parameters of the inputs.
     pub inputs: Vec<Input>,
-    /// What ties coefficients.
+    /// Laws between coefficients.
     pub laws: Vec<Law>,
-    /// Where orders lie.
+    /// Prior knowledge for initial guesses.
     pub hints: Hints,
 }
 
 impl Structure {
-    /// Equations driven by what was measured; nothing else is known.
+    /// Structure with measured signals as inputs and no further assumptions.
     #[must_use]
     pub fn new(signals: Vec<String>, equations: Vec<Equation>, initial: Initial) -> Self {
         Self {
@@ -220,7 +216,7 @@ impl Structure {
         }
     }
 
-    /// Free orders: those that stand alone in order of appearance, then those seen only through a law.
+    /// Names of the free orders: single ones in order of appearance, then those that occur only in a law.
     #[must_use]
     pub fn order_names(&self) -> Vec<String> {
         let orders = || self.equations.iter().flat_map(Equation::orders);
@@ -228,13 +224,13 @@ impl Structure {
         unique(alone.chain(orders().flat_map(Order::names)))
     }
 
-    /// Free coefficients.
+    /// Names of the free coefficients.
     #[must_use]
     pub fn coefficient_names(&self) -> Vec<String> {
         self.equations.iter().flat_map(Equation::coefficient_names).cloned().collect()
     }
 
-    /// Whether orders depend on one another: one is no plain name, or two are the same.
+    /// True if orders depend on one another: one is not a single free order, or two are the same.
     #[must_use]
     pub fn has_order_law(&self) -> bool {
         let orders: Vec<_> = self.equations.iter().flat_map(Equation::orders).filter(|order| order.is_free()).collect();
@@ -242,16 +238,16 @@ impl Structure {
         orders.iter().any(|order| !order.is_single()) || names.len() < orders.len()
     }
 
-    /// Whether the output of an equation may stick.
+    /// True if an equation has friction.
     #[must_use]
     pub fn has_friction(&self) -> bool {
         self.equations.iter().any(|equation| equation.friction.is_some())
     }
 
-    /// Refuses orders that make no equation.
+    /// Check that the orders form valid equations.
     ///
     /// # Errors
-    /// [`Error::Structure`] for an equation without terms, or a number outside the range of its order.
+    /// [`Error::Structure`] for an equation without terms, or an order out of range.
     pub fn check(&self) -> Result<()> {
         if self.equations.is_empty() {
             return Err(Error::Structure { what: "a model without an equation".into(), remedy: "add one".into() });
@@ -259,43 +255,43 @@ impl Structure {
         self.equations.iter().try_for_each(Equation::check)
     }
 
-    /// The same with some free orders replaced by values.
+    /// Substitute values for some free orders.
     ///
     /// # Errors
-    /// Those of [`Structure::check`].
+    /// As [`Structure::check`].
     pub fn with_orders(&self, values: &BTreeMap<String, f64>) -> Result<Self> {
         let mut out = self.clone();
         for equation in &mut out.equations {
-            equation.order = equation.order.partly(values);
-            equation.terms.iter_mut().for_each(|term| term.order = term.order.partly(values));
+            equation.order = equation.order.substitute(values);
+            equation.terms.iter_mut().for_each(|term| term.order = term.order.substitute(values));
         }
         out.bounds.retain(|name, _| !values.contains_key(name));
         out.check()?;
         Ok(out)
     }
 
-    /// The same with some free coefficients replaced by values.
+    /// Substitute values for some free coefficients.
     #[must_use]
     pub fn with_coefficients(&self, values: &BTreeMap<String, f64>) -> Self {
         let mut out = self.clone();
         for equation in &mut out.equations {
-            equation.terms.iter_mut().for_each(|term| term.coefficient = term.coefficient.with(values));
+            equation.terms.iter_mut().for_each(|term| term.coefficient = term.coefficient.substitute(values));
             if let Some(rubs) = &mut equation.friction {
                 for (_, number) in [&mut rubs.coulomb, &mut rubs.stribeck, &mut rubs.speed] {
-                    *number = number.with(values);
+                    *number = number.substitute(values);
                 }
             }
         }
         out
     }
 
-    /// The same with every input acting as it was given.
+    /// Structure without free input parameters.
     #[must_use]
     pub fn without_inputs(&self) -> Self {
         Self { inputs: Vec::new(), ..self.clone() }
     }
 
-    /// Equation number `place` with other terms, bounds of orders that are gone left out.
+    /// Replace equation number `place`, and remove bounds of orders that no longer occur.
     #[must_use]
     pub fn with_equation(&self, place: usize, equation: Equation) -> Self {
         let mut out = self.clone();
@@ -312,17 +308,17 @@ pub(super) fn unique<'a>(names: impl Iterator<Item = &'a String>) -> Vec<String>
     names.filter(|name| seen.insert(*name)).cloned().collect()
 }
 
-/// A number, or an affine function of free orders.
+/// Order of a derivative: a number, or an affine function of free orders.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Order {
     /// Constant part.
     pub constant: f64,
-    /// Weight of each free order, names rising, without zeros.
+    /// Nonzero weight of each free order, sorted by name.
     pub weights: Vec<(String, f64)>,
 }
 
 impl Order {
-    /// A number.
+    /// Order with a fixed value.
     ///
     /// ```
     /// use ftlm::estimation::joint_fit::structure::Order;
@@ -333,13 +329,13 @@ impl Order {
         Self { constant, weights: Vec::new() }
     }
 
-    /// One free order.
+    /// Single free order.
     #[must_use]
     pub fn free(name: &str) -> Self {
         Self { constant: 0.0, weights: vec![(name.to_owned(), 1.0)] }
     }
 
-    /// Free orders that this one depends on.
+    /// Names of the free orders that this order depends on.
     pub fn names(&self) -> impl Iterator<Item = &String> {
         self.weights.iter().map(|(name, _)| name)
     }
@@ -350,28 +346,28 @@ impl Order {
         !self.weights.is_empty()
     }
 
-    /// Whether it is one free order and nothing else.
+    /// True if it is a single free order with weight 1 and no constant.
     #[must_use]
     pub fn is_single(&self) -> bool {
         self.constant == 0.0 && matches!(self.weights.as_slice(), [(_, 1.0)])
     }
 
-    /// Its value where every free order has one; those that have none count 0.
+    /// Value at the given values of the free orders.
     #[must_use]
     pub fn at(&self, value: impl Fn(&str) -> f64) -> f64 {
         self.constant + self.weights.iter().map(|(name, weight)| weight * value(name)).sum::<f64>()
     }
 
-    /// The same with some free orders replaced by values.
+    /// Substitute values for some free orders.
     #[must_use]
-    pub fn partly(&self, values: &BTreeMap<String, f64>) -> Self {
+    pub fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
         let known = self.weights.iter().filter_map(|(name, weight)| values.get(name).map(|value| weight * value));
         let constant = tidy(self.constant + known.sum::<f64>());
         let weights = self.weights.iter().filter(|(name, _)| !values.contains_key(name)).cloned().collect();
         Self { constant, weights }
     }
 
-    /// As the estimators take it, the free orders in this order.
+    /// Form used by the estimators, with the weights in the sequence of `names`.
     #[must_use]
     pub fn affine(&self, names: &[String]) -> AffineOrder {
         let weight = |name: &String| self.weights.iter().find(|(n, _)| n == name).map_or(0.0, |(_, weight)| *weight);

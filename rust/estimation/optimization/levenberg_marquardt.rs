@@ -1,50 +1,50 @@
-//! Nonlinear least squares by Levenberg–Marquardt, for any problem that can say its residuals and their derivatives.
+//! Nonlinear least squares with bounds by Levenberg–Marquardt.
 //!
-//! Columns are scaled by the Jacobian's norms, steps follow from a QR factor of [J | e] with the damping below it, and a
-//! rejected step costs no Jacobian. A problem says itself how a point moves: in which coordinates, and within which bounds.
-//! What stands on a bound and is pushed out of it is left out of step and gradient, so that the rest moves on.
+//! Columns are scaled by the column norms of the Jacobian. Steps follow from a QR factor of [J | e] with the damping
+//! below it. A rejected step costs no Jacobian. The problem defines the coordinates and bounds of its parameters.
+//! Parameters at an active bound are excluded from step and gradient.
 //!
-//! Where Gauss–Newton foretells the fall of the cost badly, what it leaves out is learnt (`Curvature`); along a valley
-//! the search leaps (`Valley`).
+//! If Gauss–Newton predicts the decrease of the cost badly, secant updates of the second-order part are used. Along an
+//! ill-conditioned valley, several steps are extrapolated.
 //!
-//! A minimum is where the gradient vanishes, and nothing else is called one: the cosine between the residuals and every
-//! column that is free to move, the relative offset of Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
+//! Convergence means a vanishing gradient: the cosine between the residuals and every free column, as in Dennis &
+//! Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
 pub use super::damped_step::Problem;
 
-use super::damped_step::{Curvature, Linear, Valley, LEAST_DAMPING};
+use super::damped_step::{Curvature, LinearizedProblem, ValleyExtrapolation, MIN_DAMPING};
 use crate::error::{check_length, Error, Result};
 
-/// Damping of the first step: near Gauss–Newton's, yet safe where a start is some tens of percent off.
-const FIRST_DAMPING: f64 = 1e-3;
-/// Damping beyond which a step is shorter than rounding.
-const LARGEST_DAMPING: f64 = 1e12;
-/// A step as good as its prediction lowers the damping by this factor, a rejected one raises it by as much.
-const FACTOR: f64 = 10.0;
-/// Share of the predicted fall of the cost that a step reaches whose damping is right.
-const FAIR: f64 = 0.25;
-/// Residuals that are differences of signals carry rounding of this share of them at most, once no step lowers the cost.
-const ROUNDING: f64 = 1e-10;
+/// Damping of the first step: close to Gauss–Newton, but safe for an initial guess that is off by some tens of percent.
+const INITIAL_DAMPING: f64 = 1e-3;
+/// Damping above which a step is at rounding level.
+const MAX_DAMPING: f64 = 1e12;
+/// Factor by which an accurately predicted step decreases the damping and a rejected step increases it.
+const DAMPING_FACTOR: f64 = 10.0;
+/// Ratio of actual to predicted decrease of the cost above which the damping is decreased.
+const ACCEPTABLE_GAIN_RATIO: f64 = 0.25;
+/// Rounding error of the residuals relative to the signals, for the convergence test if no step decreases the cost.
+const RELATIVE_ROUNDING_ERROR: f64 = 1e-10;
 
-/// Where the search for the optimum ended.
+/// Reason of termination.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
-    /// The gradient is zero, but for what pushes out of a bound and for rounding.
+    /// The gradient is zero up to rounding, except at active bounds.
     Converged,
-    /// The last allowed evaluation still moved.
+    /// The budget of evaluations is exhausted.
     Exhausted,
-    /// No step lowers the cost although the gradient is not zero.
+    /// No step decreases the cost although the gradient is not zero.
     Stalled,
-    /// The way down leads where the problem has no value, or none that may be trusted.
-    Wall,
+    /// The descent direction leaves the domain of the problem: the value is not finite or not admissible.
+    DomainLimit,
 }
 
-/// How long to search.
+/// Termination criteria.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Most evaluations of the residuals; 0 for those of the start without their derivatives.
+    /// Maximum number of residual evaluations; 0 for the residuals of the initial guess without derivatives.
     pub evaluations: usize,
-    /// Share of the cost by which a Gauss–Newton step lowers it at a minimum, and so the square of the gradient's cosine.
+    /// Relative decrease of the cost by a Gauss–Newton step at convergence: the square of the cosine of the gradient.
     pub tolerance: f64,
 }
 
@@ -54,7 +54,7 @@ impl Default for Settings {
     }
 }
 
-/// A minimum, or where the search for it ended.
+/// Result of a minimization.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Minimum<P, E> {
     /// The best point.
@@ -63,11 +63,11 @@ pub struct Minimum<P, E> {
     pub evaluation: E,
     /// Half the sum of squared residuals.
     pub cost: f64,
-    /// Derivatives of the residuals there, one column a parameter; none where only residuals were asked for.
+    /// Derivatives of the residuals, one column per parameter; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Reason of termination.
     pub status: Status,
 }
 
@@ -76,11 +76,12 @@ fn cost(residuals: &[f64]) -> f64 {
     0.5 * residuals.iter().map(|e| e * e).sum::<f64>()
 }
 
-/// Minimises half the sum of squared residuals from a start. An evaluation costs what the problem says, a step O(k² N)
-/// for k parameters and N residuals.
+/// Minimize half the sum of squared residuals from an initial guess.
+///
+/// A step costs O(k² N) for k parameters and N residuals, in addition to the evaluations.
 ///
 /// # Errors
-/// As the problem's own at the start; [`Error::Length`] for columns of the Jacobian that do not match the residuals.
+/// Those of the problem at the initial guess; [`Error::Length`] for a Jacobian that does not match the residuals.
 ///
 /// ```
 /// use ftlm::error::Result;
@@ -102,18 +103,18 @@ fn cost(residuals: &[f64]) -> f64 {
 ///     fn jacobian(&self, x: &f64, _: &[f64; 1]) -> Result<Vec<Vec<f64>>> {
 ///         Ok(vec![vec![2.0 * x]])
 ///     }
-///     fn moved(&self, x: &f64, steps: &[f64]) -> (f64, f64) {
+///     fn apply_step(&self, x: &f64, steps: &[f64]) -> (f64, f64) {
 ///         (x + steps[0], steps[0].abs())
 ///     }
 /// }
 ///
 /// # fn main() -> Result<()> {
-/// let found = minimise(&Root, 1.0, Settings::default())?;
+/// let found = minimize(&Root, 1.0, Settings::default())?;
 /// assert!((found.point - 2.0_f64.sqrt()).abs() < 1e-9);
 /// # Ok(())
 /// # }
 /// ```
-pub fn minimise<P: Problem>(
+pub fn minimize<P: Problem>(
     problem: &P,
     start: P::Point,
     settings: Settings,
@@ -121,41 +122,41 @@ pub fn minimise<P: Problem>(
     let mut search = Search { problem, settings, evaluations: 1, gain: f64::INFINITY, hit: false, corners: false };
     let mut at = search.start(start)?;
     if settings.evaluations == 0 {
-        return Ok(at.ended(1, Status::Exhausted));
+        return Ok(at.into_minimum(1, Status::Exhausted));
     }
-    at.jacobian = search.slopes(&at.point, &at.evaluation)?;
-    let mut valley = Valley::new();
+    at.jacobian = search.checked_jacobian(&at.point, &at.evaluation)?;
+    let mut valley = ValleyExtrapolation::new();
     loop {
         let ended = match search.advance(&mut at)? {
             Advance::Moved(step, gain) => {
-                valley.moved(&step, gain);
+                valley.record_step(&step, gain);
                 None
             }
             Advance::Ended(status) => Some(status),
         };
         if let Some(before) = valley.outcome(at.cost, search.evaluations, ended.is_some()) {
             at = before;
-            search.anew();
+            search.reset_progress();
             continue;
         }
         if let Some(status) = ended {
-            return Ok(at.ended(search.evaluations, status));
+            return Ok(at.into_minimum(search.evaluations, status));
         }
-        let left = if problem.leaps() { settings.evaluations - search.evaluations } else { 0 };
-        if let Some(leap) = valley.leap(left) {
-            if let Some(there) = search.landed(&at, &leap)? {
+        let left = if problem.allows_extrapolation() { settings.evaluations - search.evaluations } else { 0 };
+        if let Some(leap) = valley.propose_step(left) {
+            if let Some(there) = search.evaluate_extrapolation(&at, &leap)? {
                 let from = at.cost;
-                valley.left(std::mem::replace(&mut at, there), from, search.evaluations);
-                search.anew();
+                valley.begin_trial(std::mem::replace(&mut at, there), from, search.evaluations);
+                search.reset_progress();
             } else {
-                valley.fell();
+                valley.reject_trial();
             }
         }
     }
 }
 
-/// A point with all that the next step from it is made of.
-struct At<P: Problem> {
+/// State of the iteration: point, evaluation, Jacobian, damping and curvature.
+struct SearchState<P: Problem> {
     point: P::Point,
     evaluation: P::Evaluation,
     cost: f64,
@@ -167,60 +168,60 @@ struct At<P: Problem> {
     before: Option<(Vec<f64>, Vec<f64>)>,
 }
 
-impl<P: Problem> At<P> {
-    fn ended(self, evaluations: usize, status: Status) -> Minimum<P::Point, P::Evaluation> {
+impl<P: Problem> SearchState<P> {
+    fn into_minimum(self, evaluations: usize, status: Status) -> Minimum<P::Point, P::Evaluation> {
         let Self { point, evaluation, cost, jacobian, .. } = self;
         Minimum { point, evaluation, cost, jacobian, evaluations, status }
     }
 }
 
-/// What one step came to: its coordinates and the share of the cost that fell, or the end.
+/// Result of one iteration: the step in coordinates and its relative decrease of the cost, or termination.
 enum Advance {
     Moved(Vec<f64>, f64),
     Ended(Status),
 }
 
-/// What a search knows beside where it is.
+/// Settings and progress of a minimization.
 struct Search<'a, P> {
     problem: &'a P,
     settings: Settings,
     evaluations: usize,
-    /// Share of the cost by which the last step lowered it.
+    /// Relative decrease of the cost by the last step.
     gain: f64,
-    /// Whether the last step that was tried led where there is no value.
+    /// True if the last trial step left the domain of the problem.
     hit: bool,
-    /// Whether parameters stay that have corners.
+    /// True if parameters with kinks are kept fixed.
     corners: bool,
 }
 
 impl<P: Problem> Search<'_, P> {
-    fn slopes(&self, point: &P::Point, evaluation: &P::Evaluation) -> Result<Vec<Vec<f64>>> {
+    fn checked_jacobian(&self, point: &P::Point, evaluation: &P::Evaluation) -> Result<Vec<Vec<f64>>> {
         let jacobian = self.problem.jacobian(point, evaluation)?;
         let rows = self.problem.residuals(evaluation).len();
         jacobian.iter().try_for_each(|column| check_length("column of the Jacobian", rows, column.len()))?;
         Ok(jacobian)
     }
 
-    /// The start, without its derivatives.
-    fn start(&self, start: P::Point) -> Result<At<P>> {
+    /// Evaluate the initial guess, without derivatives.
+    fn start(&self, start: P::Point) -> Result<SearchState<P>> {
         let evaluation = self.problem.evaluate(&start)?;
-        let point = self.problem.settled(&evaluation, start);
-        let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.trusted(&point));
-        let (damping, curvature) = (FIRST_DAMPING, Curvature::new(0));
-        Ok(At { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
+        let point = self.problem.point_of_evaluation(&evaluation, start);
+        let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.is_admissible(&point));
+        let (damping, curvature) = (INITIAL_DAMPING, Curvature::new(0));
+        Ok(SearchState { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
     }
 
-    /// Forgets how the last steps went.
-    fn anew(&mut self) {
+    /// Reset the progress of the last steps.
+    fn reset_progress(&mut self) {
         (self.gain, self.hit) = (f64::INFINITY, false);
     }
 
-    /// Where a leap leads, in coordinates; none where the problem has no value or none that may be trusted.
-    fn landed(&mut self, from: &At<P>, leap: &[f64]) -> Result<Option<At<P>>> {
-        let next = self.problem.moved(&from.point, leap).0;
+    /// Evaluate an extrapolation step; None if it leaves the domain of the problem.
+    fn evaluate_extrapolation(&mut self, from: &SearchState<P>, leap: &[f64]) -> Result<Option<SearchState<P>>> {
+        let next = self.problem.apply_step(&from.point, leap).0;
         self.evaluations += 1;
         let made = self.start(next).and_then(|mut there| {
-            there.jacobian = self.slopes(&there.point, &there.evaluation)?;
+            there.jacobian = self.checked_jacobian(&there.point, &there.evaluation)?;
             Ok(there)
         });
         match made {
@@ -230,65 +231,76 @@ impl<P: Problem> Search<'_, P> {
         }
     }
 
-    /// One step that lowers the cost, or why there is none.
-    fn advance(&mut self, at: &mut At<P>) -> Result<Advance> {
+    /// Make one step that decreases the cost, or return the reason of termination.
+    fn advance(&mut self, at: &mut SearchState<P>) -> Result<Advance> {
         let (problem, settings) = (self.problem, self.settings);
-        // The gradient's cosine at a minimum: its square is a share of the cost.
+        // Cosine of the gradient at convergence; its square is a relative decrease of the cost.
         let flat = settings.tolerance.max(f64::EPSILON).sqrt();
         loop {
             if self.evaluations >= settings.evaluations {
                 return Ok(Advance::Ended(Status::Exhausted));
             }
-            let linear = Linear::at(problem, &at.point, &at.jacobian, problem.residuals(&at.evaluation), self.corners);
+            let linear = LinearizedProblem::at(
+                problem,
+                &at.point,
+                &at.jacobian,
+                problem.residuals(&at.evaluation),
+                self.corners,
+            );
             if at.curvature.is_for(at.jacobian.len()) {
                 if let Some((taken, gradient)) = at.before.take() {
                     let now = linear.gradient_by_parameter();
                     let change: Vec<f64> = now.iter().zip(&gradient).map(|(a, b)| a - b).collect();
-                    at.curvature.learn(&taken, &change, &linear.columns_along(&taken));
+                    at.curvature.update(&taken, &change, &linear.columns_along(&taken));
                 }
             } else {
                 at.curvature = Curvature::new(at.jacobian.len());
             }
-            let slope = linear.slope();
+            let slope = linear.max_gradient();
             let level = slope <= flat * linear.norm;
-            let (newton, falls) = linear.step(LEAST_DAMPING);
-            let nowhere = problem.moved(&at.point, &linear.unscaled(&newton)).1 <= settings.tolerance;
-            // A flat gradient along a valley may still have far to go: a whole step says so, unless none has led anywhere.
+            let (newton, falls) = linear.damped_step_and_decrease(MIN_DAMPING);
+            let nowhere = problem.apply_step(&at.point, &linear.to_coordinates(&newton)).1 <= settings.tolerance;
+            // In a valley a small gradient can still be far from the minimum: check the predicted decrease as well.
             if nowhere || (level && (falls <= settings.tolerance || self.gain <= settings.tolerance)) {
                 return Ok(Advance::Ended(Status::Converged));
             }
             if self.gain <= settings.tolerance && self.hit {
-                return Ok(Advance::Ended(Status::Wall));
+                return Ok(Advance::Ended(Status::DomainLimit));
             }
             self.hit = false;
-            match self.lowered(at, &linear, (slope, level))? {
+            match self.find_descent_step(at, &linear, (slope, level))? {
                 Some(advance) => return Ok(advance),
-                // What has corners stays, and the rest goes on.
-                None => (self.corners, at.damping, self.gain) = (true, FIRST_DAMPING, f64::INFINITY),
+                // Fix the parameters with kinks and continue with the others.
+                None => (self.corners, at.damping, self.gain) = (true, INITIAL_DAMPING, f64::INFINITY),
             }
         }
     }
 
-    /// Steps ever shorter until one lowers the cost; none where parameters with corners are to stay first.
-    fn lowered(&mut self, at: &mut At<P>, linear: &Linear, (slope, level): (f64, bool)) -> Result<Option<Advance>> {
+    /// Shorten the step until it decreases the cost; None if parameters with kinks must be fixed first.
+    fn find_descent_step(
+        &mut self,
+        at: &mut SearchState<P>,
+        linear: &LinearizedProblem,
+        (slope, level): (f64, bool),
+    ) -> Result<Option<Advance>> {
         let (problem, settings) = (self.problem, self.settings);
         loop {
-            let curved = if at.curvature.used { linear.curved_step(at.damping, &at.curvature) } else { None };
-            if at.curvature.used && curved.is_none() && at.damping <= LARGEST_DAMPING {
-                at.damping *= FACTOR;
+            let curved = if at.curvature.is_used { linear.curved_step(at.damping, &at.curvature) } else { None };
+            if at.curvature.is_used && curved.is_none() && at.damping <= MAX_DAMPING {
+                at.damping *= DAMPING_FACTOR;
                 continue;
             }
-            let first = if curved.is_some() { linear.projected } else { 0 };
-            let (step, falls) = curved.unwrap_or_else(|| linear.step(at.damping));
-            let steps = linear.unscaled(&step);
-            let (next, moved) = problem.moved(&at.point, &steps);
-            if moved <= settings.tolerance || at.damping > LARGEST_DAMPING {
-                // No step lowers the cost any more: at its bottom, for rounding, at a wall or at a corner.
-                return Ok(if level || slope <= ROUNDING * problem.size(&at.evaluation) {
+            let first = if curved.is_some() { linear.eliminated_count } else { 0 };
+            let (step, falls) = curved.unwrap_or_else(|| linear.damped_step_and_decrease(at.damping));
+            let steps = linear.to_coordinates(&step);
+            let (next, moved) = problem.apply_step(&at.point, &steps);
+            if moved <= settings.tolerance || at.damping > MAX_DAMPING {
+                // No step decreases the cost: converged, at rounding level, at the domain limit or at a kink.
+                return Ok(if level || slope <= RELATIVE_ROUNDING_ERROR * problem.signal_norm(&at.evaluation) {
                     Some(Advance::Ended(Status::Converged))
                 } else if self.hit {
-                    Some(Advance::Ended(Status::Wall))
-                } else if !self.corners && (0..linear.scales.len()).any(|i| problem.kinked(&at.point, i)) {
+                    Some(Advance::Ended(Status::DomainLimit))
+                } else if !self.corners && (0..linear.scales.len()).any(|i| problem.has_kinks(&at.point, i)) {
                     None
                 } else {
                     Some(Advance::Ended(Status::Stalled))
@@ -298,8 +310,8 @@ impl<P: Problem> Search<'_, P> {
                 return Ok(Some(Advance::Ended(Status::Exhausted)));
             }
             self.evaluations += 1;
-            let trusts = problem.trusted(&next);
-            // A step that lowers nothing, or leaves the numbers, is shortened.
+            let trusts = problem.is_admissible(&next);
+            // A step that does not decrease the cost or overflows is shortened.
             let tried = problem.evaluate(&next).and_then(|found| {
                 let reached = cost(problem.residuals(&found));
                 if !reached.is_finite() || (at.trusted && !trusts) {
@@ -308,19 +320,19 @@ impl<P: Problem> Search<'_, P> {
                 if reached >= at.cost {
                     return Ok(None);
                 }
-                let settled = problem.settled(&found, next.clone());
-                Ok(Some((self.slopes(&settled, &found)?, found, reached, settled)))
+                let settled = problem.point_of_evaluation(&found, next.clone());
+                Ok(Some((self.checked_jacobian(&settled, &found)?, found, reached, settled)))
             });
             match tried {
                 Ok(Some((slopes, found, reached, next))) => {
                     self.gain = (at.cost - reached) / at.cost.max(f64::MIN_POSITIVE);
                     (at.point, at.evaluation, at.cost, at.jacobian, at.trusted) =
                         (next, found, reached, slopes, trusts);
-                    let told = linear.falls(&step, first);
-                    at.curvature.judge(told, told - linear.bent(&step, &at.curvature), self.gain);
+                    let told = linear.predicted_decrease(&step, first);
+                    at.curvature.select_model(told, told - linear.curvature_change(&step, &at.curvature), self.gain);
                     at.before = Some((steps.clone(), linear.gradient_by_parameter()));
-                    if self.gain >= FAIR * falls {
-                        at.damping = (at.damping / FACTOR).max(LEAST_DAMPING);
+                    if self.gain >= ACCEPTABLE_GAIN_RATIO * falls {
+                        at.damping = (at.damping / DAMPING_FACTOR).max(MIN_DAMPING);
                     }
                     return Ok(Some(Advance::Moved(steps, self.gain)));
                 }
@@ -328,7 +340,7 @@ impl<P: Problem> Search<'_, P> {
                 Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => self.hit = true,
                 Err(error) => return Err(error),
             }
-            at.damping *= FACTOR;
+            at.damping *= DAMPING_FACTOR;
         }
     }
 }

@@ -1,5 +1,6 @@
-//! What the evaluations of one search have in common: kernels of orders that stay, their spectra, and of runs on one grid
-//! whatever does not depend on the run.
+//! Cache of kernels and spectra across the evaluations of one optimization.
+//!
+//! Kernels of unchanged orders, their spectra, and everything shared by runs on one grid are computed once.
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -7,36 +8,39 @@ use std::rc::Rc;
 
 use super::experiment::Experiment;
 use super::parameterization::FreeModel;
-use super::system_inverse::{filtered_spectrum, Filter, Means, Operator, Power, Solved, FACTORS, KEPT_PULSES};
+use super::system_inverse::{
+    filtered_spectrum, InitialTerm, Operator, PulseMeans, SeriesFilter, SystemInverse, MAX_CACHED_PULSES,
+    SPECTRUM_FACTORS,
+};
 use crate::error::Result;
 use crate::regressors::Record;
 use crate::series::Kernel;
 
-/// Powers of t that are kept of long records and of others.
-const FEW_POWERS: usize = 8;
-const MANY_POWERS: usize = 64;
+/// Maximum number of cached powers of t for long records, and for others.
+const MAX_POWERS_LONG_RECORD: usize = 8;
+const MAX_POWERS_SHORT_RECORD: usize = 64;
 
-/// Runs of one grid are this share as long as the longest at least: shorter ones would pay for transforms of its length.
-const AS_LONG: f64 = 0.7;
+/// Smallest length of a run relative to the longest on its grid; shorter runs would need unnecessarily long transforms.
+const MIN_LENGTH_RATIO: f64 = 0.7;
 
-/// What runs of one step and one filter share: kernels, powers of t, and A⁻¹ at the last point, as long as the longest.
-struct Grid {
-    /// A record of nothing, as long as the longest.
+/// Cache of runs with the same step and filter: kernels, powers of t, and A⁻¹ at the last point, for the longest run.
+struct GridCache {
+    /// Zero record of the length of the longest run.
     bare: Record,
-    /// The filter that all its signals pass.
-    filter: Option<Rc<Filter>>,
+    /// Sensor filter of all signals.
+    filter: Option<Rc<SeriesFilter>>,
     runs: usize,
     /// The last operator of each term of each equation.
     operators: HashMap<(usize, usize), Rc<Operator>>,
-    /// Powers of t that initial terms bring, by the bits of their exponents.
-    powers: HashMap<u64, Rc<Power>>,
-    /// What the last equations were, by the bits of their own terms, and their inverse.
-    solved: Option<(Vec<u64>, Rc<Solved>)>,
+    /// Initial terms t^e, by the bits of their exponents.
+    powers: HashMap<u64, Rc<InitialTerm>>,
+    /// Inverse of the last equations, with the bits of their autoregressive terms as key.
+    solved: Option<(Vec<u64>, Rc<SystemInverse>)>,
 }
 
-impl Grid {
-    /// Whether an experiment is on the grid of a longer one.
-    fn holds(&self, experiment: &Experiment) -> bool {
+impl GridCache {
+    /// True if an experiment can share the cache of a longer one.
+    fn accepts(&self, experiment: &Experiment) -> bool {
         let record = &experiment.record;
         let filters = match (self.bare.filter(), record.filter()) {
             (None, None) => true,
@@ -47,41 +51,42 @@ impl Grid {
         filters
             && self.bare.step().to_bits() == record.step().to_bits()
             && record.m() <= long
-            && record.m() as f64 >= AS_LONG * long as f64
+            && record.m() as f64 >= MIN_LENGTH_RATIO * long as f64
     }
 }
 
-/// What stays of one experiment from one evaluation to the next.
-pub(crate) struct Shelf {
-    grid: Rc<RefCell<Grid>>,
-    /// Points of every series that is multiplied, in all factors together.
+/// Cache of one experiment across evaluations.
+pub(crate) struct EvaluationCache {
+    grid: Rc<RefCell<GridCache>>,
+    /// Length of the spectra.
     pub(crate) total: usize,
-    /// Spectra of signals that drive and have no free number.
-    drivers: HashMap<(usize, bool), Rc<Kernel>>,
-    /// Weighted samples of impulses that the filter of an output gets, by output and the bits of their exponents.
+    /// Spectra of inputs without a free parameter.
+    input_spectra: HashMap<(usize, bool), Rc<Kernel>>,
+    /// Impulses at the sensor filters in weighted samples, by output and the bits of their exponents.
     impulses: HashMap<(usize, u64), Vec<f64>>,
 }
 
-impl Shelf {
-    /// One for each experiment; what is on one grid shares it.
+impl EvaluationCache {
+    /// One cache per experiment; experiments on the same grid share a part of it.
     ///
     /// # Errors
     /// As [`Record::new`].
     pub(crate) fn of(experiments: &[Experiment]) -> Result<Vec<Self>> {
         let mut longest: Vec<usize> = (0..experiments.len()).collect();
         longest.sort_by_key(|&k| std::cmp::Reverse(experiments[k].record.m()));
-        let mut grids: Vec<Rc<RefCell<Grid>>> = Vec::new();
-        let mut places: Vec<(usize, Rc<RefCell<Grid>>)> = Vec::with_capacity(experiments.len());
+        let mut grids: Vec<Rc<RefCell<GridCache>>> = Vec::new();
+        let mut places: Vec<(usize, Rc<RefCell<GridCache>>)> = Vec::with_capacity(experiments.len());
         for k in longest {
-            let grid = match grids.iter().find(|grid| grid.borrow().holds(&experiments[k])) {
+            let grid = match grids.iter().find(|grid| grid.borrow().accepts(&experiments[k])) {
                 Some(known) => known.clone(),
                 None => {
                     let record = &experiments[k].record;
                     let bare =
                         Record::new(record.step(), vec![vec![0.0; record.m()]], record.filter().map(<[f64]>::to_vec))?;
-                    let filter = record.filter().map(|series| Rc::new(Filter::new(series)));
+                    let filter = record.filter().map(|series| Rc::new(SeriesFilter::new(series)));
                     let (operators, powers) = (HashMap::new(), HashMap::new());
-                    let grid = Rc::new(RefCell::new(Grid { bare, filter, runs: 0, operators, powers, solved: None }));
+                    let grid =
+                        Rc::new(RefCell::new(GridCache { bare, filter, runs: 0, operators, powers, solved: None }));
                     grids.push(grid.clone());
                     grid
                 }
@@ -90,25 +95,27 @@ impl Shelf {
             places.push((k, grid));
         }
         places.sort_by_key(|(k, _)| *k);
-        let shelf = |(_, grid): (usize, Rc<RefCell<Grid>>)| {
-            let total = FACTORS * grid.borrow().bare.m();
-            Self { grid, total, drivers: HashMap::new(), impulses: HashMap::new() }
+        let shelf = |(_, grid): (usize, Rc<RefCell<GridCache>>)| {
+            let total = SPECTRUM_FACTORS * grid.borrow().bare.m();
+            Self { grid, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
         };
         Ok(places.into_iter().map(shelf).collect())
     }
 
-    /// Answers to the powers t^e of equations, each with `m` pulses of `n` unknowns or more.
+    /// Responses to the initial terms t^e of equations, each with at least `m` pulses of `n` outputs.
     ///
     /// # Errors
-    /// As [`Solved::natural`].
-    pub(crate) fn natural(
+    /// As [`SystemInverse::initial_term_responses`].
+    pub(crate) fn initial_term_responses(
         &self,
-        solved: &Solved,
+        solved: &SystemInverse,
         (n, m): (usize, usize),
         terms: &[(usize, f64)],
-    ) -> Result<Vec<Rc<Means>>> {
-        let shared = self.shared();
-        solved.natural((n, if shared { self.pulses() } else { m }), terms, shared, |exponent| self.power(exponent))
+    ) -> Result<Vec<Rc<PulseMeans>>> {
+        let shared = self.is_shared();
+        solved.initial_term_responses((n, if shared { self.pulses() } else { m }), terms, shared, |exponent| {
+            self.initial_term(exponent)
+        })
     }
 
     /// Pulses of the longest run on the grid.
@@ -116,38 +123,42 @@ impl Shelf {
         self.grid.borrow().bare.m()
     }
 
-    /// Whether other runs are on the grid.
-    fn shared(&self) -> bool {
+    /// True if other runs are on the grid.
+    fn is_shared(&self) -> bool {
         self.grid.borrow().runs > 1
     }
 
-    /// The operator of a term that is integrated by `eta`; its order may be free.
+    /// Operator of a term of integration order `eta`.
     pub(crate) fn operator(&self, place: (usize, usize), eta: f64, free: bool) -> Rc<Operator> {
         let mut grid = self.grid.borrow_mut();
         if let Some(known) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
             return known.clone();
         }
         let (m, step) = (grid.bare.m(), grid.bare.step());
-        // Terms of one order are integrated alike, whatever they are of.
-        let alike = grid.operators.values().find(|o| o.serves(eta, free)).cloned();
+        // Terms of the same order share an operator.
+        let alike = grid.operators.values().find(|o| o.matches_order(eta, free)).cloned();
         let made = alike.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
         grid.operators.insert(place, made.clone());
         made
     }
 
-    /// The equations whose own terms have these bits, or what is made of them.
+    /// Inverse of the equations with these bits of autoregressive terms, computed by `made` if not cached.
     ///
     /// # Errors
     /// Those of `made`.
-    pub(crate) fn solved(&self, bits: Vec<u64>, made: impl FnOnce() -> Result<Solved>) -> Result<Rc<Solved>> {
+    pub(crate) fn system_inverse(
+        &self,
+        bits: Vec<u64>,
+        made: impl FnOnce() -> Result<SystemInverse>,
+    ) -> Result<Rc<SystemInverse>> {
         let known = self.grid.borrow().solved.as_ref().filter(|(known, _)| *known == bits).map(|(_, s)| s.clone());
         match known {
             Some(solved) => Ok(solved),
             None => {
-                // What is past frees its memory before what follows takes its own.
+                // Free the memory of the old inverse before computing the new one.
                 self.grid.borrow_mut().solved = None;
                 let solved = Rc::new(made()?);
-                if self.shared() {
+                if self.is_shared() {
                     self.grid.borrow_mut().solved = Some((bits, solved.clone()));
                 }
                 Ok(solved)
@@ -155,8 +166,9 @@ impl Shelf {
         }
     }
 
-    /// The spectrum of a signal that drives a term integrated by `eta`, for products of [`FACTORS`] series; of what an actuator makes of it.
-    pub(crate) fn driver(
+    /// Spectrum of the input of a term of integration order `eta`, after its input nonlinearity, for products of
+    /// [`SPECTRUM_FACTORS`] series.
+    pub(crate) fn input_spectrum(
         &mut self,
         model: &FreeModel,
         experiment: &Experiment,
@@ -166,51 +178,53 @@ impl Shelf {
         if let Some(law) = model.law_of(signal) {
             return self.spectrum(&acted[law].0);
         }
-        let series = experiment.record.driver(signal, eta);
-        if experiment.record.m() > KEPT_PULSES {
+        let series = experiment.record.term_signal(signal, eta);
+        if experiment.record.m() > MAX_CACHED_PULSES {
             return self.spectrum(series);
         }
         let total = self.total;
         let made = || Rc::new(Kernel::with_length(series, total));
-        self.drivers.entry((signal, eta < 0.0)).or_insert_with(made).clone()
+        self.input_spectra.entry((signal, eta < 0.0)).or_insert_with(made).clone()
     }
 
-    /// Of a series, for products of [`FACTORS`] of them.
+    /// Spectrum of a series, for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn spectrum(&self, series: &[f64]) -> Rc<Kernel> {
         Rc::new(Kernel::with_length(series, self.total))
     }
 
-    /// What an initial term t^e adds, as long as the longest run.
-    pub(crate) fn power(&self, exponent: f64) -> Rc<Power> {
+    /// Initial term t^e, of the length of the longest run.
+    pub(crate) fn initial_term(&self, exponent: f64) -> Rc<InitialTerm> {
         let mut grid = self.grid.borrow_mut();
-        // Exponents that move with free orders would fill the shelf.
-        if grid.powers.len() > if grid.bare.m() > KEPT_PULSES { FEW_POWERS } else { MANY_POWERS } {
+        // Exponents that change with free orders would fill the cache.
+        if grid.powers.len()
+            > if grid.bare.m() > MAX_CACHED_PULSES { MAX_POWERS_LONG_RECORD } else { MAX_POWERS_SHORT_RECORD }
+        {
             grid.powers.clear();
         }
         if let Some(known) = grid.powers.get(&exponent.to_bits()) {
             return known.clone();
         }
-        let made = Rc::new(Power::new(exponent, grid.bare.m(), grid.bare.step(), grid.filter.clone()));
+        let made = Rc::new(InitialTerm::new(exponent, grid.bare.m(), grid.bare.step(), grid.filter.clone()));
         grid.powers.insert(exponent.to_bits(), made.clone());
         made
     }
 
-    /// What the filter makes of a series that is no signal of the record.
-    pub(crate) fn filtered(&self, series: &[f64]) -> Vec<f64> {
-        self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.of(series))
+    /// Filter a series that is no signal of the record.
+    pub(crate) fn filter_series(&self, series: &[f64]) -> Vec<f64> {
+        self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.apply(series))
     }
 
-    /// Its spectrum, for a product with one more series.
+    /// Spectrum of the filtered series, for a product with one more series.
     pub(crate) fn filtered_spectrum(&self, series: &[f64]) -> Rc<Kernel> {
         Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref(), self.total))
     }
 
-    /// Weighted samples of an impulse, or of a derivative of one, that only the filter of an output gets.
-    pub(crate) fn impulse(&mut self, experiment: &Experiment, output: usize, exponent: f64) -> Vec<f64> {
+    /// Samples of the response of the sensor filter of an output to an impulse or its derivative, weighted.
+    pub(crate) fn impulse_samples(&mut self, experiment: &Experiment, output: usize, exponent: f64) -> Vec<f64> {
         let made = || {
             let mut means = vec![vec![0.0; experiment.record.m()]; experiment.samples.len()];
             means[output] = experiment.record.initial_term(exponent);
-            experiment.sampled(&means)
+            experiment.weighted_samples(&means)
         };
         self.impulses.entry((output, exponent.to_bits())).or_insert_with(made).clone()
     }

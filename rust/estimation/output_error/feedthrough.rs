@@ -1,36 +1,37 @@
-//! Direct feed-through: what a term of its equation's own order adds to an output at once.
+//! Direct feedthrough: the instantaneous effect of a term whose order equals that of its equation.
 //!
-//! A sample is read after the inputs of its instant act: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without what
-//! feeds through. The mean of the pulses on either side of t holds G times the mean of s on either side, so it lacks G δ
-//! with δ = s(t⁺) less that mean: half a jump of a held signal, a quarter of the second difference of a linear one.
+//! A sample is taken after its input acts: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without feedthrough. The
+//! mean of the pulses on either side of t contains G times the mean of s on either side. The correction is G δ, with δ
+//! the difference of s(t⁺) and that mean: half a jump of a zero-order hold, a quarter of the second difference of a
+//! linearly interpolated signal.
 
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, Point};
 use crate::equation::Structure;
 use crate::error::Result;
-use crate::fractional::kernels::first;
+use crate::fractional::kernels::first_coefficient;
 use crate::linalg::small;
 
-/// Orders closer than this are the same: the term integrates nothing.
-pub(crate) const AT_ONCE: f64 = 1e-9;
+/// Difference of the orders of term and equation below which a term has direct feedthrough.
+pub(crate) const FEEDTHROUGH_ORDER_TOLERANCE: f64 = 1e-9;
 
-/// What feeds through in one experiment.
-pub(crate) struct Direct {
-    /// (I − C)⁻¹ with C the gains between simulated outputs, row by row; none where outputs do not drive each other at once.
-    between: Option<Vec<f64>>,
-    /// δ of each signal that drives an output at once, and its derivative with respect to its free number.
-    lacking: Vec<Option<(Vec<f64>, Vec<f64>)>>,
-    /// Whether each term of each equation feeds through.
+/// Direct feedthrough of one experiment.
+pub(crate) struct Feedthrough {
+    /// (I − C)⁻¹ with C the feedthrough gains between outputs, row-major; None without such gains.
+    coupling_inverse: Option<Vec<f64>>,
+    /// δ of each input with feedthrough, and its derivative with respect to its free parameter.
+    deviations: Vec<Option<(Vec<f64>, Vec<f64>)>>,
+    /// True for terms with feedthrough, by equation.
     terms: Vec<Vec<bool>>,
     /// (I − C)⁻¹ B δ by output and sample, unweighted.
     values: Vec<Vec<f64>>,
 }
 
-impl Direct {
-    /// What feeds through at a point; none where no term does.
+impl Feedthrough {
+    /// Feedthrough at a point; None without such terms.
     ///
     /// # Errors
-    /// [`crate::error::Error::LeadingZero`] where the equations contradict each other at once.
+    /// [`crate::error::Error::LeadingZero`] if the algebraic loop between the outputs is singular.
     pub(crate) fn of(
         model: &FreeModel,
         experiment: &Experiment,
@@ -40,7 +41,7 @@ impl Direct {
     ) -> Result<Option<Self>> {
         let terms: Vec<Vec<bool>> = structures
             .iter()
-            .map(|s| s.terms.iter().map(|term| (s.order - term.order).abs() < AT_ONCE).collect())
+            .map(|s| s.terms.iter().map(|term| (s.order - term.order).abs() < FEEDTHROUGH_ORDER_TOLERANCE).collect())
             .collect();
         if !terms.iter().flatten().any(|&at_once| at_once) {
             return Ok(None);
@@ -51,27 +52,27 @@ impl Direct {
         (0..n).for_each(|i| between[i * n + i] = 1.0);
         for (i, (structure, row)) in structures.iter().zip(&terms).enumerate() {
             for (k, term) in structure.terms.iter().enumerate().filter(|(k, _)| row[*k]) {
-                if let Some(j) = model.unknown(i, term.signal) {
+                if let Some(j) = model.output_index(i, term.signal) {
                     between[i * n + j] -= model.equations[i].terms[k].2.at(&point.coefficients);
                 } else if lacking[term.signal].is_none() {
                     lacking[term.signal] = Some(match model.law_of(term.signal) {
-                        Some(d) => experiment.lacking_behind(term.signal, &acted[d]),
-                        None => (experiment.lacking(term.signal), Vec::new()),
+                        Some(d) => experiment.input_point_deviation(term.signal, &acted[d]),
+                        None => (experiment.point_deviation(term.signal), Vec::new()),
                     });
                 }
             }
         }
         let coupled = (0..n * n).any(|at| at % (n + 1) != 0 && between[at] != 0.0);
         let between = if coupled { Some(small::inverse(&between, n)?) } else { None };
-        let mut direct = Self { between, lacking, terms, values: Vec::new() };
-        let mut driven = vec![vec![0.0; experiment.compared()]; n];
-        direct.add_driven(model, &mut driven, |i, k| model.equations[i].terms[k].2.at(&point.coefficients), |l| &l.0);
-        direct.values = direct.through(driven);
+        let mut direct = Self { coupling_inverse: between, deviations: lacking, terms, values: Vec::new() };
+        let mut driven = vec![vec![0.0; experiment.compared_count()]; n];
+        direct.add_inputs(model, &mut driven, |i, k| model.equations[i].terms[k].2.at(&point.coefficients), |l| &l.0);
+        direct.values = direct.apply_coupling(driven);
         Ok(Some(direct))
     }
 
-    /// Adds weighted δ of what drives each equation at once.
-    fn add_driven<'a>(
+    /// Add the weighted δ of the feedthrough inputs of each equation.
+    fn add_inputs<'a>(
         &'a self,
         model: &FreeModel,
         driven: &mut [Vec<f64>],
@@ -81,8 +82,8 @@ impl Direct {
         for (i, row) in self.terms.iter().enumerate() {
             for (k, _) in row.iter().enumerate().filter(|&(_, &at_once)| at_once) {
                 let signal = model.equations[i].terms[k].0;
-                let (c, unknown) = (weight(i, k), model.unknown(i, signal));
-                let series = match (unknown, &self.lacking[signal]) {
+                let (c, unknown) = (weight(i, k), model.output_index(i, signal));
+                let series = match (unknown, &self.deviations[signal]) {
                     (Some(j), _) if !self.values.is_empty() => &self.values[j],
                     (None, Some(lacking)) => which(lacking),
                     _ => continue,
@@ -94,9 +95,9 @@ impl Direct {
         }
     }
 
-    /// (I − C)⁻¹ times what drives each equation.
-    pub(crate) fn through(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
-        let Some(between) = &self.between else { return driven };
+    /// Multiply the feedthrough inputs of the equations by (I − C)⁻¹.
+    pub(crate) fn apply_coupling(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
+        let Some(between) = &self.coupling_inverse else { return driven };
         let gains = between.chunks_exact(driven.len());
         let mixed = |gains: &[f64]| {
             let mut out = vec![0.0; driven.first().map_or(0, Vec::len)];
@@ -108,17 +109,17 @@ impl Direct {
         gains.map(mixed).collect()
     }
 
-    /// What the sampled means lack.
-    pub(crate) fn samples(&self, experiment: &Experiment) -> Vec<f64> {
-        experiment.weighted(&self.values)
+    /// Correction of the weighted samples.
+    pub(crate) fn weighted_correction(&self, experiment: &Experiment) -> Vec<f64> {
+        experiment.weighted_corrections(&self.values)
     }
 }
 
-/// Adds to the derivative of the sampled means that of what feeds through.
-pub(crate) fn add_slope(
+/// Add the derivative of the feedthrough to that of the samples.
+pub(crate) fn add_feedthrough_derivative(
     model: &FreeModel,
     experiment: &Experiment,
-    direct: &Direct,
+    direct: &Feedthrough,
     point: &Point,
     parameter: usize,
     column: &mut [f64],
@@ -127,10 +128,10 @@ pub(crate) fn add_slope(
     if parameter < orders {
         return;
     }
-    let mut driven = vec![vec![0.0; experiment.compared()]; model.equations.len()];
+    let mut driven = vec![vec![0.0; experiment.compared_count()]; model.equations.len()];
     if parameter < numbers {
         let slope = |i: usize, k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, parameter - orders);
-        direct.add_driven(model, &mut driven, slope, |l| &l.0);
+        direct.add_inputs(model, &mut driven, slope, |l| &l.0);
     } else {
         let acting = model.inputs[parameter - numbers].signal;
         let weight = |i: usize, k: usize| {
@@ -141,49 +142,51 @@ pub(crate) fn add_slope(
                 0.0
             }
         };
-        direct.add_driven(model, &mut driven, weight, |l| &l.1);
+        direct.add_inputs(model, &mut driven, weight, |l| &l.1);
     }
-    column.iter_mut().zip(experiment.weighted(&direct.through(driven))).for_each(|(v, s)| *v += s);
+    column.iter_mut().zip(experiment.weighted_corrections(&direct.apply_coupling(driven))).for_each(|(v, s)| *v += s);
 }
 
-/// Pulses see a jump of a held signal, or a corner of a linear one, at a sample too early: the mean of the pulses on
-/// either side holds half of what the first pulse after it answers, of which only the direct gain is there at the sample.
-/// Without this a first-order equation is off by a share of the step, and one that differentiates what drives it by 0.6
-/// by the step to the power of 0.4.
-pub(crate) struct Early {
-    /// Half of what the mean of the first pulse after each compared sample has of the jump or corner of each signal there,
-    /// and its derivative with respect to its free number.
+/// Correction of the response to jumps and kinks of the inputs, which pulse means show half a pulse too early.
+///
+/// The mean of the pulses on either side of a sample contains half of the response of the first pulse after it, of
+/// which only the direct gain is present at the sample. Without the correction a first-order equation has an error
+/// proportional to the step. An equation with an input derivative of order 0.6 has one of order step^0.4.
+pub(crate) struct JumpCorrection {
+    /// Half of the effect of the jump or kink of each signal at each compared sample on the mean of the next pulse, and
+    /// its derivative with respect to the free parameter.
     jumps: Vec<Option<(Vec<f64>, Vec<f64>)>>,
 }
 
-/// Central differences of gains, which are smooth in all parameters: their error is 1e−10.
-const SHIFT: f64 = 1e-5;
+/// Relative step of the central differences of the gains, which have an error of 1e−10.
+const RELATIVE_DIFFERENCE_STEP: f64 = 1e-5;
 
-impl Early {
-    /// The jumps of what holds in between, and the corners of what is linear there.
+impl JumpCorrection {
+    /// Jumps of zero-order-hold signals, and kinks of linearly interpolated ones.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, acted: &[(Vec<f64>, Vec<f64>)]) -> Self {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
-                // Corners of samples at times of their own are known one by one.
-                let instant = experiment.instants.get(signal).filter(|_| experiment.own.is_none())?;
-                if !instant.held {
-                    // What lies behind an actuator with a free number has none that are known.
+                // Nonuniform samples have an exact kink correction instead.
+                let instant = experiment.point_values.get(signal).filter(|_| experiment.nonuniform.is_none())?;
+                if !instant.is_zero_order_hold {
+                    // The kinks behind a free input nonlinearity are unknown.
                     instant.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
-                    return Some((experiment.lacking(signal).iter().map(|v| -v).collect(), Vec::new()));
+                    return Some((experiment.point_deviation(signal).iter().map(|v| -v).collect(), Vec::new()));
                 }
                 let still = (experiment.record.signal(signal).to_vec(), Vec::new());
                 Some(match model.law_of(signal) {
-                    Some(d) => experiment.lacking_behind(signal, &acted[d]),
-                    None => {
-                        (experiment.lacking_behind(signal, &(still.0, vec![0.0; experiment.record.m()])).0, still.1)
-                    }
+                    Some(d) => experiment.input_point_deviation(signal, &acted[d]),
+                    None => (
+                        experiment.input_point_deviation(signal, &(still.0, vec![0.0; experiment.record.m()])).0,
+                        still.1,
+                    ),
                 })
             })
             .collect();
         Self { jumps }
     }
 
-    /// Answer of the first pulse less the direct gain: outputs by signals, row by row.
+    /// Response of the first pulse minus the direct gain: outputs by signals, row-major.
     fn gains(model: &FreeModel, step: f64, signals: usize, at_once: &[Vec<bool>], point: &Point) -> Result<Vec<f64>> {
         let structures = model.structures(&point.orders);
         let n = structures.len();
@@ -193,7 +196,7 @@ impl Early {
                 between[i * n + i] += 1.0;
                 for (k, (signal, _, c)) in model.equations[i].terms.iter().enumerate() {
                     let gain = c.at(&point.coefficients) * leading(i, k);
-                    match model.unknown(i, *signal) {
+                    match model.output_index(i, *signal) {
                         Some(j) => between[i * n + j] -= gain,
                         None => driving[i * signals + signal] += gain,
                     }
@@ -203,20 +206,22 @@ impl Early {
             let entry = |i: usize, s: usize| (0..n).map(|j| inverse[i * n + j] * driving[j * signals + s]).sum::<f64>();
             Ok((0..n * signals).map(|at| entry(at / signals, at % signals)).collect())
         };
-        let answered = solved(&|i, k| first(structures[i].order - structures[i].terms[k].order, step))?;
+        let answered = solved(&|i, k| first_coefficient(structures[i].order - structures[i].terms[k].order, step))?;
         let direct = solved(&|i, k| f64::from(u8::from(at_once[i][k])))?;
         Ok(answered.iter().zip(direct).map(|(first, direct)| first - direct).collect())
     }
 
-    fn at_once(model: &FreeModel, point: &Point) -> Vec<Vec<bool>> {
+    fn feedthrough_terms(model: &FreeModel, point: &Point) -> Vec<Vec<bool>> {
         let structures = model.structures(&point.orders);
-        let near = |s: &Structure| s.terms.iter().map(|term| (s.order - term.order).abs() < AT_ONCE).collect();
+        let near = |s: &Structure| {
+            s.terms.iter().map(|term| (s.order - term.order).abs() < FEEDTHROUGH_ORDER_TOLERANCE).collect()
+        };
         structures.iter().map(near).collect()
     }
 
-    /// Adds what is early, by these gains, to weighted samples that lack it the other way round.
+    /// Subtract the early response, with the given gains, from weighted samples.
     fn add(&self, experiment: &Experiment, gains: &[f64], slopes: bool, samples: &mut [f64]) {
-        let (signals, compared) = (self.jumps.len(), experiment.compared());
+        let (signals, compared) = (self.jumps.len(), experiment.compared_count());
         for (i, row) in samples.chunks_exact_mut(compared.max(1)).enumerate() {
             if experiment.filter.as_ref().is_some_and(|(_, applies)| applies[i]) {
                 continue;
@@ -231,10 +236,10 @@ impl Early {
         }
     }
 
-    /// Takes what is early from the weighted samples.
+    /// Correct weighted samples.
     ///
     /// # Errors
-    /// [`crate::error::Error::LeadingZero`] where the scheme has no next pulse.
+    /// [`crate::error::Error::LeadingZero`] if the scheme is singular.
     pub(crate) fn correct(
         &self,
         model: &FreeModel,
@@ -245,16 +250,16 @@ impl Early {
         if self.jumps.iter().all(Option::is_none) {
             return Ok(());
         }
-        let at_once = Self::at_once(model, point);
+        let at_once = Self::feedthrough_terms(model, point);
         let gains = Self::gains(model, experiment.record.step(), self.jumps.len(), &at_once, point)?;
         self.add(experiment, &gains, false, samples);
         Ok(())
     }
 
-    /// The same of the derivative with respect to a parameter.
+    /// Correct the derivative of weighted samples with respect to a parameter.
     ///
     /// # Errors
-    /// As [`Early::correct`].
+    /// As [`JumpCorrection::correct`].
     pub(crate) fn correct_slope(
         &self,
         model: &FreeModel,
@@ -266,7 +271,7 @@ impl Early {
         if self.jumps.iter().all(Option::is_none) {
             return Ok(());
         }
-        let at_once = Self::at_once(model, point);
+        let at_once = Self::feedthrough_terms(model, point);
         let (orders, numbers) = (point.orders.len(), point.orders.len() + point.coefficients.len());
         let gains = |point: &Point| Self::gains(model, experiment.record.step(), self.jumps.len(), &at_once, point);
         if parameter >= numbers {
@@ -282,7 +287,9 @@ impl Early {
                 None => &mut point.orders[parameter],
                 Some(c) => &mut point.coefficients[c],
             };
-            let by = sign * SHIFT * if parameter < orders { 1.0 } else { value.abs().max(SHIFT) };
+            let by = sign
+                * RELATIVE_DIFFERENCE_STEP
+                * if parameter < orders { 1.0 } else { value.abs().max(RELATIVE_DIFFERENCE_STEP) };
             *value += by;
             by
         };

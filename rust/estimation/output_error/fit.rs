@@ -1,72 +1,72 @@
-//! The fit: a model, its experiments and a start become a least-squares problem, and its minimum a result.
+//! Output-error fit of a model to experiments from an initial guess.
 
 use std::cell::RefCell;
 
-use super::evaluation_cache::Shelf;
+use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
-use super::parameterization::{Clock, Coordinate, FreeInput, FreeModel, Point};
+use super::parameterization::{Coordinate, FreeInput, FreeModel, Point, TimeUnit};
 use super::residuals::Evaluation;
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::optimization::damped_step::Problem;
-use crate::estimation::optimization::levenberg_marquardt::{minimise, Settings, Status};
+use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
 use crate::parallel::Stop;
 
-/// The optimum and what describes it.
+/// Optimum of an output-error fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
-    /// Free orders, coefficients and numbers of inputs.
+    /// Free orders, coefficients and input parameters.
     pub point: Point,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
+    /// Residuals (y − ŷ)/σ, ordered by record, then by output.
     pub residuals: Vec<f64>,
-    /// Their derivatives with respect to orders, coefficients (plain coordinates), then inputs, initial terms projected
-    /// out; none where only residuals were asked for.
+    /// Derivatives of the residuals with respect to orders, coefficients (plain coordinates) and inputs, with the
+    /// initial terms projected out; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms per record and equation.
     pub initial: Vec<Vec<Vec<f64>>>,
     /// Exponents of the initial terms per equation.
     pub exponents: Vec<Vec<f64>>,
-    /// Evaluations of residuals.
+    /// Number of residual evaluations.
     pub evaluations: usize,
-    /// How it ended.
+    /// Reason of termination.
     pub status: Status,
 }
 
-/// The output error of a model on its experiments, as a problem of least squares.
-struct OutputError<'a> {
+/// Nonlinear least-squares problem of the output error of a model.
+struct OutputErrorProblem<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
-    /// Where the coefficients start, in the unit of time of the clock.
+    /// Initial coefficients, in the unit of time.
     start: Vec<f64>,
-    /// The unit of time in which coefficients are moved.
-    clock: Clock,
-    /// Whether a free run that grows is no place to go.
-    steady: bool,
-    /// Whether all coefficients keep their own coordinates, as where an optimum is followed and not looked for.
-    plain: bool,
-    /// Coefficients that are solved for at every point.
+    /// Unit of time in which the coefficients are stepped.
+    time_unit: TimeUnit,
+    /// True if a stable model must not become unstable.
+    requires_stability: bool,
+    /// True to allow extrapolation along valleys: all coefficients have plain coordinates, as near an optimum.
+    allows_extrapolation: bool,
+    /// Coefficients that are eliminated at every point.
     linear: Vec<usize>,
-    /// What evaluations share, by experiment.
-    shelves: RefCell<Vec<Shelf>>,
-    /// What ends the search between two computations.
+    /// Caches of the evaluations, by experiment.
+    caches: RefCell<Vec<EvaluationCache>>,
+    /// Cancellation flag.
     stop: &'a Stop,
 }
 
-impl Problem for OutputError<'_> {
+impl Problem for OutputErrorProblem<'_> {
     type Point = Point;
     type Evaluation = Evaluation;
 
     fn evaluate(&self, point: &Point) -> Result<Evaluation> {
         self.stop.check()?;
-        self.model.evaluate(self.experiments, &mut self.shelves.borrow_mut(), point, &self.linear)
+        self.model.evaluate(self.experiments, &mut self.caches.borrow_mut(), point, &self.linear)
     }
 
-    fn settled(&self, evaluation: &Evaluation, _point: Point) -> Point {
+    fn point_of_evaluation(&self, evaluation: &Evaluation, _point: Point) -> Point {
         evaluation.point.clone()
     }
 
-    fn projected(&self, parameter: usize) -> bool {
+    fn is_eliminated(&self, parameter: usize) -> bool {
         parameter.checked_sub(self.model.order_bounds.len()).is_some_and(|c| self.linear.contains(&c))
     }
 
@@ -76,70 +76,71 @@ impl Problem for OutputError<'_> {
 
     fn jacobian(&self, _point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
         self.stop.check()?;
-        self.model.jacobian(self.experiments, &mut self.shelves.borrow_mut(), &self.linear, evaluation)
+        self.model.jacobian(self.experiments, &mut self.caches.borrow_mut(), &self.linear, evaluation)
     }
 
-    fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
-        stepped(self.model, &self.clock, point, steps)
+    fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+        step_within_bounds(self.model, &self.time_unit, point, steps)
     }
 
-    fn stretch(&self, point: &Point, parameter: usize) -> f64 {
+    fn coordinate_derivative(&self, point: &Point, parameter: usize) -> f64 {
         parameter.checked_sub(point.orders.len()).filter(|j| *j < point.coefficients.len()).map_or(1.0, |j| {
-            let factor = self.clock.factor(j, &point.orders);
-            self.model.coordinates[j].stretch(factor * point.coefficients[j]) / factor
+            let factor = self.time_unit.factor(j, &point.orders);
+            self.model.coordinates[j].derivative(factor * point.coefficients[j]) / factor
         })
     }
 
-    /// With an order move the coefficients whose numbers stay in the unit of time.
-    fn carried(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
+    /// Derivatives of the coefficients with respect to an order, at constant values in the unit of time.
+    fn coupled_derivatives(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
         if parameter >= point.orders.len() {
             return Vec::new();
         }
         (point.coefficients.iter().enumerate())
-            .map(|(j, c)| (point.orders.len() + j, -c * self.clock.fall(j, parameter)))
+            .map(|(j, c)| (point.orders.len() + j, -c * self.time_unit.relative_decrease(j, parameter)))
             .filter(|(_, slope)| *slope != 0.0)
             .collect()
     }
 
-    /// Distance of orders and of inputs' numbers from their bounds; coefficients have none but 0 where they keep a sign.
-    fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
+    /// Distance of a parameter from its bounds. Coefficients are bounded only if they keep their sign.
+    fn distance_to_bounds(&self, point: &Point, parameter: usize) -> (f64, f64) {
         let behind = point.orders.len() + point.coefficients.len();
         let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
             (Some(order), _) => (*order, self.model.order_bounds[parameter]),
             (None, Some(input)) => (point.inputs[input], self.model.inputs[input].bounds),
             (None, None) => {
                 let j = parameter - point.orders.len();
-                let value = self.clock.factor(j, &point.orders) * point.coefficients[j];
-                let down = self.model.coordinates[j].room(value, self.start[j]);
+                let value = self.time_unit.factor(j, &point.orders) * point.coefficients[j];
+                let down = self.model.coordinates[j].distance_to_bound(value, self.start[j]);
                 return (down, f64::INFINITY);
             }
         };
         (value - low, high - value)
     }
 
-    /// The response is linear in a delay between whole numbers of steps, and in a limit between values of the input; there
-    /// its slope jumps.
-    fn kinked(&self, point: &Point, parameter: usize) -> bool {
+    /// True for input parameters: the response is piecewise linear in delays and limits.
+    fn has_kinks(&self, point: &Point, parameter: usize) -> bool {
         parameter >= point.orders.len() + point.coefficients.len()
     }
 
-    fn size(&self, evaluation: &Evaluation) -> f64 {
+    fn signal_norm(&self, evaluation: &Evaluation) -> f64 {
         evaluation.size
     }
 
-    /// Where the grids see all of each equation: a fit would follow noise with what they do not see.
-    fn trusted(&self, point: &Point) -> bool {
-        self.model.resolved(self.experiments, point) && !(self.steady && self.model.grows(point))
+    /// True if the grids resolve the dynamics of each equation. Unresolved modes would fit noise.
+    fn is_admissible(&self, point: &Point) -> bool {
+        self.model.is_resolved(self.experiments, point) && !(self.requires_stability && self.model.is_unstable(point))
     }
 
-    fn leaps(&self) -> bool {
-        self.plain
+    fn allows_extrapolation(&self) -> bool {
+        self.allows_extrapolation
     }
 }
 
-/// A point moved by steps in its coordinates, within bounds, and how far: orders as they are, coefficients as a share
-/// of themselves in the clock's unit, numbers of inputs as a share of their interval.
-fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (Point, f64) {
+/// Move a point by steps in its coordinates, within bounds; return it and the largest change.
+///
+/// Changes of orders are absolute. Those of coefficients are relative in the unit of time, those of input parameters
+/// relative to their interval.
+fn step_within_bounds(model: &FreeModel, clock: &TimeUnit, point: &Point, deltas: &[f64]) -> (Point, f64) {
     let mut next = point.clone();
     let mut moved: f64 = 0.0;
     let (orders, rest) = deltas.split_at(point.orders.len());
@@ -151,7 +152,7 @@ fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (
     }
     for (j, (&coordinate, &delta)) in model.coordinates.iter().zip(coefficients).enumerate() {
         let before = clock.factor(j, &point.orders) * point.coefficients[j];
-        let value = coordinate.shifted(before, delta);
+        let value = coordinate.shift(before, delta);
         next.coefficients[j] = value / clock.factor(j, &next.orders);
         moved = moved.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
     }
@@ -164,14 +165,14 @@ fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (
     (next, moved)
 }
 
-/// Weighted least squares on the output error from a start, by Levenberg–Marquardt with columns scaled by the Jacobian.
+/// Fit a model to experiments by output error from an initial guess, by Levenberg–Marquardt.
 ///
-/// Coefficients of what drives from outside are solved for at every point, so where they start does not matter, nor with
-/// which sign; a single evaluation is of the start as it is.
+/// The coefficients of external inputs are eliminated at every point, so their initial values and signs do not matter.
+/// With a single evaluation, the initial guess is evaluated as given.
 ///
 /// # Errors
-/// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its coordinates; a model that names
-/// what is not there, experiments that do not fit it ([`FreeModel::check`]).
+/// An initial guess whose simulation is not finite ([`Error::Diverged`]), or which is out of the range of its
+/// coordinates; a model that does not match the experiments ([`FreeModel::check`]).
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -210,18 +211,18 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
     fit_until(model, experiments, start, settings, false, &Stop::default())
 }
 
-/// The same, but from a start whose free run does not grow no step leads to one that does.
+/// Fit a model as [`fit`], but never step from a stable model to an unstable one.
 ///
-/// With initial terms that are estimated, a growing mode costs nothing: they take it away until the end of the run, and
-/// what is left depends on what the inputs will be. Equations that drive each other as simulated are not looked at.
+/// Free initial terms can cancel an unstable mode up to the end of the run, which makes the response depend on future
+/// inputs. The stability of coupled equations is not checked.
 ///
 /// # Errors
 /// As [`fit`].
-pub fn fit_steady(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+pub fn fit_stable(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
     fit_until(model, experiments, start, settings, true, &Stop::default())
 }
 
-/// [`fit`], or where `steady` [`fit_steady`], until it is told to stop.
+/// Fit a model as [`fit`], or as [`fit_stable`] if `steady`, with a cancellation flag.
 ///
 /// # Errors
 /// As [`fit`]; [`Error::Interrupted`].
@@ -241,23 +242,33 @@ pub fn fit_until(
     let mut point = start.clone();
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
-    // A single evaluation is of the start as it is.
-    let linear = if settings.evaluations > 1 { model.linear() } else { Vec::new() };
+    // With a single evaluation nothing is eliminated.
+    let linear = if settings.evaluations > 1 { model.linear_coefficients() } else { Vec::new() };
     let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();
-    // Solved for, they need no coordinate that keeps a sign.
+    // Logarithmic coordinates are not needed for eliminated coefficients.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
-    // With free inputs, what drives is no signal of the record.
+    // With free input parameters the inputs of the equations are not signals of the record.
     let passed: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
-        true => experiments.iter().map(Experiment::passed_first).collect::<Result<_>>()?,
+        true => experiments.iter().map(Experiment::prefilter_signals).collect::<Result<_>>()?,
         false => None,
     };
     let experiments = passed.as_deref().unwrap_or(experiments);
-    let shelves = RefCell::new(Shelf::of(experiments)?);
-    let clock = Clock::of(&model, experiments);
+    let shelves = RefCell::new(EvaluationCache::of(experiments)?);
+    let clock = TimeUnit::from_experiments(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
-    let problem = OutputError { model: &model, experiments, start, clock, steady, plain, linear, shelves, stop };
-    let found = minimise(&problem, point, settings)?;
+    let problem = OutputErrorProblem {
+        model: &model,
+        experiments,
+        start,
+        time_unit: clock,
+        requires_stability: steady,
+        allows_extrapolation: plain,
+        linear,
+        caches: shelves,
+        stop,
+    };
+    let found = minimize(&problem, point, settings)?;
     Ok(Fit {
         point: found.point,
         cost: found.cost,
@@ -270,10 +281,10 @@ pub fn fit_until(
     })
 }
 
-/// Refuses a start that its coordinates cannot move, or that is no number.
+/// Check that an initial guess is finite and in the range of its coordinates.
 fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
     for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
-        if !coordinate.holds(c) {
+        if !coordinate.contains(c) {
             return Err(Error::OutOfRange {
                 name: format!("start of coefficient {i}"),
                 value: c,

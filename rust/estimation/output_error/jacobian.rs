@@ -1,24 +1,25 @@
-//! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse transform a parameter and output.
+//! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse FFT per parameter and output.
 
 use std::borrow::Cow;
 use std::rc::Rc;
 
-use super::evaluation_cache::Shelf;
+use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, Point};
-use super::residuals::{Evaluation, Part};
+use super::residuals::{Evaluation, Linearization};
 use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
 use crate::linalg::orthogonal::project_out;
 use crate::series::Kernel;
 
 impl FreeModel {
-    /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
-    /// then inputs' numbers, initial terms projected out; those of linear coefficients are there already.
+    /// Derivatives of the residuals with respect to orders, coefficients (plain coordinates) and input parameters.
+    ///
+    /// Initial terms are projected out. The columns of the linear coefficients are taken from the evaluation.
     pub(crate) fn jacobian(
         &self,
         experiments: &[Experiment],
-        shelves: &mut [Shelf],
+        shelves: &mut [EvaluationCache],
         linear: &[usize],
         at: &Evaluation,
     ) -> Result<Vec<Vec<f64>>> {
@@ -34,13 +35,13 @@ impl FreeModel {
         Ok(jacobian)
     }
 
-    /// One experiment's rows of the Jacobian: A⁻¹(∂b − ∂A y) as products of three spectra.
+    /// Rows of the Jacobian of one experiment.
     #[allow(clippy::too_many_arguments)]
     fn sensitivities(
         &self,
         experiment: &Experiment,
-        shelf: &mut Shelf,
-        part: &Part,
+        shelf: &mut EvaluationCache,
+        part: &Linearization,
         point: &Point,
         initial: &[Vec<f64>],
         linear: &[usize],
@@ -51,11 +52,11 @@ impl FreeModel {
         let (m, n) = (record.m(), self.equations.len());
         let mut responses: Vec<Option<Rc<Kernel>>> = part.response.iter().map(|_| None).collect();
         let mut columns: Vec<Option<Vec<f64>>> = vec![None; jacobian.len()];
-        for (&coefficient, driven) in linear.iter().zip(&part.driven) {
+        for (&coefficient, driven) in linear.iter().zip(&part.linear_effects) {
             columns[orders.len() + coefficient] = Some(driven.samples.clone());
         }
         let open: Vec<usize> = (0..columns.len()).filter(|&parameter| columns[parameter].is_none()).collect();
-        part.solved.inverse()?.each(
+        part.system.inverse()?.solve_each(
             (n, m),
             open.len(),
             |place, rights| {
@@ -63,29 +64,32 @@ impl FreeModel {
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, _)) in equation.terms.iter().enumerate() {
                         let turns = parameter < orders.len();
-                        let weight = self.pull((i, k), point, parameter);
+                        let weight = self.right_hand_side_weight((i, k), point, parameter);
                         if weight == 0.0 {
                             continue;
                         }
                         let operator = &part.operators[i][k];
                         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
-                            let slope = &part.acted[input].1;
+                            let slope = &part.input_means[input].1;
                             rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || shelf.spectrum(slope));
-                        } else if let Some(j) = self.unknown(i, *signal) {
+                        } else if let Some(j) = self.output_index(i, *signal) {
                             let (response, known) = (&part.response[j], &mut responses[j]);
                             let made = || known.get_or_insert_with(|| shelf.spectrum(response)).clone();
                             rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), made);
                         } else {
-                            let series = || Cow::Borrowed(self.drives(record, (*signal, operator.eta()), &part.acted));
-                            let made = || shelf.driver(self, experiment, (*signal, operator.eta()), &part.acted);
+                            let series = || {
+                                Cow::Borrowed(self.input_means(record, (*signal, operator.eta()), &part.input_means))
+                            };
+                            let made =
+                                || shelf.input_spectrum(self, experiment, (*signal, operator.eta()), &part.input_means);
                             rights.add(i, weight, (operator, turns), series, made);
                         }
                     }
                     if parameter < orders.len() {
                         if let Some(moved) =
-                            initial_slope(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
+                            initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
                         {
-                            let series = || Cow::Owned(shelf.filtered(&moved));
+                            let series = || Cow::Owned(shelf.filter_series(&moved));
                             rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
                         }
                     }
@@ -94,17 +98,18 @@ impl FreeModel {
             },
             |place, means| {
                 if let Some(means) = means {
-                    columns[open[place]] = Some(part.moved_by(open[place], means, (self, experiment, point))?.samples);
+                    columns[open[place]] =
+                        Some(part.parameter_effect(open[place], means, (self, experiment, point))?.samples);
                 }
                 Ok(())
             },
         )?;
         for (column, out) in columns.into_iter().zip(jacobian) {
             match column {
-                None => out.extend(std::iter::repeat_n(0.0, n * experiment.compared())),
+                None => out.extend(std::iter::repeat_n(0.0, n * experiment.compared_count())),
                 Some(mut column) => {
                     project_out(&part.basis, &mut column);
-                    // Residuals fall where the response rises.
+                    // Residuals are measured minus simulated samples.
                     out.extend(column.iter().map(|v| -v));
                 }
             }
@@ -112,13 +117,15 @@ impl FreeModel {
         Ok(())
     }
 
-    /// How a parameter moves the right-hand side by term k of equation i: the weight of the term's operator, of its
-    /// derivative for an order, of the slope of what drives for a number of an input.
-    fn pull(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
+    /// Weight of term k of equation i in the derivative of the right-hand side with respect to a parameter.
+    ///
+    /// It multiplies the operator for a coefficient, its derivative for an order, and the derivative of the input for
+    /// an input parameter.
+    fn right_hand_side_weight(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
         let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
         let (signal, order, monomial) = &equation.terms[k];
         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
-            // It moves only what it drives: kernel and coefficient stay.
+            // An input parameter does not change kernels and coefficients.
             return if self.inputs[input].signal == *signal { monomial.at(coefficients) } else { 0.0 };
         }
         match parameter.checked_sub(orders.len()) {
@@ -131,16 +138,17 @@ impl FreeModel {
     }
 }
 
-/// How the initial terms of equation i move with a free order, weighted by their coefficients, before the filter; none if
-/// they do not.
-fn initial_slope(
+/// Derivative of the weighted initial terms of equation i with respect to a free order, before the filter.
+///
+/// None if they do not depend on the order.
+fn initial_term_derivative(
     model: &FreeModel,
     (i, parameter): (usize, usize),
     orders: &[f64],
     values: &[f64],
-    (experiment, shelf): (&Experiment, &Shelf),
+    (experiment, shelf): (&Experiment, &EvaluationCache),
 ) -> Result<Option<Vec<f64>>> {
-    // Exponents are sums of orders: any shift tells how they follow them.
+    // Exponents are linear in the orders, so any shift gives their derivative.
     const SHIFT: f64 = 1e-4;
     if values.is_empty() || !model.initial.follows_orders() {
         return Ok(None);
@@ -152,7 +160,7 @@ fn initial_slope(
     };
     let (below, here, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
     if [&below, &here, &above].iter().any(|list| list.len() != values.len()) {
-        // An exponent appears or merges here: the projection follows it in the next evaluation.
+        // The set of exponents changes here; the projection adapts in the next evaluation.
         return Ok(None);
     }
     let mut out = Vec::new();
@@ -162,7 +170,7 @@ fn initial_slope(
             continue;
         }
         out.resize(experiment.record.m(), 0.0);
-        let power = shelf.power(exponent);
+        let power = shelf.initial_term(exponent);
         out.iter_mut().zip(power.slope()).for_each(|(v, slope)| *v += x * follows * slope);
     }
     Ok(Some(out).filter(|out| !out.is_empty()))

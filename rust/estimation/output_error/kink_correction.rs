@@ -1,122 +1,125 @@
-//! What samples at times of their own see of the corners that jumps of held inputs leave, and their pulse means do not.
+//! Kink correction: slope discontinuities of the output near input jumps, at nonuniform sample times.
 //!
-//! The leading corners of an output are those of the terms that drive its equation, Σ c I^{α−ν} s, and what its own terms
-//! make of these, once. Made twice they are smoother still, and what is left falls with the step.
+//! Block-pulse means smooth out the kinks after jumps of zero-order-hold inputs. The leading kinks of an output come
+//! from the input terms of its equation, Σ c I^{α−ν} s, and from these passed once through the autoregressive terms.
+//! Higher repetitions are smoother, and their error decreases with the step.
 
-use super::experiment::{Experiment, OwnTimes};
-use super::feedthrough::{Direct, AT_ONCE};
+use super::experiment::{Experiment, NonuniformSamples};
+use super::feedthrough::{Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
 use super::parameterization::{FreeModel, Point};
 use crate::equation::Structure;
 
-/// Corners are smooth in an order: the error of a central difference is 1e−10.
-const SHIFT: f64 = 1e-5;
+/// Step of the central difference in an order, which has an error of 1e−10.
+const ORDER_DIFFERENCE_STEP: f64 = 1e-5;
 
-/// Orders of integration from which on a corner is as smooth as the pulses around a sample follow.
-const SMOOTH: f64 = 2.0;
+/// Integration order above which block pulses represent a kink accurately.
+const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
 
-/// A term whose signal jumps near samples, by itself or through a term of the output's own: what the samples lack for
-/// coefficients of 1, and the derivative of that with respect to the order of integration.
-struct Corner {
+/// Kink of one input term, alone or passed through an autoregressive term: correction of the samples for coefficients
+/// of 1, and its derivative with respect to the integration order.
+struct Kink {
     equation: usize,
     terms: Vec<usize>,
     values: Vec<f64>,
     slopes: Vec<f64>,
 }
 
-/// Corners of one experiment.
-pub(crate) struct Corners {
-    all: Vec<Corner>,
+/// Kink correction of one experiment.
+pub(crate) struct KinkCorrection {
+    all: Vec<Kink>,
 }
 
-impl Corners {
-    /// Those of all terms that drive an equation by what holds in between; none where samples keep to the grid.
+impl KinkCorrection {
+    /// Kinks of all zero-order-hold input terms; None for uniform samples.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
-        let OwnTimes { readings, jumps } = experiment.own.as_ref()?;
+        let NonuniformSamples { readings, jumps } = experiment.nonuniform.as_ref()?;
         let step = experiment.record.step();
         let mut all = Vec::new();
         for (equation, structure) in structures.iter().enumerate() {
             let integration = |term: usize| structure.order - structure.terms[term].order;
             let own: Vec<usize> = (0..structure.terms.len())
-                .filter(|&k| model.unknown(equation, structure.terms[k].signal) == Some(equation))
+                .filter(|&k| model.output_index(equation, structure.terms[k].signal) == Some(equation))
                 .collect();
             for (term, driver) in structure.terms.iter().enumerate() {
                 let Some(Some(near)) = jumps.get(driver.signal) else { continue };
-                if model.unknown(equation, driver.signal).is_some() {
+                if model.output_index(equation, driver.signal).is_some() {
                     continue;
                 }
                 for terms in std::iter::once(vec![term]).chain(own.iter().map(|&k| vec![term, k])) {
                     let eta: f64 = terms.iter().map(|&k| integration(k)).sum();
-                    // What feeds through at once is counted as that.
-                    if eta < AT_ONCE || (terms.len() > 1 && eta >= SMOOTH) {
+                    // Direct feedthrough has its own correction.
+                    if eta < FEEDTHROUGH_ORDER_TOLERANCE || (terms.len() > 1 && eta >= SMOOTH_INTEGRATION_ORDER) {
                         continue;
                     }
-                    let shift = SHIFT.min(0.5 * eta);
-                    let (up, down) =
-                        (readings.corners(near, eta + shift, step), readings.corners(near, eta - shift, step));
+                    let shift = ORDER_DIFFERENCE_STEP.min(0.5 * eta);
+                    let (up, down) = (
+                        readings.kink_corrections(near, eta + shift, step),
+                        readings.kink_corrections(near, eta - shift, step),
+                    );
                     let slopes = up.iter().zip(&down).map(|(u, d)| (u - d) / (2.0 * shift)).collect();
-                    all.push(Corner { equation, terms, values: readings.corners(near, eta, step), slopes });
+                    all.push(Kink { equation, terms, values: readings.kink_corrections(near, eta, step), slopes });
                 }
             }
         }
         Some(Self { all })
     }
 
-    /// Weighted, what the samples lack of an initial term t^e in one equation; nothing where they keep to the grid.
-    pub(crate) fn of_power(experiment: &Experiment, equation: usize, exponent: f64) -> Vec<f64> {
-        let mut rows = vec![vec![0.0; experiment.compared()]; experiment.samples.len()];
-        if let Some(own) = experiment.own.as_ref().filter(|_| exponent.fract() != 0.0) {
+    /// Correction of the weighted samples for an initial term t^e of one equation; zero for uniform samples.
+    pub(crate) fn initial_term_correction(experiment: &Experiment, equation: usize, exponent: f64) -> Vec<f64> {
+        let mut rows = vec![vec![0.0; experiment.compared_count()]; experiment.samples.len()];
+        if let Some(own) = experiment.nonuniform.as_ref().filter(|_| exponent.fract() != 0.0) {
             let start = own.readings.jumps(&[0.0], &[libm::tgamma(exponent + 1.0)]);
-            rows[equation] = own.readings.corners(&start, exponent, experiment.record.step());
+            rows[equation] = own.readings.kink_corrections(&start, exponent, experiment.record.step());
         }
-        experiment.weighted(&rows)
+        experiment.weighted_corrections(&rows)
     }
 
-    /// Adds corners with weights for their values and for their slopes.
-    fn driven(
+    /// Sum of the kinks, with weights for their values and derivatives, in weighted samples.
+    fn weighted_sum(
         &self,
         model: &FreeModel,
         experiment: &Experiment,
-        direct: Option<&Direct>,
-        weights: impl Fn(&Corner) -> (f64, f64),
+        direct: Option<&Feedthrough>,
+        weights: impl Fn(&Kink) -> (f64, f64),
     ) -> Vec<f64> {
-        let mut driven = vec![vec![0.0; experiment.compared()]; model.equations.len()];
+        let mut driven = vec![vec![0.0; experiment.compared_count()]; model.equations.len()];
         for corner in &self.all {
             let (value, slope) = weights(corner);
             let rows = corner.values.iter().zip(&corner.slopes);
             driven[corner.equation].iter_mut().zip(rows).for_each(|(v, (c, s))| *v += value * c + slope * s);
         }
-        experiment.weighted(&match direct {
-            Some(direct) => direct.through(driven),
+        experiment.weighted_corrections(&match direct {
+            Some(direct) => direct.apply_coupling(driven),
             None => driven,
         })
     }
 
-    /// Weighted, what the samples lack.
-    pub(crate) fn samples(
+    /// Correction of the weighted samples.
+    pub(crate) fn weighted_correction(
         &self,
         model: &FreeModel,
         experiment: &Experiment,
         point: &Point,
-        direct: Option<&Direct>,
+        direct: Option<&Feedthrough>,
     ) -> Vec<f64> {
-        let weight = |c: &Corner| {
+        let weight = |c: &Kink| {
             let terms = &model.equations[c.equation].terms;
             (c.terms.iter().map(|&k| terms[k].2.at(&point.coefficients)).product(), 0.0)
         };
-        self.driven(model, experiment, direct, weight)
+        self.weighted_sum(model, experiment, direct, weight)
     }
 
-    /// Adds the derivative of that with respect to a parameter; through what feeds through it is not followed.
+    /// Add the derivative of the correction with respect to a parameter, at constant feedthrough gains.
     pub(crate) fn add_slope(
         &self,
         model: &FreeModel,
         experiment: &Experiment,
-        direct: Option<&Direct>,
+        direct: Option<&Feedthrough>,
         point: &Point,
         parameter: usize,
         column: &mut [f64],
     ) {
-        let weight = |c: &Corner| {
+        let weight = |c: &Kink| {
             let equation = &model.equations[c.equation];
             let value = |k: usize| equation.terms[k].2.at(&point.coefficients);
             match parameter.checked_sub(point.orders.len()) {
@@ -133,7 +136,7 @@ impl Corners {
                 }
             }
         };
-        let moved = self.driven(model, experiment, direct, weight);
+        let moved = self.weighted_sum(model, experiment, direct, weight);
         column.iter_mut().zip(moved).for_each(|(v, m)| *v += m);
     }
 }

@@ -1,11 +1,12 @@
-//! Joint output error: all equations of a model, all records, all orders continuous, by Levenberg–Marquardt.
+//! Output-error estimation of all equations of a model on all records, with continuous orders, by Levenberg–Marquardt.
 //!
-//! For white noise on the outputs this is maximum likelihood. The free run solves A y = b in series, by exact division.
-//! Its sensitivity to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series: with the spectra of A⁻¹ at hand,
-//! one inverse transform a parameter and output. Rejected steps cost no Jacobian. Initial terms are linear and projected
-//! out (variable projection, Kaufman's form, doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the
-//! mean of the pulses on either side of kh, on a grid that may be finer than the samples, plus what the inputs of that
-//! instant feed through. Samples that were not read weigh nothing; samples at times of their own are compared there.
+//! The output error is the measured minus the simulated output. For white output noise the estimate is maximum
+//! likelihood. The simulation (free run: only inputs and initial conditions are used) solves A y = b in series, by
+//! exact division. The sensitivity to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series. With the
+//! spectra of A⁻¹ it costs one inverse transform per parameter and output. Initial terms are linear and projected out
+//! (variable projection in Kaufman's form, doi:10.1007/BF01932995). A sample y_k is compared with the mean of the
+//! pulses on either side of kh, on a grid that can be finer than the samples, plus the direct feedthrough of the
+//! inputs. Missing samples have zero weight. Nonuniform samples are compared at their own times.
 
 mod evaluation_cache;
 pub mod experiment;
@@ -19,6 +20,6 @@ pub mod stability;
 mod system_inverse;
 
 pub use crate::estimation::optimization::levenberg_marquardt::{Settings, Status};
-pub use experiment::{Experiment, Instant, OwnTimes};
-pub use fit::{fit, fit_steady, fit_until, Fit};
+pub use experiment::{Experiment, NonuniformSamples, PointValues};
+pub use fit::{fit, fit_stable, fit_until, Fit};
 pub use parameterization::{Coordinate, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point};

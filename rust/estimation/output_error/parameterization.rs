@@ -1,84 +1,82 @@
-//! What is estimated: equations whose orders and coefficients follow from free ones, free numbers of inputs,
-//! coordinates, bounds.
+//! Parameterization of a model: free orders, coefficients and input parameters, coordinates, bounds and
+//! time scaling.
 //!
-//! What an actuator does to an input before it drives an equation: a delay, a saturation, a dead zone, its number free.
-//!
-//! Time in a unit of the records' own, so that no search depends on the unit in which time is told.
-//!
-//! Before D^ν y beside D^α y a coefficient is a time to the power of −(α − ν): moved at free orders, it means something else
-//! in seconds than in minutes, and along a flat valley a search would end elsewhere. So its number in a unit between sample
-//! and record is what is moved, where a resonance that the record shows is near 1 and orders are least like coefficients.
+//! A coefficient of D^ν y in an equation for D^α y has the unit time^−(α − ν), which changes with free orders. Without
+//! scaling, an optimization along a flat valley would end elsewhere in seconds than in minutes. The optimization
+//! therefore uses a unit between the sampling interval and the duration. In this unit the resonances of a record are
+//! near 1, and orders and coefficients are least correlated.
 
 use super::experiment::Experiment;
-use super::stability::grows;
+use super::stability::is_unstable;
 use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
-use crate::signal::block_pulse::delayed;
+use crate::signal::block_pulse::delay_samples;
 use crate::simulate::nyquist_margin;
 
-/// In which coordinate a coefficient is estimated: scales decide whether the optimum is reached.
+/// Coordinate in which a coefficient is stepped; its scaling affects convergence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Coordinate {
-    /// As it is.
+    /// The coefficient itself.
     Plain,
-    /// ln|c|, the sign of the start kept.
+    /// ln|c|, with the sign of the initial guess.
     Logarithm,
     /// ln(c − 1), for a ratio that exceeds 1.
     ExcessLogarithm,
-    /// It stays where it starts, as an order or a delay does between two equal bounds.
-    Held,
+    /// No coordinate: fixed at the initial value, like an order between equal bounds.
+    Fixed,
 }
 
-/// Logarithm of the share of its start to which a coefficient that keeps its sign may fall.
-const VANISHED: f64 = 20.0;
+/// Largest logarithmic decrease of a coefficient from its initial value.
+const MAX_LOG_DECREASE: f64 = 20.0;
 
 impl Coordinate {
-    /// Whether a coefficient of this value can be moved in its coordinate.
-    pub(crate) fn holds(self, value: f64) -> bool {
+    /// True if a value is in the range of the coordinate.
+    pub(crate) fn contains(self, value: f64) -> bool {
         match self {
-            Self::Plain | Self::Held => value.is_finite(),
+            Self::Plain | Self::Fixed => value.is_finite(),
             Self::Logarithm => value != 0.0 && value.is_finite(),
             Self::ExcessLogarithm => value > 1.0 && value.is_finite(),
         }
     }
 
-    /// A coefficient moved by `delta` in its coordinate.
-    pub(crate) fn shifted(self, value: f64, delta: f64) -> f64 {
-        // A factor of e^5 in one step has left the region in which the linearisation means anything.
+    /// Shift a coefficient by `delta` in its coordinate.
+    pub(crate) fn shift(self, value: f64, delta: f64) -> f64 {
+        // The linearization is meaningless beyond a factor of e^5.
         let bounded = delta.clamp(-5.0, 5.0);
         match self {
             Self::Plain => value + delta,
             Self::Logarithm => value * libm::exp(bounded),
             Self::ExcessLogarithm => 1.0 + (value - 1.0) * libm::exp(bounded),
-            Self::Held => value,
+            Self::Fixed => value,
         }
     }
 
-    /// How far a coefficient may fall in its coordinate, from its start on: none of its terms shows any more behind that,
-    /// and a descent would go on towards 0 for ever.
-    pub(crate) fn room(self, value: f64, start: f64) -> f64 {
+    /// Distance of a coefficient from its lower bound in its coordinate.
+    ///
+    /// Below the bound its terms have no effect, and an optimization would never terminate.
+    pub(crate) fn distance_to_bound(self, value: f64, start: f64) -> f64 {
         match self {
-            Self::Logarithm => libm::log(value / start) + VANISHED,
-            Self::Plain | Self::ExcessLogarithm | Self::Held => f64::INFINITY,
+            Self::Logarithm => libm::log(value / start) + MAX_LOG_DECREASE,
+            Self::Plain | Self::ExcessLogarithm | Self::Fixed => f64::INFINITY,
         }
     }
 
     /// Derivative of a coefficient with respect to its coordinate.
-    pub(crate) fn stretch(self, value: f64) -> f64 {
+    pub(crate) fn derivative(self, value: f64) -> f64 {
         match self {
             Self::Plain => 1.0,
             Self::Logarithm => value,
             Self::ExcessLogarithm => value - 1.0,
-            Self::Held => 0.0,
+            Self::Fixed => 0.0,
         }
     }
 }
 
-/// A signed product of powers of coefficients: factor·Π c_i^{n_i}.
+/// Monomial of the free coefficients: factor·Π c_i^{n_i}.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Monomial {
-    /// Known factor.
+    /// Factor that is fixed.
     pub factor: f64,
     /// Free coefficients and their powers.
     pub powers: Vec<(usize, i32)>,
@@ -98,7 +96,7 @@ impl Monomial {
     }
 }
 
-/// One equation whose orders and coefficients follow from shared free ones.
+/// Equation whose orders and coefficients are functions of shared free parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeEquation {
     /// Index of the output in the record.
@@ -109,18 +107,18 @@ pub struct FreeEquation {
     pub terms: Vec<(usize, AffineOrder, Monomial)>,
 }
 
-/// Values of all that is free.
+/// Values of all free parameters.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Point {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free numbers of inputs: delays, limits.
+    /// Free input parameters: delays, limits.
     pub inputs: Vec<f64>,
 }
 
-/// What is estimated.
+/// Model with free orders, coefficients and input parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeModel {
     /// The equations.
@@ -129,23 +127,24 @@ pub struct FreeModel {
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
     pub coordinates: Vec<Coordinate>,
-    /// What is free of inputs, one number of an input at most.
+    /// Free input parameters, at most one per input.
     pub inputs: Vec<FreeInput>,
-    /// Whether the equations' outputs drive each other as simulated, or as measured.
+    /// True if outputs enter other equations as simulated; false if as measured.
     pub coupled: bool,
     /// Initial terms of each record.
     pub initial: Initial,
 }
 
-/// Least response of the divisor at Nyquist's frequency, as a share of its leading coefficient, that a step may end at.
-const RESOLVED: f64 = 0.02;
+/// Smallest response of the divisor at the Nyquist frequency, relative to its leading coefficient, of an admissible
+/// point.
+const MIN_NYQUIST_RESPONSE_RATIO: f64 = 0.02;
 
 impl FreeModel {
-    /// Refuses a model that these experiments cannot tell anything about.
+    /// Check that the model matches the experiments.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a signal or a coefficient that is not there, a delay of what is no input, or bounds that
-    /// do not rise; [`Error::Length`] for experiments or weights of other lengths.
+    /// [`Error::Structure`] for an unknown signal or coefficient, a nonlinearity of a signal that is no input, or
+    /// crossed bounds; [`Error::Length`] for experiments or weights of wrong lengths.
     pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
         let Some(signals) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
@@ -184,7 +183,7 @@ impl FreeModel {
         for experiment in experiments {
             experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
-            if experiment.own.is_some() && !self.inputs.is_empty() {
+            if experiment.nonuniform.is_some() && !self.inputs.is_empty() {
                 let what = "a free delay or limit with samples at times of their own".to_owned();
                 return refuse(what, "give its value, or samples at regular times");
             }
@@ -192,16 +191,21 @@ impl FreeModel {
         self.initial.check()
     }
 
-    /// Place of a signal's law among the free ones, if it has one.
+    /// Index of the free input parameter of a signal, if any.
     pub(crate) fn law_of(&self, signal: usize) -> Option<usize> {
         self.inputs.iter().position(|d| d.signal == signal)
     }
 
-    /// Pulse means of an input once it acts, and their derivative with respect to the number of its law.
-    pub(crate) fn acted(&self, record: &Record, input: FreeInput, value: f64) -> Result<(Vec<f64>, Vec<f64>)> {
+    /// Pulse means of an input after its nonlinearity, and their derivative with respect to its parameter.
+    pub(crate) fn apply_input_law(
+        &self,
+        record: &Record,
+        input: FreeInput,
+        value: f64,
+    ) -> Result<(Vec<f64>, Vec<f64>)> {
         let means = record.signal(input.signal);
-        let before = if self.initial.at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
-        input.law.acted(means, value, record.step(), before)
+        let before = if self.initial.is_at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
+        input.law.apply(means, value, record.step(), before)
     }
 
     pub(crate) fn structures(&self, orders: &[f64]) -> Vec<Structure> {
@@ -209,20 +213,25 @@ impl FreeModel {
             .iter()
             .map(|e| Structure {
                 output: e.output,
-                order: raw(&e.order, orders),
-                terms: e.terms.iter().map(|(s, o, _)| Term { signal: *s, order: raw(o, orders) }).collect(),
+                order: unrounded_order(&e.order, orders),
+                terms: e.terms.iter().map(|(s, o, _)| Term { signal: *s, order: unrounded_order(o, orders) }).collect(),
             })
             .collect()
     }
 
-    /// Exponents of the initial terms of equation i, of a structure of it, on an experiment: of impulses only where its
-    /// output passes a filter that may still have held something.
+    /// Exponents of the initial terms of equation i on an experiment.
+    ///
+    /// Impulses are included only if the output passes a sensor filter, for the initial state of the filter.
     pub(crate) fn exponents(&self, experiment: &Experiment, i: usize, structure: &Structure) -> Vec<f64> {
-        structure.initial_exponents(if experiment.behind_filter(i) { &self.initial } else { self.initial.unfiltered() })
+        structure.initial_exponents(if experiment.is_filtered(i) {
+            &self.initial
+        } else {
+            self.initial.without_filter()
+        })
     }
 
-    /// The unknown that a signal of equation i is, if it is one.
-    pub(crate) fn unknown(&self, i: usize, signal: usize) -> Option<usize> {
+    /// Index of the simulated output that a signal of equation i is; None for an input.
+    pub(crate) fn output_index(&self, i: usize, signal: usize) -> Option<usize> {
         if self.coupled {
             self.equations.iter().position(|e| e.output == signal)
         } else {
@@ -230,8 +239,8 @@ impl FreeModel {
         }
     }
 
-    /// Order of each equation, and coefficients and orders of its own terms.
-    fn own_terms(&self, point: &Point) -> Vec<(f64, Vec<(f64, f64)>)> {
+    /// Order of each equation, and coefficients and orders of its autoregressive terms.
+    fn autoregressive_terms(&self, point: &Point) -> Vec<(f64, Vec<(f64, f64)>)> {
         let own = |(structure, equation): (&Structure, &FreeEquation)| {
             let terms = structure.terms.iter().zip(&equation.terms);
             let own = terms.filter(|(term, _)| term.signal == structure.output);
@@ -240,80 +249,81 @@ impl FreeModel {
         self.structures(&point.orders).iter().zip(&self.equations).map(own).collect()
     }
 
-    /// Whether the free run of an equation grows, as far as equations stand alone.
-    pub(crate) fn grows(&self, point: &Point) -> bool {
+    /// True if an equation is unstable; false for coupled equations, which are not checked.
+    pub(crate) fn is_unstable(&self, point: &Point) -> bool {
         let alone = !self.coupled || self.equations.len() == 1;
-        alone && self.own_terms(point).iter().any(|(order, own)| grows(*order, own))
+        alone && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
     }
 
-    /// Whether every grid sees what the own terms of each equation do, as far as equations stand alone.
+    /// True if every grid resolves the autoregressive terms of each equation; true for coupled equations.
     ///
-    /// At Nyquist's frequency the divisor is [`nyquist_margin`] beside its leading coefficient: negative, the scheme has
-    /// a mode that grows from pulse to pulse; near 0, one that hardly decays. A fit would follow noise with it.
-    pub(crate) fn resolved(&self, experiments: &[Experiment], point: &Point) -> bool {
+    /// The ratio of the divisor at the Nyquist frequency ([`nyquist_margin`]) to its leading coefficient is checked. If
+    /// it is negative, the scheme has a mode that is unstable from pulse to pulse, near 0 one that hardly decays. A fit
+    /// would use such a mode to follow noise.
+    pub(crate) fn is_resolved(&self, experiments: &[Experiment], point: &Point) -> bool {
         if self.coupled && self.equations.len() > 1 {
             return true;
         }
-        self.own_terms(point).iter().all(|(order, terms)| {
+        self.autoregressive_terms(point).iter().all(|(order, terms)| {
             let own: Vec<(f64, f64)> = terms.iter().map(|(c, nu)| (*c, order - nu)).collect();
             experiments.iter().all(|experiment| {
                 let h = experiment.record.step();
                 let first = |&(c, eta): &(f64, f64)| c * libm::pow(h, eta) / libm::tgamma(eta + 2.0);
                 let leading = 1.0 - own.iter().map(first).sum::<f64>();
-                nyquist_margin(&own, h) / leading >= RESOLVED
+                nyquist_margin(&own, h) / leading >= MIN_NYQUIST_RESPONSE_RATIO
             })
         })
     }
 }
 
-/// An affine order without rounding to the grain: it moves continuously here.
-fn raw(law: &AffineOrder, free: &[f64]) -> f64 {
+/// Value of an affine order without rounding, so that it is continuous.
+fn unrounded_order(law: &AffineOrder, free: &[f64]) -> f64 {
     law.constant + law.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>()
 }
 
-/// How an input acts.
+/// Kind of input nonlinearity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputLaw {
-    /// Later, by a time \[s\].
+    /// Delay by a time \[s\].
     Delay,
-    /// No further than a limit on either side of 0, in the input's unit.
+    /// Symmetric saturation at a limit in the unit of the input.
     Saturation,
-    /// By what exceeds a threshold on either side of 0, in the input's unit.
+    /// Symmetric dead zone of a half-width in the unit of the input.
     DeadZone,
 }
 
-/// The free number of an input's law.
+/// Free parameter of an input nonlinearity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FreeInput {
-    /// Index of the input in the record; no equation's output.
+    /// Index of the input in the record; not an output of an equation.
     pub signal: usize,
-    /// How it acts.
+    /// Kind of the nonlinearity.
     pub law: InputLaw,
-    /// Least and largest value: \[s\] of a delay, else in the input's unit.
+    /// Lower and upper bound: \[s\] for a delay, else in the unit of the input.
     pub bounds: (f64, f64),
 }
 
 impl InputLaw {
-    /// Pulse means of an input once it acts, and their derivative with respect to the number of its law.
+    /// Apply the nonlinearity to pulse means; return them and their derivative with respect to the parameter.
     ///
-    /// A delay shifts held inputs exactly, one that is linear in between to second order in the step; its derivative is
-    /// that towards longer delays where it is a whole number of steps. A limit bends every pulse by itself, which is
-    /// exact for what holds in between.
+    /// A delay is exact for a zero-order hold, and of second order in the step for linear interpolation. At an integer
+    /// number of steps its derivative is the one towards longer delays. Limits act on every pulse separately, which is
+    /// exact for a zero-order hold.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a number that is negative or none.
+    /// [`Error::OutOfRange`] for a parameter that is negative or not finite.
     ///
     /// ```
     /// use ftlm::estimation::output_error::InputLaw;
     /// # fn main() -> ftlm::error::Result<()> {
-    /// let (means, slope) = InputLaw::Saturation.acted(&[0.5, 2.0, -3.0], 1.5, 0.1, 0.0)?;
+    /// let (means, slope) = InputLaw::Saturation.apply(&[0.5, 2.0, -3.0], 1.5, 0.1, 0.0)?;
     /// assert_eq!((means, slope), (vec![0.5, 1.5, -1.5], vec![0.0, 1.0, -1.0]));
-    /// let (means, slope) = InputLaw::DeadZone.acted(&[0.5, 2.0, -3.0], 1.5, 0.1, 0.0)?;
+    /// let (means, slope) = InputLaw::DeadZone.apply(&[0.5, 2.0, -3.0], 1.5, 0.1, 0.0)?;
     /// assert_eq!((means, slope), (vec![0.0, 0.5, -1.5], vec![0.0, -1.0, 1.0]));
     /// # Ok(())
     /// # }
     /// ```
-    pub fn acted(self, means: &[f64], value: f64, step: f64, before: f64) -> Result<(Vec<f64>, Vec<f64>)> {
+    pub fn apply(self, means: &[f64], value: f64, step: f64, before: f64) -> Result<(Vec<f64>, Vec<f64>)> {
         if !(value >= 0.0 && value.is_finite()) {
             return Err(Error::OutOfRange {
                 name: "number of an input".into(),
@@ -327,9 +337,9 @@ impl InputLaw {
             Self::Delay => {
                 let steps = value / step;
                 let whole = steps.floor();
-                let (near, far) = (delayed(means, whole, before)?, delayed(means, whole + 1.0, before)?);
+                let (near, far) = (delay_samples(means, whole, before)?, delay_samples(means, whole + 1.0, before)?);
                 let slope = near.iter().zip(&far).map(|(near, far)| (far - near) / step).collect();
-                (delayed(means, steps, before)?, slope)
+                (delay_samples(means, steps, before)?, slope)
             }
             Self::Saturation => means.iter().map(|&v| (v.clamp(-value, value), beyond(v))).unzip(),
             Self::DeadZone => means
@@ -343,132 +353,131 @@ impl InputLaw {
     }
 }
 
-/// ln of the largest power of the unit that counts.
-const LARGEST: f64 = 300.0;
-/// Powers of time closer than this are the same.
-const SAME: f64 = 1e-9;
+/// Largest logarithm of a scaling factor; larger ones are clipped.
+const MAX_LOG_FACTOR: f64 = 300.0;
+/// Difference below which two exponents of time are equal.
+const EXPONENT_TOLERANCE: f64 = 1e-9;
 
-/// A power of time: its constant, and the weights of the free orders in it.
-type Power = (f64, Vec<f64>);
+/// Exponent of time: its constant, and the weights of the free orders.
+type TimePower = (f64, Vec<f64>);
 
-/// ln of the unit of time, and of each coefficient that stands alone before a term the weights of the free orders in α − ν,
-/// behind its constant; none of others, which keep their number.
+/// Unit of time (its logarithm), and the exponent of time of each coefficient; None for unscaled coefficients.
 #[derive(Debug, Clone)]
-pub(crate) struct Clock {
+pub(crate) struct TimeUnit {
     unit: f64,
-    powers: Vec<Option<Power>>,
+    powers: Vec<Option<TimePower>>,
 }
 
-impl Clock {
-    /// The unit of some experiments.
-    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment]) -> Self {
-        Self::of_spans(model, &experiments.iter().map(span).collect::<Vec<_>>())
+impl TimeUnit {
+    /// Unit of time of experiments.
+    pub(crate) fn from_experiments(model: &FreeModel, experiments: &[Experiment]) -> Self {
+        Self::from_log_spans(model, &experiments.iter().map(log_span).collect::<Vec<_>>())
     }
 
-    /// The same from ln of the product of each run's sample interval and duration.
+    /// Unit of time from the logarithm of sampling interval times duration of each run.
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn of_spans(model: &FreeModel, spans: &[f64]) -> Self {
-        // A frequency half way, in logarithms, between that of the record and Nyquist's.
+    pub(crate) fn from_log_spans(model: &FreeModel, spans: &[f64]) -> Self {
+        // Geometric mean of the lowest frequency of the record and the Nyquist frequency.
         let unit = spans.iter().sum::<f64>() / (2.0 * spans.len().max(1) as f64) - libm::log(std::f64::consts::PI);
-        Self { unit, powers: powers(model) }
+        Self { unit, powers: time_powers(model) }
     }
 
-    /// ln of the unit of time.
-    pub(crate) fn unit(&self) -> f64 {
+    /// Logarithm of the unit of time.
+    pub(crate) fn log_unit(&self) -> f64 {
         self.unit
     }
 
-    /// By what a coefficient is to be multiplied at some orders for its number in the unit.
+    /// Factor of a coefficient for its value in the unit, at the given orders.
     pub(crate) fn factor(&self, coefficient: usize, orders: &[f64]) -> f64 {
         self.powers[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
             let power = constant + weights.iter().zip(orders).map(|(w, o)| w * o).sum::<f64>();
-            // Of units beyond all measure no number is left.
-            libm::exp((power * self.unit).clamp(-LARGEST, LARGEST))
+            // Clipping avoids overflow with extreme units.
+            libm::exp((power * self.unit).clamp(-MAX_LOG_FACTOR, MAX_LOG_FACTOR))
         })
     }
 
-    /// Share of itself by which a coefficient falls with one more of a free order, its number in the unit kept.
-    pub(crate) fn fall(&self, coefficient: usize, order: usize) -> f64 {
-        let weight = |(_, weights): &Power| weights.get(order).copied().unwrap_or(0.0);
+    /// Relative decrease of a coefficient per unit of a free order, at a constant value in the unit.
+    pub(crate) fn relative_decrease(&self, coefficient: usize, order: usize) -> f64 {
+        let weight = |(_, weights): &TimePower| weights.get(order).copied().unwrap_or(0.0);
         self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
     }
 }
 
-/// ln of the product of a sample interval and the duration.
-fn span(experiment: &Experiment) -> f64 {
+/// Logarithm of sampling interval times duration.
+fn log_span(experiment: &Experiment) -> f64 {
     let (m, step) = (experiment.record.m() as f64, experiment.record.step());
-    let interval = step * experiment.every as f64;
+    let interval = step * experiment.pulses_per_sample as f64;
     libm::log(interval) + libm::log(m * step)
 }
 
-/// The power of time that each coefficient is: the constant, then the weights of the free orders.
-fn powers(model: &FreeModel) -> Vec<Option<Power>> {
-    agreed(model).unwrap_or_else(|| {
-        // One number stands before terms of several orders: under a law it keeps its own unit, as its companions must then.
+/// Exponent of time of each coefficient; None for unscaled ones.
+fn time_powers(model: &FreeModel) -> Vec<Option<TimePower>> {
+    consistent_powers(model).unwrap_or_else(|| {
+        // Exponents conflict if one coefficient occurs with several orders. Under a law no coefficient is scaled then.
         let lawful = model.equations.iter().flat_map(|e| &e.terms).any(|(_, _, c)| c.powers.len() > 1);
-        (0..model.coordinates.len()).map(|j| if lawful { None } else { power(model, j) }).collect()
+        (0..model.coordinates.len()).map(|j| if lawful { None } else { time_power(model, j) }).collect()
     })
 }
 
-/// Whether the number of a coefficient is moved as a power of time; one that is held keeps it, a ratio has none.
-fn moves(model: &FreeModel, coefficient: usize) -> bool {
+/// True if a coefficient is scaled; fixed coefficients and ratios are not.
+fn is_scaled(model: &FreeModel, coefficient: usize) -> bool {
     matches!(model.coordinates[coefficient], Coordinate::Plain | Coordinate::Logarithm)
 }
 
-/// α − ν of the first term before which a coefficient stands alone.
-fn power(model: &FreeModel, coefficient: usize) -> Option<Power> {
-    if !moves(model, coefficient) {
+/// Exponent α − ν of the first term whose coefficient is this one alone.
+fn time_power(model: &FreeModel, coefficient: usize) -> Option<TimePower> {
+    if !is_scaled(model, coefficient) {
         return None;
     }
     model.equations.iter().find_map(|equation| {
         let (_, order, _) = equation.terms.iter().find(|(_, _, c)| c.powers == [(coefficient, 1)])?;
-        let mut power = between(&equation.order, order);
+        let mut power = order_difference(&equation.order, order);
         let constant = power.remove(0);
         Some((constant, power))
     })
 }
 
-/// α − ν: the constant, then the weights of the free orders.
-fn between(highest: &AffineOrder, order: &AffineOrder) -> Vec<f64> {
+/// Difference α − ν: the constant, then the weights of the free orders.
+fn order_difference(highest: &AffineOrder, order: &AffineOrder) -> Vec<f64> {
     let weights = highest.weights.iter().zip(&order.weights).map(|(a, b)| a - b);
     std::iter::once(highest.constant - order.constant).chain(weights).collect()
 }
 
-/// Powers of time on which all products of coefficients agree, by elimination; none where they contradict one another.
-fn agreed(model: &FreeModel) -> Option<Vec<Option<Power>>> {
+/// Exponents of time consistent with all products of coefficients, by elimination; None if they conflict.
+fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
     let (count, orders) = (model.coordinates.len(), model.order_bounds.len());
-    // A row says how often each coefficient stands in a product, and what power of time that is.
+    // One row per product: exponents of the coefficients, and the exponent of time of the product.
     let mut rows: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
     for equation in &model.equations {
         for (_, order, coefficient) in &equation.terms {
             let mut often = vec![0.0; count];
-            for &(j, n) in coefficient.powers.iter().filter(|(j, _)| moves(model, *j)) {
+            for &(j, n) in coefficient.powers.iter().filter(|(j, _)| is_scaled(model, *j)) {
                 often[j] += f64::from(n);
             }
             if often.iter().any(|&n| n != 0.0) {
-                rows.push((often, between(&equation.order, order)));
+                rows.push((often, order_difference(&equation.order, order)));
             }
         }
     }
     let mut pivots = Vec::new();
     for j in 0..count {
         let done = pivots.len();
-        let Some(at) = (done..rows.len()).find(|&i| rows[i].0[j].abs() > SAME) else { continue };
+        let Some(at) = (done..rows.len()).find(|&i| rows[i].0[j].abs() > EXPONENT_TOLERANCE) else { continue };
         rows.swap(done, at);
         let pivot = rows[done].clone();
         for (i, (often, power)) in rows.iter_mut().enumerate() {
-            // The pivot's own row is divided by what stands there.
+            // The pivot row is divided by the pivot.
             let by = if i == done { 1.0 - 1.0 / pivot.0[j] } else { often[j] / pivot.0[j] };
             often.iter_mut().zip(&pivot.0).for_each(|(v, p)| *v -= by * p);
             power.iter_mut().zip(&pivot.1).for_each(|(v, p)| *v -= by * p);
         }
         pivots.push(j);
     }
-    if rows[pivots.len()..].iter().flat_map(|(_, power)| power).any(|v| v.abs() > SAME) {
+    if rows[pivots.len()..].iter().flat_map(|(_, power)| power).any(|v| v.abs() > EXPONENT_TOLERANCE) {
         return None;
     }
-    // What the products leave open is a number.
-    let mut found: Vec<_> = (0..count).map(|j| moves(model, j).then(|| (0.0, vec![0.0; orders]))).collect();
+    // Coefficients not determined by the products have no unit.
+    let mut found: Vec<_> = (0..count).map(|j| is_scaled(model, j).then(|| (0.0, vec![0.0; orders]))).collect();
     for ((_, mut power), j) in rows.into_iter().zip(pivots) {
         let constant = power.remove(0);
         found[j] = Some((constant, power));

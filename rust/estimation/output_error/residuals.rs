@@ -1,21 +1,18 @@
-//! The free run of a model at a point, its residuals on every experiment, and the initial terms that are projected out.
+//! Simulation and residuals of a model on every experiment, with linear coefficients and initial terms eliminated.
 //!
-//! Coefficients in which the residuals are linear: those of what drives, once everything else is given.
-//!
-//! They are solved for at every point of the search (variable projection, Golub & Pereyra, doi:10.1137/0710036), so that
-//! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
-//!
-//! What a free run leaves behind for the derivatives of its residuals.
+//! Linear coefficients and initial terms are solved for at every point (Golub & Pereyra, doi:10.1137/0710036), so that
+//! only autoregressive coefficients, orders and input parameters are iterated. No sign has to be guessed, and collinear
+//! inputs cause no valley.
 
 use std::borrow::Cow;
 use std::rc::Rc;
 
-use super::evaluation_cache::Shelf;
+use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
-use super::feedthrough::{add_slope, Direct, Early};
-use super::kink_correction::Corners;
+use super::feedthrough::{add_feedthrough_derivative, Feedthrough, JumpCorrection};
+use super::kink_correction::KinkCorrection;
 use super::parameterization::{Coordinate, FreeModel, Point};
-use super::system_inverse::{Means, Operator, Solved};
+use super::system_inverse::{Operator, PulseMeans, SystemInverse};
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimation::least_squares;
@@ -26,46 +23,46 @@ use crate::linalg::small::back_substitute;
 use crate::regressors::Record;
 use crate::series::{Buffers, Recursion, SumOfProducts};
 
-/// Own-output orders closer to α than this make the equation say that the output equals itself.
-const LEAST_INTEGRATION: f64 = 1e-3;
+/// Smallest difference of α and the order of an autoregressive term; at 0 the equation would be an identity.
+const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
-/// An initial term whose response lies in the span of the others up to this share adds nothing to the projection.
-const SPANNED: f64 = 1e-12;
+/// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
+const RANK_TOLERANCE: f64 = 1e-12;
 
-/// Residuals at a point, and what their derivatives there are made of.
+/// Residuals at a point, and intermediates for their derivatives.
 pub(crate) struct Evaluation {
-    /// The point, with the best values of what the residuals are linear in.
+    /// The point, with optimal values of the linear coefficients.
     pub(crate) point: Point,
     pub(crate) residuals: Vec<f64>,
-    /// Norm of the weighted samples, of which the residuals are differences.
+    /// Norm of the weighted measured samples.
     pub(crate) size: f64,
     pub(crate) initial: Vec<Vec<Vec<f64>>>,
     pub(crate) exponents: Vec<Vec<f64>>,
-    pub(crate) parts: Vec<Part>,
+    pub(crate) parts: Vec<Linearization>,
 }
 
-/// Response of an experiment to an initial term: its equation, weighted samples, pulse means; none of what moves nothing
-/// but the filter of an output.
-struct Free {
+/// Response of an experiment to an initial term: equation, weighted samples, pulse means.
+///
+/// The pulse means are empty for a term that affects only the sensor filter.
+struct InitialTermResponse {
     equation: usize,
     samples: Vec<f64>,
-    means: Rc<Means>,
+    means: Rc<PulseMeans>,
 }
 
-/// An experiment's free run before its initial terms are added.
-struct Answer {
-    part: Part,
+/// Simulation of an experiment from rest, before the initial terms are added.
+struct RestSimulation {
+    part: Linearization,
     residuals: Vec<f64>,
-    free: Vec<Free>,
+    free: Vec<InitialTermResponse>,
 }
 
 impl FreeModel {
-    /// Residuals at a point, the coefficients that are named, in which they are linear, at their best (variable
-    /// projection, doi:10.1137/0710036).
+    /// Residuals at a point, with the `linear` coefficients eliminated (variable projection, doi:10.1137/0710036).
     pub(crate) fn evaluate(
         &self,
         experiments: &[Experiment],
-        shelves: &mut [Shelf],
+        shelves: &mut [EvaluationCache],
         point: &Point,
         linear: &[usize],
     ) -> Result<Evaluation> {
@@ -80,58 +77,59 @@ impl FreeModel {
         };
         let mut answers = Vec::with_capacity(experiments.len());
         for (experiment, shelf) in experiments.iter().zip(shelves) {
-            answers.push(self.answer(experiment, shelf, &structures, point, linear, &mut out)?);
+            answers.push(self.simulate_at_rest(experiment, shelf, &structures, point, linear, &mut out)?);
         }
         if !linear.is_empty() {
-            let sides: Vec<(&[f64], &Part)> = answers.iter().map(|a| (&a.residuals[..], &a.part)).collect();
-            let moves = best_moves(&sides)?;
+            let sides: Vec<(&[f64], &Linearization)> = answers.iter().map(|a| (&a.residuals[..], &a.part)).collect();
+            let moves = solve_linear_steps(&sides)?;
             linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
             for (answer, experiment) in answers.iter_mut().zip(experiments) {
-                let Part { driven, response, direct, acted, .. } = &mut answer.part;
+                let Linearization { linear_effects: driven, response, feedthrough: direct, input_means: acted, .. } =
+                    &mut answer.part;
                 for (column, by) in driven.iter_mut().zip(&moves) {
-                    column.moved(*by, &mut answer.residuals, response);
+                    column.apply(*by, &mut answer.residuals, response);
                 }
                 if direct.is_some() {
-                    *direct = Direct::of(self, experiment, &structures, &out.point, acted)?;
+                    *direct = Feedthrough::of(self, experiment, &structures, &out.point, acted)?;
                 }
             }
         }
         for answer in answers {
-            Self::add_initial(answer, structures.len(), &mut out)?;
+            Self::add_initial_terms(answer, structures.len(), &mut out)?;
         }
         Ok(out)
     }
 
-    fn answer(
+    fn simulate_at_rest(
         &self,
         experiment: &Experiment,
-        shelf: &mut Shelf,
+        shelf: &mut EvaluationCache,
         structures: &[Structure],
         point: &Point,
         linear: &[usize],
         out: &mut Evaluation,
-    ) -> Result<Answer> {
+    ) -> Result<RestSimulation> {
         let record = &experiment.record;
         let acted = (self.inputs.iter().zip(&point.inputs))
-            .map(|(&input, &value)| self.acted(record, input, value))
+            .map(|(&input, &value)| self.apply_input_law(record, input, value))
             .collect::<Result<Vec<_>>>()?;
-        let operators = self.operators(experiment, shelf, structures)?;
+        let operators = self.term_operators(experiment, shelf, structures)?;
         out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
         let asked = out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
-        let (response, solved) = self.response(experiment, shelf, &operators, point, &acted)?;
-        let mut residuals = experiment.measured();
+        let (response, solved) = self.rest_response(experiment, shelf, &operators, point, &acted)?;
+        let mut residuals = experiment.measured_samples();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
-        let mut sampled = experiment.sampled(&response);
-        let early = Early::of(self, experiment, &acted);
+        let mut sampled = experiment.weighted_samples(&response);
+        let early = JumpCorrection::of(self, experiment, &acted);
         early.correct(self, experiment, point, &mut sampled)?;
         residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
-        let direct = Direct::of(self, experiment, structures, point, &acted)?;
+        let direct = Feedthrough::of(self, experiment, structures, point, &acted)?;
         if let Some(direct) = &direct {
-            residuals.iter_mut().zip(direct.samples(experiment)).for_each(|(e, v)| *e -= v);
+            residuals.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
         }
-        let corners = Corners::of(self, experiment, structures);
+        let corners = KinkCorrection::of(self, experiment, structures);
         if let Some(corners) = &corners {
-            let there = corners.samples(self, experiment, point, direct.as_ref());
+            let there = corners.weighted_correction(self, experiment, point, direct.as_ref());
             residuals.iter_mut().zip(there).for_each(|(e, v)| *e -= v);
         }
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
@@ -142,36 +140,47 @@ impl FreeModel {
         if asked {
             let terms: Vec<(usize, f64)> =
                 out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
-            let beside = |i: usize, e: f64| experiment.moves_filter(self.equations[i].output, e);
+            let beside = |i: usize, e: f64| experiment.affects_only_filter(self.equations[i].output, e);
             let moving: Vec<(usize, f64)> = terms.iter().filter(|&&(i, e)| !beside(i, e)).copied().collect();
-            let mut answers = shelf.natural(&solved, (structures.len(), record.m()), &moving)?.into_iter();
+            let mut answers =
+                shelf.initial_term_responses(&solved, (structures.len(), record.m()), &moving)?.into_iter();
             for (i, exponent) in terms {
                 let moves = if beside(i, exponent) { None } else { answers.next() };
                 let (samples, means) = match moves {
-                    None => (shelf.impulse(experiment, i, exponent), Rc::default()),
+                    None => (shelf.impulse_samples(experiment, i, exponent), Rc::default()),
                     Some(means) => {
-                        let mut samples = experiment.sampled(&cut(&means, record.m()));
-                        if experiment.own.is_some() {
-                            let corner = Corners::of_power(experiment, i, exponent);
+                        let mut samples = experiment.weighted_samples(&truncate_means(&means, record.m()));
+                        if experiment.nonuniform.is_some() {
+                            let corner = KinkCorrection::initial_term_correction(experiment, i, exponent);
                             samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
                         }
                         (samples, means)
                     }
                 };
-                extend_orthonormal(&mut basis, samples.clone(), SPANNED);
-                free.push(Free { equation: i, samples, means });
+                extend_orthonormal(&mut basis, samples.clone(), RANK_TOLERANCE);
+                free.push(InitialTermResponse { equation: i, samples, means });
             }
         }
-        let mut part = Part { solved, operators, response, basis, driven: Vec::new(), acted, direct, early, corners };
-        part.driven = self.driven_by(experiment, shelf, &part, point, linear)?;
-        Ok(Answer { part, residuals, free })
+        let mut part = Linearization {
+            system: solved,
+            operators,
+            response,
+            basis,
+            linear_effects: Vec::new(),
+            input_means: acted,
+            feedthrough: direct,
+            jump_correction: early,
+            kink_correction: corners,
+        };
+        part.linear_effects = self.linear_effects(experiment, shelf, &part, point, linear)?;
+        Ok(RestSimulation { part, residuals, free })
     }
 
-    /// The integral of each term of each equation.
-    fn operators(
+    /// Integral operators of the terms of each equation.
+    fn term_operators(
         &self,
         experiment: &Experiment,
-        shelf: &Shelf,
+        shelf: &EvaluationCache,
         structures: &[Structure],
     ) -> Result<Vec<Vec<Rc<Operator>>>> {
         let mut operators = Vec::with_capacity(structures.len());
@@ -179,59 +188,60 @@ impl FreeModel {
             let mut row = Vec::with_capacity(structure.terms.len());
             for (k, term) in structure.terms.iter().enumerate() {
                 let eta = structure.order - term.order;
-                let held = experiment.instants.get(term.signal).is_some_and(|instant| instant.held);
+                let held = experiment.point_values.get(term.signal).is_some_and(|instant| instant.is_zero_order_hold);
                 let least = if term.signal == structure.output {
-                    LEAST_INTEGRATION
+                    MIN_INTEGRATION_ORDER
                 } else if held {
                     // The derivative of a jump is infinite.
                     0.0
                 } else {
-                    LEAST_INTEGRATION - MAX_EXCESS
+                    MIN_INTEGRATION_ORDER - MAX_EXCESS
                 };
                 if eta < least {
-                    // Reported like a step too far, so that the search shortens it.
+                    // This is reported as divergence, so that the optimization shortens its step.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
-                row.push(shelf.operator((i, k), eta, self.turns(i, k)));
+                row.push(shelf.operator((i, k), eta, self.depends_on_free_order(i, k)));
             }
             operators.push(row);
         }
         Ok(operators)
     }
 
-    /// Pulse means of the free run from rest, and what solves the equations.
-    fn response(
+    /// Pulse means of the simulation from rest, and the inverse of the equations.
+    fn rest_response(
         &self,
         experiment: &Experiment,
-        shelf: &mut Shelf,
+        shelf: &mut EvaluationCache,
         operators: &[Vec<Rc<Operator>>],
         point: &Point,
         acted: &[(Vec<f64>, Vec<f64>)],
-    ) -> Result<(Means, Rc<Solved>)> {
+    ) -> Result<(PulseMeans, Rc<SystemInverse>)> {
         let (record, n) = (&experiment.record, operators.len());
         let m = record.m();
         let coefficient = |i: usize, k: usize| self.equations[i].terms[k].2.at(&point.coefficients);
         let places = || operators.iter().enumerate().flat_map(|(i, row)| (0..row.len()).map(move |k| (i, k)));
-        let whole: Option<Vec<usize>> = operators.iter().flatten().map(|operator| operator.whole()).collect();
+        let whole: Option<Vec<usize>> = operators.iter().flatten().map(|operator| operator.integer_order()).collect();
         if let Some(orders) = whole {
             let own = places().zip(&orders).filter_map(|((i, k), &order)| {
-                let j = self.unknown(i, self.equations[i].terms[k].0)?;
+                let j = self.output_index(i, self.equations[i].terms[k].0)?;
                 Some((i, j, order, coefficient(i, k)))
             });
             let highest = orders.iter().copied().max().unwrap_or(0);
-            let solved = Solved::of(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
+            let solved =
+                SystemInverse::from_running_sums(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
             let mut response = vec![vec![0.0; m]; n];
-            solved.inverse()?.each(
+            solved.inverse()?.solve_each(
                 (n, m),
                 1,
                 |_, rights| {
                     for (i, k) in places() {
                         let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
-                        if self.unknown(i, signal).is_none() && c != 0.0 {
+                        if self.output_index(i, signal).is_none() && c != 0.0 {
                             let eta = operators[i][k].eta();
-                            let series = || Cow::Borrowed(self.drives(record, (signal, eta), acted));
+                            let series = || Cow::Borrowed(self.input_means(record, (signal, eta), acted));
                             rights.add(i, c, (&operators[i][k], false), series, || {
-                                shelf.driver(self, experiment, (signal, eta), acted)
+                                shelf.input_spectrum(self, experiment, (signal, eta), acted)
                             });
                         }
                     }
@@ -252,14 +262,14 @@ impl FreeModel {
             let mut drives = false;
             for (k, operator) in row.iter().enumerate() {
                 let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
-                if self.unknown(i, signal).is_some() {
+                if self.output_index(i, signal).is_some() {
                     bits.extend([operator.eta().to_bits(), c.to_bits()]);
                 } else if c != 0.0 {
                     drives = true;
                     sum.add(
                         c,
                         &operator.spectrum(false),
-                        &shelf.driver(self, experiment, (signal, operator.eta()), acted),
+                        &shelf.input_spectrum(self, experiment, (signal, operator.eta()), acted),
                     );
                 }
             }
@@ -267,42 +277,43 @@ impl FreeModel {
                 sum.take(&mut rhs[i], &mut buffers);
             }
         }
-        let solved = shelf.solved(bits, || {
+        let solved = shelf.system_inverse(bits, || {
             let mut matrix = vec![vec![vec![0.0; shelf.pulses()]; n]; n];
             for (i, row) in operators.iter().enumerate() {
                 matrix[i][i][0] += 1.0;
                 for (k, operator) in row.iter().enumerate() {
-                    if let Some(j) = self.unknown(i, self.equations[i].terms[k].0) {
+                    if let Some(j) = self.output_index(i, self.equations[i].terms[k].0) {
                         let c = coefficient(i, k);
                         matrix[i][j].iter_mut().zip(operator.kernel()).for_each(|(a, v)| *a -= c * v);
                     }
                 }
             }
-            Solved::by(matrix)
+            SystemInverse::from_matrix(matrix)
         })?;
-        let response = solved.divided(&rhs)?;
+        let response = solved.solve_by_division(&rhs)?;
         let response = response.ok_or_else(|| Error::Internal { what: "equations that nothing divides".into() })?;
         Ok((response, solved))
     }
 
-    /// Pulse means of what drives a term that is integrated by `eta`: a signal of the record, or what an actuator makes of
-    /// it.
-    pub(crate) fn drives<'a>(
+    /// Pulse means of the input of a term of integration order `eta`, after the input nonlinearity.
+    pub(crate) fn input_means<'a>(
         &self,
         record: &'a Record,
         (signal, eta): (usize, f64),
         acted: &'a [(Vec<f64>, Vec<f64>)],
     ) -> &'a [f64] {
-        self.law_of(signal).map_or_else(|| record.driver(signal, eta), |law| &acted[law].0)
+        self.law_of(signal).map_or_else(|| record.term_signal(signal, eta), |law| &acted[law].0)
     }
 
-    /// Initial terms: the projection of the residuals on their responses.
-    fn add_initial(answer: Answer, equations: usize, out: &mut Evaluation) -> Result<()> {
-        let Answer { mut part, mut residuals, free } = answer;
+    /// Add the initial terms by projection of the residuals on their responses.
+    fn add_initial_terms(answer: RestSimulation, equations: usize, out: &mut Evaluation) -> Result<()> {
+        let RestSimulation { mut part, mut residuals, free } = answer;
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
         if !free.is_empty() {
-            let (places, columns): (Vec<_>, Vec<_>) =
-                free.into_iter().map(|Free { equation, samples, means }| ((equation, means), samples)).unzip();
+            let (places, columns): (Vec<_>, Vec<_>) = free
+                .into_iter()
+                .map(|InitialTermResponse { equation, samples, means }| ((equation, means), samples))
+                .unzip();
             let (values, _) = least_squares::solve(&columns, &residuals, 0)?;
             for (((i, means), column), x) in places.iter().zip(&columns).zip(&values) {
                 initial[*i].push(*x);
@@ -318,34 +329,35 @@ impl FreeModel {
         Ok(())
     }
 
-    /// Whether a free order moves the order by which a term is integrated.
-    fn turns(&self, equation: usize, term: usize) -> bool {
+    /// True if the integration order of a term depends on a free order.
+    fn depends_on_free_order(&self, equation: usize, term: usize) -> bool {
         let item = &self.equations[equation];
         let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
         (0..self.order_bounds.len()).any(|k| of(&item.order.weights, k) != of(&item.terms[term].1.weights, k))
     }
 }
 
-/// The first m pulses of every unknown.
-fn cut(means: &Means, m: usize) -> Cow<'_, [Vec<f64>]> {
+/// First m pulses of every output.
+fn truncate_means(means: &PulseMeans, m: usize) -> Cow<'_, [Vec<f64>]> {
     match means.iter().all(|row| row.len() == m) {
         true => Cow::Borrowed(means),
         false => means.iter().map(|row| row[..m.min(row.len())].to_vec()).collect::<Vec<_>>().into(),
     }
 }
 
-/// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
-const UNTOLD: f64 = 1e-7;
+/// Damping of the unit columns: a coefficient that is identifiable only at this level, that of rounding, is not
+/// changed.
+const COLLINEARITY_DAMPING: f64 = 1e-7;
 
 impl FreeModel {
-    /// Coefficients that stand alone, once, and before nothing but what drives from outside.
-    pub(crate) fn linear(&self) -> Vec<usize> {
+    /// Indices of the coefficients that occur alone and only in terms of external inputs.
+    pub(crate) fn linear_coefficients(&self) -> Vec<usize> {
         let stands = |j: usize| {
             let mut found = false;
             for (i, equation) in self.equations.iter().enumerate() {
                 for (signal, _, monomial) in &equation.terms {
                     if monomial.powers.iter().any(|&(k, _)| k == j) {
-                        if monomial.powers != [(j, 1)] || self.unknown(i, *signal).is_some() {
+                        if monomial.powers != [(j, 1)] || self.output_index(i, *signal).is_some() {
                             return false;
                         }
                         found = true;
@@ -358,21 +370,21 @@ impl FreeModel {
         (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
     }
 
-    /// What one more of each coefficient does that stands before what drives.
-    pub(crate) fn driven_by(
+    /// Effects of the given input coefficients on an experiment.
+    pub(crate) fn linear_effects(
         &self,
         experiment: &Experiment,
-        shelf: &mut Shelf,
-        part: &Part,
+        shelf: &mut EvaluationCache,
+        part: &Linearization,
         point: &Point,
         coefficients: &[usize],
-    ) -> Result<Vec<Driven>> {
+    ) -> Result<Vec<ParameterEffect>> {
         if coefficients.is_empty() {
             return Ok(Vec::new());
         }
         let (record, n) = (&experiment.record, self.equations.len());
         let mut driven = Vec::with_capacity(coefficients.len());
-        part.solved.inverse()?.each(
+        part.system.inverse()?.solve_each(
             (n, record.m()),
             coefficients.len(),
             |place, rights| {
@@ -381,9 +393,9 @@ impl FreeModel {
                         let weight = monomial.slope(&point.coefficients, coefficients[place]);
                         if weight != 0.0 {
                             let eta = part.operators[i][k].eta();
-                            let series = || Cow::Borrowed(self.drives(record, (*signal, eta), &part.acted));
+                            let series = || Cow::Borrowed(self.input_means(record, (*signal, eta), &part.input_means));
                             rights.add(i, weight, (&part.operators[i][k], false), series, || {
-                                shelf.driver(self, experiment, (*signal, eta), &part.acted)
+                                shelf.input_spectrum(self, experiment, (*signal, eta), &part.input_means)
                             });
                         }
                     }
@@ -393,7 +405,7 @@ impl FreeModel {
             |place, means| {
                 let parameter = point.orders.len() + coefficients[place];
                 let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
-                let found = part.moved_by(parameter, means, (self, experiment, point))?;
+                let found = part.parameter_effect(parameter, means, (self, experiment, point))?;
                 if let Some(index) = found.samples.iter().position(|v| !v.is_finite()) {
                     return Err(Error::Diverged { what: "free run".into(), index });
                 }
@@ -405,13 +417,16 @@ impl FreeModel {
     }
 }
 
-/// How far linear coefficients move to where the residuals of all experiments are least, each experiment's initial terms
-/// projected out.
-pub(crate) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
-    let count = sides.first().map_or(0, |(_, part)| part.driven.len());
+/// Solve for the steps of the linear coefficients that minimize the residuals of all experiments.
+///
+/// The initial terms of each experiment are projected out.
+pub(crate) fn solve_linear_steps(sides: &[(&[f64], &Linearization)]) -> Result<Vec<f64>> {
+    let count = sides.first().map_or(0, |(_, part)| part.linear_effects.len());
     let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
     for (residuals, run) in sides {
-        for (column, part) in columns.iter_mut().zip(run.driven.iter().map(|d| &d.samples[..]).chain([*residuals])) {
+        for (column, part) in
+            columns.iter_mut().zip(run.linear_effects.iter().map(|d| &d.samples[..]).chain([*residuals]))
+        {
             let first = column.len();
             column.extend_from_slice(part);
             project_out(&run.basis, &mut column[first..]);
@@ -428,7 +443,7 @@ pub(crate) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
         let rows = column.len();
         column.resize(rows + count, 0.0);
         if place < count {
-            column[rows + place] = UNTOLD;
+            column[rows + place] = COLLINEARITY_DAMPING;
         }
     }
     let r = dense::triangular_factor(&columns);
@@ -441,60 +456,61 @@ pub(crate) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
     }
 }
 
-/// What one experiment leaves behind for its sensitivities.
-pub(crate) struct Part {
-    /// What solves the equations.
-    pub(crate) solved: Rc<Solved>,
-    /// Of each term of each equation.
+/// Intermediates of one experiment for its sensitivities.
+pub(crate) struct Linearization {
+    /// Inverse of the equations.
+    pub(crate) system: Rc<SystemInverse>,
+    /// Operators of the terms, by equation.
     pub(crate) operators: Vec<Vec<Rc<Operator>>>,
-    /// Simulated pulse means, initial terms included.
+    /// Pulse means of the simulated outputs, including the initial terms.
     pub(crate) response: Vec<Vec<f64>>,
     /// Orthonormal basis of the sampled responses to the initial terms.
     pub(crate) basis: Vec<Vec<f64>>,
-    /// What each coefficient does that the residuals are linear in.
-    pub(crate) driven: Vec<Driven>,
-    /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
-    pub(crate) acted: Vec<(Vec<f64>, Vec<f64>)>,
-    /// What feeds through at once.
-    pub(crate) direct: Option<Direct>,
-    /// What pulses see too early.
-    pub(crate) early: Early,
-    /// Corners near samples that were read at times of their own.
-    pub(crate) corners: Option<Corners>,
+    /// Effects of the linear coefficients.
+    pub(crate) linear_effects: Vec<ParameterEffect>,
+    /// Pulse means of each input after its free nonlinearity, and their derivative with respect to its parameter.
+    pub(crate) input_means: Vec<(Vec<f64>, Vec<f64>)>,
+    /// Direct feedthrough.
+    pub(crate) feedthrough: Option<Feedthrough>,
+    /// Correction for jumps of the inputs at the samples.
+    pub(crate) jump_correction: JumpCorrection,
+    /// Kink correction at nonuniform samples.
+    pub(crate) kink_correction: Option<KinkCorrection>,
 }
 
-impl Part {
-    /// What one more of a parameter does to weighted samples, from what it does to pulse means. Orders come first among
-    /// the parameters, coefficients next, numbers of inputs last.
-    pub(crate) fn moved_by(
+impl Linearization {
+    /// Effect of a parameter on the weighted samples, from its effect on the pulse means.
+    ///
+    /// Parameters are ordered: orders, coefficients, input parameters.
+    pub(crate) fn parameter_effect(
         &self,
         parameter: usize,
         means: Vec<Vec<f64>>,
         (model, experiment, point): (&FreeModel, &Experiment, &Point),
-    ) -> Result<Driven> {
-        let mut samples = experiment.sampled(&means);
-        self.early.correct_slope(model, experiment, point, parameter, &mut samples)?;
-        if let Some(direct) = &self.direct {
-            add_slope(model, experiment, direct, point, parameter, &mut samples);
+    ) -> Result<ParameterEffect> {
+        let mut samples = experiment.weighted_samples(&means);
+        self.jump_correction.correct_slope(model, experiment, point, parameter, &mut samples)?;
+        if let Some(direct) = &self.feedthrough {
+            add_feedthrough_derivative(model, experiment, direct, point, parameter, &mut samples);
         }
-        if let Some(corners) = &self.corners {
-            corners.add_slope(model, experiment, self.direct.as_ref(), point, parameter, &mut samples);
+        if let Some(corners) = &self.kink_correction {
+            corners.add_slope(model, experiment, self.feedthrough.as_ref(), point, parameter, &mut samples);
         }
-        Ok(Driven { samples, means })
+        Ok(ParameterEffect { samples, means })
     }
 }
 
-/// What a coefficient of 1 more does to an experiment.
-pub(crate) struct Driven {
-    /// To its weighted samples.
+/// Effect of a unit change of a parameter on an experiment.
+pub(crate) struct ParameterEffect {
+    /// Change of the weighted samples.
     pub(crate) samples: Vec<f64>,
-    /// To the pulse means of each output; empty once it was moved.
+    /// Change of the pulse means of each output; empty after [`ParameterEffect::apply`].
     pub(crate) means: Vec<Vec<f64>>,
 }
 
-impl Driven {
-    /// Moves the coefficient: residuals and pulse means follow.
-    pub(crate) fn moved(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
+impl ParameterEffect {
+    /// Apply a change of the coefficient to residuals and pulse means.
+    pub(crate) fn apply(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
         if by != 0.0 {
             residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);
             for (total, more) in response.iter_mut().zip(&self.means) {

@@ -1,34 +1,34 @@
-//! Whether an equation's own terms give it a free run that grows.
+//! Stability of the homogeneous part of an equation.
 
 use std::f64::consts::PI;
 
-/// Beyond the frequencies looked at, one power of s exceeds all others together by this factor.
-const ALONE: f64 = 1e3;
-/// Widest step along ln ω, and the narrowest: a pole nearer to the axis lies on it.
-const WIDEST: f64 = 0.25;
-const NARROWEST: f64 = 1e-12;
-/// Largest turn of the curve [rad] between two points.
-const TURN: f64 = 0.5;
-/// Powers of s nearer to each other than this are told apart beyond ω = e^1000 alone.
-const SAME: f64 = 1e-3;
-/// Zeros to the right, counted by the argument, from which there is one: half of one that lies on the axis counts.
-const ONE: f64 = 0.25;
+/// Ratio by which one power of s exceeds the sum of all others outside the range of frequencies.
+const DOMINANCE_RATIO: f64 = 1e3;
+/// Largest step in ln ω; a pole closer to the axis than [`MIN_LOG_FREQUENCY_STEP`] lies on it.
+const MAX_LOG_FREQUENCY_STEP: f64 = 0.25;
+const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
+/// Largest change of the angle of the curve \[rad\] between two points.
+const MAX_ANGLE_STEP_RAD: f64 = 0.5;
+/// Difference below which two exponents of s are merged: they are distinguishable only beyond ω = e^1000.
+const EXPONENT_TOLERANCE: f64 = 1e-3;
+/// Count of zeros in the right half-plane, by the argument, above which there is one; a zero on the axis counts half.
+const MIN_UNSTABLE_ZERO_COUNT: f64 = 0.25;
 
-/// Whether s^α − Σ c s^ν, the own terms (c, ν) of an equation of order α, has a zero with a positive real part, or on the
-/// imaginary axis but for the origin.
+/// Return true if an equation of order α with autoregressive terms (c, ν) is unstable.
 ///
-/// By the argument principle on the principal sheet: of powers p of s the curve over ω from 0 to ∞ turns by
-/// (p_high − p_low − 2Z)·π/2 where Z zeros lie to the right.
+/// It is unstable if s^α − Σ c s^ν has a zero in the right half-plane, or on the imaginary axis except the origin.
+/// Zeros are counted by the argument principle on the principal sheet: the angle of the curve over ω from 0 to ∞
+/// changes by (p_high − p_low − 2Z)·π/2 for exponents p and Z zeros in the right half-plane.
 ///
 /// ```
-/// use ftlm::estimation::output_error::stability::grows;
-/// // D²y = −4 y − 0.1 Dy dies away; with the sign of the damping turned it grows.
-/// assert!(!grows(2.0, &[(-4.0, 0.0), (-0.1, 1.0)]));
-/// assert!(grows(2.0, &[(-4.0, 0.0), (0.1, 1.0)]));
+/// use ftlm::estimation::output_error::stability::is_unstable;
+/// // D²y = −4 y − 0.1 Dy is stable; with negative damping it is unstable.
+/// assert!(!is_unstable(2.0, &[(-4.0, 0.0), (-0.1, 1.0)]));
+/// assert!(is_unstable(2.0, &[(-4.0, 0.0), (0.1, 1.0)]));
 /// ```
 #[must_use]
-pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
-    let powers = distinct(std::iter::once((1.0, alpha)).chain(own.iter().map(|&(c, nu)| (-c, nu))).collect());
+pub fn is_unstable(alpha: f64, own: &[(f64, f64)]) -> bool {
+    let powers = merge_close_powers(std::iter::once((1.0, alpha)).chain(own.iter().map(|&(c, nu)| (-c, nu))).collect());
     let by_power = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
     let (Some(&low), Some(&high)) = (powers.iter().min_by(by_power), powers.iter().max_by(by_power)) else {
         return false;
@@ -36,30 +36,30 @@ pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
     if high.1 <= low.1 {
         return false;
     }
-    let share = (ALONE * powers.len() as f64).ln();
-    // ln ω at which another power, of a higher or a lower order, is as small as that beside the one at the end.
+    let share = (DOMINANCE_RATIO * powers.len() as f64).ln();
+    // ln ω at which another power is smaller than the dominant one by the dominance ratio.
     let apart = |end: (f64, f64), &(c, p): &(f64, f64)| (end.0.abs().ln() - c.abs().ln() - share) / (p - end.1);
     let ends = |end: (f64, f64)| powers.iter().filter(move |(_, p)| *p != end.1).map(move |power| apart(end, power));
     let (first, last) = (ends(low).fold(f64::INFINITY, f64::min), ends(high).fold(f64::NEG_INFINITY, f64::max));
-    let steps = ((last - first) / WIDEST).ceil().clamp(1.0, 1e6);
+    let steps = ((last - first) / MAX_LOG_FREQUENCY_STEP).ceil().clamp(1.0, 1e6);
     let mut turned = 0.0;
-    let mut here = (first, curve(&powers, first));
+    let mut here = (first, curve_point(&powers, first));
     for k in 1..=steps as usize {
         let next = first + (last - first) * k as f64 / steps;
-        let there = (next, curve(&powers, next));
-        turned += turn(&powers, here, there);
+        let there = (next, curve_point(&powers, next));
+        turned += angle_change(&powers, here, there);
         here = there;
     }
-    0.5 * (high.1 - low.1) - turned / PI > ONE
+    0.5 * (high.1 - low.1) - turned / PI > MIN_UNSTABLE_ZERO_COUNT
 }
 
-/// Powers that differ: those nearer to each other than [`SAME`] are one at all frequencies that anything is measured at.
-fn distinct(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
+/// Merge powers with exponents closer than [`EXPONENT_TOLERANCE`], which no measurable frequency distinguishes.
+fn merge_close_powers(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     powers.sort_by(|a, b| a.1.total_cmp(&b.1));
     let mut out: Vec<(f64, f64)> = Vec::with_capacity(powers.len());
     for (c, p) in powers {
         match out.last_mut() {
-            Some(last) if p - last.1 < SAME => last.0 += c,
+            Some(last) if p - last.1 < EXPONENT_TOLERANCE => last.0 += c,
             _ => out.push((c, p)),
         }
     }
@@ -67,8 +67,8 @@ fn distinct(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     out
 }
 
-/// The curve at ω, in units of its largest power.
-fn curve(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
+/// Point of the curve at ω, relative to its largest power.
+fn curve_point(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     let logs = || powers.iter().map(|(c, p)| c.abs().ln() + p * log_omega);
     let largest = logs().fold(f64::NEG_INFINITY, f64::max);
     powers.iter().zip(logs()).fold((0.0, 0.0), |(re, im), ((c, p), log)| {
@@ -77,21 +77,21 @@ fn curve(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     })
 }
 
-/// By how much the curve turns between two frequencies, finely enough not to lose a turn.
-fn turn(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -> f64 {
+/// Change of the angle of the curve between two frequencies, by bisection.
+fn angle_change(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -> f64 {
     let ((a, (x, y)), (b, (u, v))) = (from, to);
     let angle = (x * v - y * u).atan2(x * u + y * v);
     let middle = 0.5 * (a + b);
-    if angle.abs() <= TURN {
+    if angle.abs() <= MAX_ANGLE_STEP_RAD {
         return angle;
     }
-    // Far out neighbouring numbers are wider apart than the narrowest step, and beyond all of them the curve is no number.
-    if b - a < NARROWEST || !(middle > a && middle < b) || angle.is_nan() {
-        // The curve passes through 0, to either side by rounding: a zero lies on the axis, and whatever turns, grows.
+    // At extreme frequencies the spacing of floating-point numbers exceeds the smallest step, or the curve is NaN.
+    if b - a < MIN_LOG_FREQUENCY_STEP || !(middle > a && middle < b) || angle.is_nan() {
+        // The curve passes through 0, so a zero lies on the axis: return a value that counts as unstable.
         return f64::NEG_INFINITY;
     }
-    let there = (middle, curve(powers, middle));
-    turn(powers, from, there) + turn(powers, there, to)
+    let there = (middle, curve_point(powers, middle));
+    angle_change(powers, from, there) + angle_change(powers, there, to)
 }
 
 #[cfg(test)]
@@ -99,15 +99,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn equations_without_own_terms_or_with_one_have_the_poles_of_a_power() {
-        assert!(!grows(2.0, &[]) && !grows(2.0, &[(0.0, 1.0)]));
+    fn single_power_has_known_poles() {
+        assert!(!is_unstable(2.0, &[]) && !is_unstable(2.0, &[(0.0, 1.0)]));
         // s^α = c: on the principal sheet for c > 0, for c < 0 only beyond α = 2.
-        assert!(grows(0.5, &[(2.0, 0.0)]) && grows(1.7, &[(1e-9, 0.3)]));
-        assert!(!grows(0.5, &[(-2.0, 0.0)]) && !grows(1.999, &[(-2.0, 0.0)]) && grows(2.1, &[(-2.0, 0.0)]));
+        assert!(is_unstable(0.5, &[(2.0, 0.0)]) && is_unstable(1.7, &[(1e-9, 0.3)]));
+        assert!(
+            !is_unstable(0.5, &[(-2.0, 0.0)])
+                && !is_unstable(1.999, &[(-2.0, 0.0)])
+                && is_unstable(2.1, &[(-2.0, 0.0)])
+        );
     }
 
     #[test]
-    fn matignon_decides_for_two_powers_of_a_common_base() {
+    fn commensurate_orders_match_matignon() {
         // s^1.2 − c s^0.6 + 1: roots in s^0.6 grow where |arg| < 0.3π.
         for k in 0..200 {
             let c = -2.5 + 0.025 * f64::from(k);
@@ -120,45 +124,45 @@ mod tests {
                 PI
             };
             if (angle - 0.3 * PI).abs() > 1e-3 {
-                assert_eq!(grows(1.2, &[(c, 0.6), (-1.0, 0.0)]), angle < 0.3 * PI, "c = {c}");
+                assert_eq!(is_unstable(1.2, &[(c, 0.6), (-1.0, 0.0)]), angle < 0.3 * PI, "c = {c}");
             }
         }
     }
 
     #[test]
-    fn powers_and_coefficients_at_the_ends_of_all_numbers_end() {
-        // Once without end: to come back is what is asked.
+    fn extreme_values_terminate() {
+        // Regression test of infinite recursion; only termination is checked.
         for (alpha, own) in [
             (1e-9, [(-0.954, 0.0), (5e-324, 0.5)]),
             (0.0, [(1e308, 0.0), (-0.468, 0.5)]),
             (1e308, [(1.0, 0.0), (-1.0, -1e308)]),
             (1.6, [(-5e-324, 0.0), (1e308, 0.5)]),
         ] {
-            std::hint::black_box(grows(alpha, &own));
+            std::hint::black_box(is_unstable(alpha, &own));
         }
     }
 
     #[test]
-    fn powers_that_nearly_agree_end() {
-        // What a fit of a real link came to: two own terms beside the highest, whose small differences are all there is.
+    fn nearly_equal_powers_terminate() {
+        // Example from a fit of a real link: two autoregressive terms with nearly the highest order.
         for c in [1.0, 0.999_999, -1.0, 1e-9, 1e9] {
             for gap in [1e-15, 1e-12, 1e-9, 1e-6] {
-                // (1 − c) s² + c, which may lie on the axis: to end is what is asked.
-                std::hint::black_box(grows(2.0, &[(c, 2.0 - gap), (-c, gap)]));
+                // (1 − c) s² + c can have zeros on the axis; only termination is checked.
+                std::hint::black_box(is_unstable(2.0, &[(c, 2.0 - gap), (-c, gap)]));
                 // s² − 1.
-                assert!(grows(2.0, &[(c, 2.0 - gap), (-c, 2.0 - 2.0 * gap), (1.0, 0.0)]), "{c} {gap}");
+                assert!(is_unstable(2.0, &[(c, 2.0 - gap), (-c, 2.0 - 2.0 * gap), (1.0, 0.0)]), "{c} {gap}");
             }
             for gap in [1e-3, 1.1e-3, 2e-3, 1e-2] {
-                assert!(!grows(2.0, &[(-c.abs(), 2.0 - gap), (-c.abs(), 1.0), (-1.0, 0.0)]), "{c} {gap}");
+                assert!(!is_unstable(2.0, &[(-c.abs(), 2.0 - gap), (-c.abs(), 1.0), (-1.0, 0.0)]), "{c} {gap}");
             }
         }
-        assert!(!grows(2.0, &[(-2.0, 1.0), (-2.0, 1.0 + 1e-12), (-4.0, 0.0)]));
-        assert!(grows(2.0, &[(2.0, 1.0), (2.0, 1.0 + 1e-12), (-4.0, 0.0)]));
+        assert!(!is_unstable(2.0, &[(-2.0, 1.0), (-2.0, 1.0 + 1e-12), (-4.0, 0.0)]));
+        assert!(is_unstable(2.0, &[(2.0, 1.0), (2.0, 1.0 + 1e-12), (-4.0, 0.0)]));
     }
 
     #[test]
-    fn a_mode_on_the_axis_counts_as_growing() {
-        assert!(grows(2.0, &[(-9.0, 0.0)]));
-        assert!(!grows(2.0, &[(-9.0, 0.0), (-1e-6, 1.0)]) && grows(2.0, &[(-9.0, 0.0), (1e-6, 1.0)]));
+    fn mode_on_imaginary_axis_is_unstable() {
+        assert!(is_unstable(2.0, &[(-9.0, 0.0)]));
+        assert!(!is_unstable(2.0, &[(-9.0, 0.0), (-1e-6, 1.0)]) && is_unstable(2.0, &[(-9.0, 0.0), (1e-6, 1.0)]));
     }
 }

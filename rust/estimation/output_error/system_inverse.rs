@@ -1,7 +1,6 @@
-//! A⁻¹ of the equations of one experiment, applied to any right-hand side: by products of spectra, or by running sums where
-//! every order of integration is whole and stays so.
+//! Inverse A⁻¹ of the equations of one experiment, and the integral operators of their terms.
 //!
-//! The integral of a term and the power of t of an initial term, with spectra that are made when they are asked for.
+//! If all integration orders are fixed integers, running sums replace the spectra.
 
 use std::borrow::Cow;
 use std::cell::{OnceCell, RefCell};
@@ -12,26 +11,26 @@ use crate::error::{Error, Result};
 use crate::fractional::kernels::{
     kernel, kernel_with_derivative, power_means, power_means_slope, power_pulses, power_pulses_slope,
 };
-use crate::series::{multiply, Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, ABREAST, MAX_SUMS};
+use crate::series::{multiply, Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, MAX_SUMS, RIGHT_SIDE_LANES};
 
-/// A⁻¹ at a point.
+/// Representation of A⁻¹ at a point.
 pub(crate) enum Inverse {
-    /// Spectra of its entries, and points of all series that are multiplied together.
+    /// Spectra of the entries, and their length for products.
     Spectra { rows: Vec<Vec<Kernel>>, total: usize },
-    /// Running sums, one solution a right-hand side.
+    /// Running sums, one solution per right-hand side.
     Sums(Recursion),
 }
 
-/// What stands on the right-hand sides of the equations: integrals of signals, added up.
-pub(crate) enum Rights<'a> {
-    /// Of each equation, and whether anything was added.
+/// Right-hand sides of the equations: sums of integrals of signals.
+pub(crate) enum RightHandSides<'a> {
+    /// Sum of each equation, with a flag that is true if it is nonzero.
     Spectra(Vec<(bool, SumOfProducts)>),
-    /// Equation, order, weight and signal of each.
+    /// Equation, order, weight and signal of each summand.
     Sums(Vec<(usize, usize, f64, Cow<'a, [f64]>)>),
 }
 
-impl<'a> Rights<'a> {
-    /// Forgets what was added.
+impl<'a> RightHandSides<'a> {
+    /// Clear all sums.
     pub(crate) fn clear(&mut self) {
         match self {
             Self::Spectra(rights) => {
@@ -44,16 +43,16 @@ impl<'a> Rights<'a> {
         }
     }
 
-    /// Whether anything was added.
-    pub(crate) fn moves(&self) -> bool {
+    /// True if a summand was added.
+    pub(crate) fn is_nonzero(&self) -> bool {
         match self {
             Self::Spectra(rights) => rights.iter().any(|(used, _)| *used),
             Self::Sums(sources) => !sources.is_empty(),
         }
     }
 
-    /// What an inverse by spectra makes of it.
-    fn through(
+    /// Multiply by the spectra of the inverse; None if zero.
+    fn apply_inverse(
         &self,
         rows: &[Vec<Kernel>],
         m: usize,
@@ -68,10 +67,10 @@ impl<'a> Rights<'a> {
             target.take(&mut means, buffers);
             means
         };
-        self.moves().then(|| rows.iter().map(of_row).collect())
+        self.is_nonzero().then(|| rows.iter().map(of_row).collect())
     }
 
-    /// What running sums take.
+    /// Summands in the form of the running sums.
     fn sources(&self) -> Vec<Source<'_>> {
         let Self::Sums(sources) = self else { return Vec::new() };
         (sources.iter())
@@ -84,8 +83,9 @@ impl<'a> Rights<'a> {
             .collect()
     }
 
-    /// Adds an operator, or with `slope` its derivative with respect to its order, of a signal; its spectrum is asked for
-    /// only where it is needed, and so is its series.
+    /// Add an operator applied to a signal; with `slope` its derivative with respect to the order.
+    ///
+    /// The series and the spectrum of the signal are computed only if needed.
     pub(crate) fn add(
         &mut self,
         equation: usize,
@@ -101,13 +101,15 @@ impl<'a> Rights<'a> {
                 right.add(weight, &operator.spectrum(slope), &spectrum());
             }
             Self::Sums(sources) => {
-                // Orders that are whole here stay so, and have no slope.
-                sources.extend(operator.whole().filter(|_| !slope).map(|order| (equation, order, weight, series())));
+                // Integer orders are fixed and have no derivative.
+                sources.extend(
+                    operator.integer_order().filter(|_| !slope).map(|order| (equation, order, weight, series())),
+                );
             }
         }
     }
 
-    /// Adds a series as it is; of it and its spectrum that is asked for which is needed.
+    /// Add a series; only the form that is needed is computed.
     pub(crate) fn add_series(
         &mut self,
         equation: usize,
@@ -125,72 +127,72 @@ impl<'a> Rights<'a> {
     }
 }
 
-/// Pulse means of every unknown.
-pub(crate) type Means = Vec<Vec<f64>>;
+/// Pulse means of every output.
+pub(crate) type PulseMeans = Vec<Vec<f64>>;
 
-/// The equations A y = b at a point, for right-hand sides as long as the longest run or shorter.
-pub(crate) struct Solved {
-    /// What divides by A; none where running sums do.
+/// Inverse of the equations A y = b at a point, for right-hand sides up to the length of the longest run.
+pub(crate) struct SystemInverse {
+    /// Division by A; None with running sums.
     solver: Option<RefCell<Solver<'static>>>,
     inverse: OnceCell<Inverse>,
-    /// Answers to initial terms, by equation and bits of the exponent, where several runs ask for them.
-    natural: RefCell<HashMap<(usize, u64), Rc<Means>>>,
+    /// Cache of the responses to initial terms, by equation and bits of the exponent, if shared by several runs.
+    initial_responses: RefCell<HashMap<(usize, u64), Rc<PulseMeans>>>,
 }
 
-impl Solved {
-    /// Of A, entry by entry.
+impl SystemInverse {
+    /// Inverse of a matrix A of series.
     ///
     /// # Errors
     /// As [`Solver::new`].
-    pub(crate) fn by(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
-        let solver = Some(RefCell::new(Solver::keeping(matrix)?));
-        Ok(Self { solver, inverse: OnceCell::new(), natural: RefCell::default() })
+    pub(crate) fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
+        let solver = Some(RefCell::new(Solver::from_matrix(matrix)?));
+        Ok(Self { solver, inverse: OnceCell::new(), initial_responses: RefCell::default() })
     }
 
-    /// Of running sums.
-    pub(crate) fn of(sums: Recursion) -> Self {
-        Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), natural: RefCell::default() }
+    /// Inverse by running sums.
+    pub(crate) fn from_running_sums(sums: Recursion) -> Self {
+        Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), initial_responses: RefCell::default() }
     }
 
-    /// y by division, exact whether or not A⁻¹ grows; none where running sums solve.
+    /// Solve by division, exact also if A⁻¹ is unstable; None with running sums.
     ///
     /// # Errors
     /// As [`Solver::solve`].
-    pub(crate) fn divided(&self, rhs: &[Vec<f64>]) -> Result<Option<Means>> {
+    pub(crate) fn solve_by_division(&self, rhs: &[Vec<f64>]) -> Result<Option<PulseMeans>> {
         self.solver.as_ref().map(|solver| solver.borrow_mut().solve(rhs)).transpose()
     }
 
-    /// A⁻¹, its spectra for products of [`FACTORS`] series of the longest run.
+    /// Inverse A⁻¹, with spectra for products of [`SPECTRUM_FACTORS`] series of the longest run.
     ///
     /// # Errors
     /// As [`Solver::solve`].
     pub(crate) fn inverse(&self) -> Result<&Inverse> {
         if let (None, Some(solver)) = (self.inverse.get(), &self.solver) {
             let mut solver = solver.borrow_mut();
-            let total = FACTORS * solver.terms();
+            let total = SPECTRUM_FACTORS * solver.terms();
             let rows = solver.inverse_spectra(total)?;
             return Ok(self.inverse.get_or_init(|| Inverse::Spectra { rows, total }));
         }
         self.inverse.get().ok_or_else(|| Error::Internal { what: "equations that nothing solves".into() })
     }
 
-    /// Answers to the powers t^e of equations, m pulses of n unknowns; to be made once where they are kept.
+    /// Responses to the initial terms t^e of equations, m pulses of n outputs; cached if `keep`.
     ///
     /// # Errors
     /// As [`Solver::solve`].
-    pub(crate) fn natural(
+    pub(crate) fn initial_term_responses(
         &self,
         (n, m): (usize, usize),
         terms: &[(usize, f64)],
         keep: bool,
-        power: impl Fn(f64) -> Rc<Power>,
-    ) -> Result<Vec<Rc<Means>>> {
+        power: impl Fn(f64) -> Rc<InitialTerm>,
+    ) -> Result<Vec<Rc<PulseMeans>>> {
         let key = |&(i, e): &(usize, f64)| (i, e.to_bits());
         let open: Vec<(usize, f64)> =
-            terms.iter().filter(|t| !self.natural.borrow().contains_key(&key(t))).copied().collect();
-        let powers: Vec<Rc<Power>> = open.iter().map(|&(_, e)| power(e)).collect();
+            terms.iter().filter(|t| !self.initial_responses.borrow().contains_key(&key(t))).copied().collect();
+        let powers: Vec<Rc<InitialTerm>> = open.iter().map(|&(_, e)| power(e)).collect();
         let mut made = HashMap::new();
-        self.inverse()?.each(
+        self.inverse()?.solve_each(
             (n, m),
             open.len(),
             |place, rights| {
@@ -203,7 +205,7 @@ impl Solved {
                 Ok(())
             },
         )?;
-        let mut kept = self.natural.borrow_mut();
+        let mut kept = self.initial_responses.borrow_mut();
         let answers = terms.iter().filter_map(|t| kept.get(&key(t)).or_else(|| made.get(&key(t))).cloned()).collect();
         if keep {
             kept.extend(made);
@@ -213,42 +215,43 @@ impl Solved {
 }
 
 impl Inverse {
-    /// For each of `count` right-hand sides, as `given` adds it up, the pulse means of each unknown to `taken`; none where
-    /// nothing was added.
+    /// Solve for `count` right-hand sides: `given` fills each one, `taken` receives the pulse means of the outputs.
+    ///
+    /// The means are None for a zero right-hand side.
     ///
     /// # Errors
     /// Those of `given` and `taken`.
-    pub(crate) fn each<'a>(
+    pub(crate) fn solve_each<'a>(
         &self,
         (n, m): (usize, usize),
         count: usize,
-        mut given: impl FnMut(usize, &mut Rights<'a>) -> Result<()>,
+        mut given: impl FnMut(usize, &mut RightHandSides<'a>) -> Result<()>,
         mut taken: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
     ) -> Result<()> {
         match self {
             Self::Spectra { rows, total } => {
                 let sum = || (false, SumOfProducts::with_length(*total));
-                let mut rights = Rights::Spectra((0..n).map(|_| sum()).collect());
+                let mut rights = RightHandSides::Spectra((0..n).map(|_| sum()).collect());
                 let mut target = SumOfProducts::with_length(*total);
                 let mut buffers = Buffers::default();
                 for place in 0..count {
                     given(place, &mut rights)?;
-                    taken(place, rights.through(rows, m, &mut target, &mut buffers))?;
+                    taken(place, rights.apply_inverse(rows, m, &mut target, &mut buffers))?;
                     rights.clear();
                 }
             }
             Self::Sums(recursion) => {
-                for first in (0..count).step_by(ABREAST) {
-                    let mut lists = Vec::with_capacity(ABREAST);
-                    for place in first..(first + ABREAST).min(count) {
-                        let mut rights = Rights::Sums(Vec::new());
+                for first in (0..count).step_by(RIGHT_SIDE_LANES) {
+                    let mut lists = Vec::with_capacity(RIGHT_SIDE_LANES);
+                    for place in first..(first + RIGHT_SIDE_LANES).min(count) {
+                        let mut rights = RightHandSides::Sums(Vec::new());
                         given(place, &mut rights)?;
                         lists.push(rights);
                     }
-                    let sources: Vec<Vec<Source>> = lists.iter().map(Rights::sources).collect();
+                    let sources: Vec<Vec<Source>> = lists.iter().map(RightHandSides::sources).collect();
                     for (place, (means, rights)) in (first..).zip(recursion.solve(m, &sources)?.into_iter().zip(&lists))
                     {
-                        taken(place, rights.moves().then_some(means))?;
+                        taken(place, rights.is_nonzero().then_some(means))?;
                     }
                 }
             }
@@ -257,28 +260,28 @@ impl Inverse {
     }
 }
 
-/// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
-pub(crate) const FACTORS: usize = 3;
+/// Number of series in a product: spectra of this multiple of m multiply without aliasing.
+pub(crate) const SPECTRUM_FACTORS: usize = 3;
 
-/// Spectra of longer records are made anew each time: those of all terms together would be many times the record.
-pub(crate) const KEPT_PULSES: usize = 1 << 15;
+/// Number of pulses above which spectra are not cached, because they need many times the memory of the record.
+pub(crate) const MAX_CACHED_PULSES: usize = 1 << 15;
 
-/// How near to a whole number an order of integration is one: the kernels differ by as much.
-const WHOLE: f64 = 1e-12;
+/// Difference from an integer below which an integration order is an integer.
+const INTEGER_TOLERANCE: f64 = 1e-12;
 
-/// The integral of a term: its kernel, and the kernel's derivative with respect to its order where the order is free.
+/// Integral operator of a term: kernel, and its derivative with respect to the order if the order is free.
 pub(crate) struct Operator {
     eta: f64,
     free: bool,
     m: usize,
     step: f64,
-    /// Kernel and, of an order above 0, its derivative, once they are asked for.
+    /// Lazily computed kernel and, for orders of at least 0, its derivative.
     series: OnceCell<(Vec<f64>, Vec<f64>)>,
     spectra: [OnceCell<Rc<Kernel>>; 2],
 }
 
 impl Operator {
-    /// That integrates by `eta` on a grid of m pulses; its order may be free.
+    /// Operator of integration order `eta` on a grid of m pulses.
     pub(crate) fn new(eta: f64, free: bool, m: usize, step: f64) -> Self {
         Self { eta, free, m, step, series: OnceCell::new(), spectra: [OnceCell::new(), OnceCell::new()] }
     }
@@ -290,9 +293,9 @@ impl Operator {
         })
     }
 
-    /// The spectrum of the kernel's derivative. Below order 0 that is a product of three, which no rejected step asks for.
+    /// Spectrum of the derivative of the kernel; below order 0 a product of three series.
     fn slope(&self) -> Kernel {
-        let total = FACTORS * self.m;
+        let total = SPECTRUM_FACTORS * self.m;
         if self.eta >= 0.0 || !self.free {
             return Kernel::with_length(&self.series().1, total);
         }
@@ -305,102 +308,104 @@ impl Operator {
         Kernel::with_length(&slope, total)
     }
 
-    /// The order of the integral.
+    /// Integration order.
     pub(crate) fn eta(&self) -> f64 {
         self.eta
     }
 
-    /// Whether it is the integral of this order, with or without a derivative.
-    pub(crate) fn serves(&self, eta: f64, free: bool) -> bool {
+    /// True if the operator has this order and this derivative flag.
+    pub(crate) fn matches_order(&self, eta: f64, free: bool) -> bool {
         self.eta.to_bits() == eta.to_bits() && self.free == free
     }
 
-    /// Of the integral.
+    /// Kernel of the integral.
     pub(crate) fn kernel(&self) -> &[f64] {
         &self.series().0
     }
 
-    /// The order of the integral where it is whole and stays so.
+    /// Integration order if it is a fixed integer.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub(crate) fn whole(&self) -> Option<usize> {
+    pub(crate) fn integer_order(&self) -> Option<usize> {
         let near = self.eta.round();
-        let stays = !self.free && (self.eta - near).abs() <= WHOLE && near >= 0.0;
+        let stays = !self.free && (self.eta - near).abs() <= INTEGER_TOLERANCE && near >= 0.0;
         (stays && near <= MAX_SUMS as f64).then_some(near as usize)
     }
 
-    /// The spectrum of the kernel, or of its derivative, for products of [`FACTORS`] series.
+    /// Spectrum of the kernel, or of its derivative, for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
-        let made = || Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), FACTORS * self.m) });
-        if self.m > KEPT_PULSES {
+        let made = || {
+            Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), SPECTRUM_FACTORS * self.m) })
+        };
+        if self.m > MAX_CACHED_PULSES {
             return made();
         }
         self.spectra[usize::from(slope)].get_or_init(made).clone()
     }
 }
 
-/// What an initial term t^e adds, behind the filter that all signals pass, and how that turns with its exponent.
-pub(crate) struct Power {
+/// Initial term t^e after the sensor filter of all signals, and its derivative with respect to the exponent.
+pub(crate) struct InitialTerm {
     exponent: f64,
     step: f64,
-    filter: Option<Rc<Filter>>,
+    filter: Option<Rc<SeriesFilter>>,
     raw: Vec<f64>,
     series: OnceCell<Vec<f64>>,
     spectrum: OnceCell<Rc<Kernel>>,
     slope: OnceCell<Vec<f64>>,
 }
 
-/// A filter with its spectrum for products of [`FACTORS`] series.
-pub(crate) struct Filter {
+/// Filter series with its spectrum for products of [`SPECTRUM_FACTORS`] series.
+pub(crate) struct SeriesFilter {
     series: Vec<f64>,
     spectrum: Kernel,
 }
 
-impl Filter {
-    /// Of its series.
+impl SeriesFilter {
+    /// Filter from its series.
     pub(crate) fn new(series: &[f64]) -> Self {
-        Self { series: series.to_vec(), spectrum: Kernel::with_length(series, FACTORS * series.len()) }
+        Self { series: series.to_vec(), spectrum: Kernel::with_length(series, SPECTRUM_FACTORS * series.len()) }
     }
 
-    /// What it makes of a series.
-    pub(crate) fn of(&self, series: &[f64]) -> Vec<f64> {
+    /// Filter a series.
+    pub(crate) fn apply(&self, series: &[f64]) -> Vec<f64> {
         multiply(&self.series, series, series.len())
     }
 }
 
-impl Power {
-    /// On a grid of m pulses.
-    pub(crate) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<Filter>>) -> Self {
+impl InitialTerm {
+    /// Initial term on a grid of m pulses.
+    pub(crate) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<SeriesFilter>>) -> Self {
         let raw = if filter.is_some() { power_pulses(exponent, m, step) } else { power_means(exponent, m, step) };
         let (series, spectrum, slope) = Default::default();
         Self { exponent, step, filter, raw, series, spectrum, slope }
     }
 
-    /// Pulse means.
+    /// Pulse means after the filter.
     pub(crate) fn series(&self) -> &[f64] {
         match &self.filter {
             None => &self.raw,
-            Some(filter) => self.series.get_or_init(|| filter.of(&self.raw)),
+            Some(filter) => self.series.get_or_init(|| filter.apply(&self.raw)),
         }
     }
 
-    /// The derivative of t^e with respect to e, before the filter.
+    /// Derivative of t^e with respect to e, before the filter.
     pub(crate) fn slope(&self) -> &[f64] {
         let of = if self.filter.is_some() { power_pulses_slope } else { power_means_slope };
         self.slope.get_or_init(|| of(self.exponent, self.raw.len(), self.step))
     }
 
-    /// Their spectrum, for a product with one more series.
+    /// Spectrum of the pulse means, for a product with one more series.
     pub(crate) fn spectrum(&self) -> Rc<Kernel> {
-        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), FACTORS * self.raw.len()));
-        if self.raw.len() > KEPT_PULSES {
+        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), SPECTRUM_FACTORS * self.raw.len()));
+        if self.raw.len() > MAX_CACHED_PULSES {
             return made();
         }
         self.spectrum.get_or_init(made).clone()
     }
 }
 
-/// The spectrum of a series that passes a filter, for products of so many terms in all.
-pub(crate) fn filtered_spectrum(series: &[f64], filter: Option<&Filter>, total: usize) -> Kernel {
+/// Spectrum of a filtered series, of length `total`.
+pub(crate) fn filtered_spectrum(series: &[f64], filter: Option<&SeriesFilter>, total: usize) -> Kernel {
     let mut spectrum = Kernel::with_length(series, total);
     if let Some(filter) = filter {
         spectrum.multiply(&filter.spectrum);

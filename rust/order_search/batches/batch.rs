@@ -1,83 +1,96 @@
-//! Some rounds at work: screens their candidates, follows the open ones, accounts for all.
+//! Evaluation of one batch: screen, simulate the candidates that no bound excludes, count every outcome.
 
 use std::sync::atomic::Ordering;
 
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::order_search::branch_and_bound::{screen_slab, Boxes, LEAST};
+use crate::order_search::branch_and_bound::{screen_slice, BranchAndBound, MIN_SLICE_CANDIDATES};
 use crate::order_search::candidate::problem::Scratch;
-use crate::order_search::candidate_index::Catalogue;
-use crate::order_search::control::{Checkpoint, Control, Place};
-use crate::order_search::grid::traversal::{visit, Cursor, Slab};
-use crate::order_search::result::{Failure, Kept, Part, Row, Verdict, LISTED};
-use crate::order_search::screening::{by_guess, screen, Open};
+use crate::order_search::candidate_index::CandidateIndex;
+use crate::order_search::control::{BatchPosition, Checkpoint, Control};
+use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor, GridSlice};
+use crate::order_search::result::{Failure, Part, Row, TopRows, Verdict, MAX_LISTED_FAILURES};
+use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 use crate::parallel::PerThread;
 
-/// Pulses of all candidates followed between two checkpoints: a tenth of a second or so of one core.
-const PIECE: usize = 1 << 21;
-/// Candidates that a thread screens at a time: those that the Gram matrix alone ranks cost a nanosecond or so.
-const CHUNK: u64 = 512;
-const CHUNK_PLAIN: u64 = 1 << 13;
-/// Slabs of which boxes are tried where candidates are hard to exclude, and one in how many of their candidates boxes must
-/// exclude to pay: where they exclude none a search takes half as long again.
-const SLABS: u64 = 32;
-const PAYING: u64 = 8;
-/// First and largest number of candidates followed between two looks at the kept scores.
-const FOLLOWED: (u64, u64) = (256, 16_384);
-/// First and largest number of refined candidates followed between two looks at the kept scores: each takes about a
-/// millisecond, and a lower score excludes many.
-const REFINED: (u64, u64) = (32, 1024);
+/// Pulses simulated between two checkpoints, about 0.1 s on one core.
+const CHECKPOINT_PULSES: usize = 1 << 21;
+/// Candidates that a task screens. Ranking by the Gram matrix alone costs about one nanosecond per candidate.
+const BOUND_CHUNK_CANDIDATES: u64 = 512;
+const GRAM_CHUNK_CANDIDATES: u64 = 1 << 13;
+/// Slices on which boxes are tried if candidates are hard to exclude. Boxes are worthwhile if they exclude at least one
+/// in so many candidates. Useless boxes make a search half as long again.
+const TRIAL_SLICES: u64 = 32;
+const MAX_CANDIDATES_PER_EXCLUSION: u64 = 8;
+/// First and largest number of candidates simulated between two updates of the limit.
+const SIMULATION_CHUNK_RANGE: (u64, u64) = (256, 16_384);
+/// First and largest number of refined candidates between two updates of the limit. Each takes about one millisecond,
+/// and a lower score excludes many.
+const REFINEMENT_CHUNK_RANGE: (u64, u64) = (32, 1024);
 
-/// Some rounds of a search at work.
-pub(super) struct Hunt<'a> {
-    pub(super) catalogue: &'a Catalogue<'a>,
-    boxes: Option<&'a Boxes>,
+/// Evaluation of a range of batches.
+pub(super) struct BatchEvaluation<'a> {
+    pub(super) catalogue: &'a CandidateIndex<'a>,
+    boxes: Option<&'a BranchAndBound>,
     pub(super) pool: &'a rayon::ThreadPool,
     control: &'a Control,
     scratches: PerThread<Scratch>,
-    /// Of the rounds done, and of the candidates done in this one but for its rows.
-    pub(super) part: Part,
-    /// Whether the next checkpoint is the first one of a stretch begun at its start.
-    pub(super) anew: bool,
+    /// Result of the completed batches, and of the candidates evaluated in the current batch, without its rows.
+    pub(super) result: Part,
+    /// Whether the next checkpoint is the first one since the range was started.
+    pub(super) replaces_previous: bool,
 }
 
-impl<'a> Hunt<'a> {
+impl<'a> BatchEvaluation<'a> {
     pub(super) fn new(
-        catalogue: &'a Catalogue<'a>,
-        boxes: Option<&'a Boxes>,
+        catalogue: &'a CandidateIndex<'a>,
+        boxes: Option<&'a BranchAndBound>,
         pool: &'a rayon::ThreadPool,
         control: &'a Control,
     ) -> Self {
-        Self { catalogue, boxes, pool, control, scratches: PerThread::new(pool), part: Part::default(), anew: true }
+        Self {
+            catalogue,
+            boxes,
+            pool,
+            control,
+            scratches: PerThread::new(pool),
+            result: Part::default(),
+            replaces_previous: true,
+        }
     }
 
-    pub(super) fn stopped(&self) -> bool {
-        self.control.stopped()
+    pub(super) fn is_stopped(&self) -> bool {
+        self.control.is_stopped()
     }
 
     pub(super) fn check_stop(&self) -> Result<()> {
         self.control.check_stop()
     }
 
-    /// Screens a round and follows what is open, from a place on: its rows. False where the place lies in a round that
-    /// visits its candidates in another order, as one of another kind of processor may.
-    pub(super) fn round(&mut self, bounds: (u64, u64), kept: &mut Kept, mut place: Place) -> Result<bool> {
+    /// Screen a batch and simulate its open candidates, starting at a position. Return `false` if the position belongs
+    /// to another evaluation order, as on another kind of processor.
+    pub(super) fn evaluate_batch(
+        &mut self,
+        bounds: (u64, u64),
+        kept: &mut TopRows,
+        mut place: BatchPosition,
+    ) -> Result<bool> {
         let (start, end) = bounds;
         let (limit, resumed) = (kept.limit, place.end > 0);
         let (catalogue, control) = (self.catalogue, self.control);
-        let parts: Vec<(Vec<Open>, Vec<u64>, u64)> = self.pool.install(|| {
+        let parts: Vec<(Vec<OpenCandidate>, Vec<u64>, u64)> = self.pool.install(|| {
             self.chunks(start, end, limit)
                 .par_iter()
                 .with_max_len(1)
                 .map(|(lo, hi, slab)| {
                     let (lo, hi) = (*lo, *hi);
-                    if control.stopped() {
+                    if control.is_stopped() {
                         return Default::default();
                     }
                     let boxes = slab.as_ref().zip(self.boxes);
                     let found = boxes
-                        .and_then(|(slab, boxes)| screen_slab(catalogue, boxes, slab, (lo, hi), limit))
+                        .and_then(|(slab, boxes)| screen_slice(catalogue, boxes, slab, (lo, hi), limit))
                         .unwrap_or_else(|| {
                             let (open, singular) = screen(catalogue, lo, hi, limit);
                             (open, singular, 0)
@@ -91,7 +104,7 @@ impl<'a> Hunt<'a> {
                 .collect()
         });
         self.check_stop()?;
-        let mut open: Vec<Open> = Vec::new();
+        let mut open: Vec<OpenCandidate> = Vec::new();
         let mut singular: Vec<u64> = Vec::new();
         let mut boxed = 0;
         for (found, failed, excluded) in parts {
@@ -99,7 +112,7 @@ impl<'a> Hunt<'a> {
             singular.extend(failed);
             boxed += excluded;
         }
-        by_guess(&mut open);
+        sort_by_guess(&mut open);
         let order = digest(&open);
         if !place.fits(open.len() as u64, order) {
             return Ok(false);
@@ -107,49 +120,51 @@ impl<'a> Hunt<'a> {
         place.order = order;
         if !resumed {
             let failed = singular.len() as u64;
-            self.part.counts.singular += failed;
-            self.part.counts.bounded += end - start - open.len() as u64 - failed;
-            self.part.counts.boxed += boxed;
-            self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
+            self.result.counts.singular += failed;
+            self.result.counts.excluded_by_bound += end - start - open.len() as u64 - failed;
+            self.result.counts.excluded_by_box += boxed;
+            self.result
+                .failures
+                .extend(singular.into_iter().take(MAX_LISTED_FAILURES).map(|index| (index, Failure::Singular)));
         }
-        self.follow(&open, kept, place, true).map(|()| true)
+        self.simulate_open(&open, kept, place, true).map(|()| true)
     }
 
-    /// Whether boxes exclude more than one in [`PAYING`] of some candidates all over the lattice at this limit.
-    pub(super) fn boxes_exclude(&self, limit: f64) -> Result<bool> {
+    /// Whether boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates on trial slices.
+    pub(super) fn boxes_are_worthwhile(&self, limit: f64) -> Result<bool> {
         let Some(boxes) = self.boxes else { return Ok(false) };
         let (catalogue, control) = (self.catalogue, self.control);
-        let order = visit(catalogue.lattice.count());
-        let places: Vec<u64> = (0..SLABS.min(catalogue.lattice.count())).map(order).collect();
+        let order = low_discrepancy_order(catalogue.lattice.count());
+        let places: Vec<u64> = (0..TRIAL_SLICES.min(catalogue.lattice.count())).map(order).collect();
         let found: Vec<(u64, u64)> = self.pool.install(|| {
             places
                 .into_par_iter()
                 .with_max_len(1)
                 .filter_map(|at| {
-                    let slab = catalogue.lattice.slab(at).filter(|_| !control.stopped())?;
-                    let end = slab.hi.min(slab.lo + LEAST);
-                    let (.., boxed) = screen_slab(catalogue, boxes, &slab, (slab.lo, end), limit)?;
+                    let slab = catalogue.lattice.slice_at(at).filter(|_| !control.is_stopped())?;
+                    let end = slab.hi.min(slab.lo + MIN_SLICE_CANDIDATES);
+                    let (.., boxed) = screen_slice(catalogue, boxes, &slab, (slab.lo, end), limit)?;
                     Some((end - slab.lo, boxed))
                 })
                 .collect()
         });
         self.check_stop()?;
         let (all, boxed) = found.iter().fold((0, 0), |sums, found| (sums.0 + found.0, sums.1 + found.1));
-        Ok(boxed * PAYING > all)
+        Ok(boxed * MAX_CANDIDATES_PER_EXCLUSION > all)
     }
 
-    /// The candidates of a round in chunks: those of a large slab together, others a few at a time.
-    fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<Slab>)> {
+    /// Split the candidates of a batch into chunks: a large slice as a whole, others in small numbers.
+    fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<GridSlice>)> {
         let mut chunks = Vec::new();
-        // Beside boxes a chunk must not reach far into the next slab.
-        let plain = self.catalogue.problem.squares.is_some() && self.boxes.is_none();
-        let chunk = if plain { CHUNK_PLAIN } else { CHUNK };
+        // With boxes, a chunk must not extend far into the next slice.
+        let plain = self.catalogue.problem.residual_sums.is_some() && self.boxes.is_none();
+        let chunk = if plain { GRAM_CHUNK_CANDIDATES } else { BOUND_CHUNK_CANDIDATES };
         let mut at = start;
         while at < end {
-            let boxed = self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.catalogue.lattice.slab(at));
+            let boxed = self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.catalogue.lattice.slice_at(at));
             if let Some(slab) = boxed {
                 let to = end.min(slab.hi);
-                if to - at >= LEAST {
+                if to - at >= MIN_SLICE_CANDIDATES {
                     chunks.push((at, to, Some(slab)));
                     at = to;
                     continue;
@@ -162,18 +177,24 @@ impl<'a> Hunt<'a> {
         chunks
     }
 
-    /// Follows open candidates in this order from a place on; what is learnt goes to `kept`, and to the counts and
-    /// checkpoints if `counted`.
-    pub(super) fn follow(&mut self, open: &[Open], kept: &mut Kept, mut place: Place, counted: bool) -> Result<()> {
+    /// Simulate open candidates in this order, starting at a position. Rows are added to `kept`, and counts and
+    /// checkpoints are updated if `counted`.
+    pub(super) fn simulate_open(
+        &mut self,
+        open: &[OpenCandidate],
+        kept: &mut TopRows,
+        mut place: BatchPosition,
+        counted: bool,
+    ) -> Result<()> {
         if open.is_empty() {
             return Ok(());
         }
-        let Catalogue { problem, options, .. } = self.catalogue;
+        let CandidateIndex { problem, options, .. } = self.catalogue;
         let saving = counted && self.control.saving.load(Ordering::Relaxed);
-        // A refinement costs about ten times a free run.
-        let pulses = if problem.refines() { PIECE / 8 } else { PIECE };
+        // A refinement costs about ten times a simulation.
+        let pulses = if problem.refines() { CHECKPOINT_PULSES / 8 } else { CHECKPOINT_PULSES };
         let piece = if saving { (pulses / problem.samples().max(1)).max(4 * self.scratches.len()) } else { usize::MAX };
-        let (first, largest) = if problem.refines() { REFINED } else { FOLLOWED };
+        let (first, largest) = if problem.refines() { REFINEMENT_CHUNK_RANGE } else { SIMULATION_CHUNK_RANGE };
         let batch = |at: u64| usize::try_from(at).unwrap_or(usize::MAX).min(open.len());
         if place.end == 0 {
             place.size = first;
@@ -183,24 +204,24 @@ impl<'a> Hunt<'a> {
         loop {
             let limit = place.limit;
             kept.limit = limit;
-            while place.followed < place.end {
-                let (start, end) = (batch(place.followed), batch(place.end));
+            while place.evaluated_count < place.end {
+                let (start, end) = (batch(place.evaluated_count), batch(place.end));
                 let end = end.min(start.saturating_add(piece));
-                let rows = self.follow_some(&open[start..end], limit, counted)?;
-                place.followed = end as u64;
+                let rows = self.simulate_chunk(&open[start..end], limit, counted)?;
+                place.evaluated_count = end as u64;
                 if saving {
-                    kept.take(rows.iter().cloned());
-                    self.part.failures.sort_unstable();
-                    self.part.failures.truncate(LISTED);
-                    let rows = rows.into_iter().filter(|row| kept.holds(row)).collect();
-                    let part = Part { rows, counts: self.part.counts, failures: self.part.failures.clone() };
-                    let anew = std::mem::take(&mut self.anew);
-                    self.control.save(Checkpoint { place, anew, part });
+                    kept.insert_rows(rows.iter().cloned());
+                    self.result.failures.sort_unstable();
+                    self.result.failures.truncate(MAX_LISTED_FAILURES);
+                    let rows = rows.into_iter().filter(|row| kept.contains(row)).collect();
+                    let part = Part { rows, counts: self.result.counts, failures: self.result.failures.clone() };
+                    let anew = std::mem::take(&mut self.replaces_previous);
+                    self.control.save(Checkpoint { place, replaces_previous: anew, part });
                 } else {
-                    kept.take(rows.into_iter());
+                    kept.insert_rows(rows.into_iter());
                 }
             }
-            kept.lower(options.early_stopping);
+            kept.lower_limit(options.pruning);
             if batch(place.end) == open.len() {
                 return Ok(());
             }
@@ -210,12 +231,12 @@ impl<'a> Hunt<'a> {
         }
     }
 
-    /// Follows these candidates up to a limit: the rows they make.
-    fn follow_some(&mut self, open: &[Open], limit: f64, counted: bool) -> Result<Vec<Row>> {
+    /// Simulate these candidates up to a limit. Return the rows below it.
+    fn simulate_chunk(&mut self, open: &[OpenCandidate], limit: f64, counted: bool) -> Result<Vec<Row>> {
         let (catalogue, control, scratches) = (self.catalogue, self.control, &self.scratches);
         let problem = &catalogue.problem;
-        let visit = |candidate: &Open| {
-            if control.stopped() {
+        let visit = |candidate: &OpenCandidate| {
+            if control.is_stopped() {
                 return None;
             }
             if candidate.bound > limit {
@@ -238,7 +259,7 @@ impl<'a> Hunt<'a> {
                 };
                 scratch.positions = positions;
                 scratch.initial = initial;
-                // One that is bounded is counted as done with the other bounded ones.
+                // Candidates excluded by a bound are counted as processed elsewhere.
                 if counted && !matches!(verdict, Verdict::Bounded(_)) {
                     control.count(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
                 }
@@ -251,34 +272,34 @@ impl<'a> Hunt<'a> {
         let mut rows = Vec::new();
         for (index, verdict, row) in results.into_iter().flatten() {
             if counted {
-                self.count(index, verdict);
+                self.count_verdict(index, verdict);
             }
             rows.extend(row);
         }
         Ok(rows)
     }
 
-    fn count(&mut self, index: u64, verdict: Verdict) {
+    fn count_verdict(&mut self, index: u64, verdict: Verdict) {
         match verdict {
-            Verdict::Score(_) => self.part.counts.beaten += 1,
+            Verdict::Score(_) => self.result.counts.beaten += 1,
             Verdict::Bounded(_) => {
-                self.part.counts.bounded += 1;
+                self.result.counts.excluded_by_bound += 1;
                 self.control.count(1, 1);
             }
-            Verdict::Stopped(_) => self.part.counts.stopped += 1,
+            Verdict::Stopped(_) => self.result.counts.stopped += 1,
             Verdict::Failed(failure) => {
                 match failure {
-                    Failure::Singular => self.part.counts.singular += 1,
-                    Failure::Diverged => self.part.counts.diverged += 1,
+                    Failure::Singular => self.result.counts.singular += 1,
+                    Failure::Diverged => self.result.counts.diverged += 1,
                 }
-                self.part.failures.push((index, failure));
+                self.result.failures.push((index, failure));
             }
         }
     }
 }
 
-/// Digest of the order in which candidates are visited, below 2^63 and never 0 (64-bit FNV-1a over their indices).
-fn digest(open: &[Open]) -> u64 {
+/// Digest of the evaluation order of candidates, below 2^63 and never 0 (64-bit FNV-1a over their indices).
+fn digest(open: &[OpenCandidate]) -> u64 {
     let bytes = open.iter().flat_map(|candidate| candidate.index.to_le_bytes());
     let whole =
         bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
@@ -290,7 +311,7 @@ mod tests {
     use std::borrow::Cow;
 
     use super::*;
-    use crate::order_search::grid::{Lattice, TermAxis};
+    use crate::order_search::grid::{OrderGrid, TermAxis};
     use crate::order_search::options::Options;
     use crate::parallel::pool;
     use crate::parallel::Stop;
@@ -306,18 +327,18 @@ mod tests {
             let values = (0..40).map(|i| from + 0.01 * f64::from(i)).collect();
             TermAxis { signal, values, interchangeable: false }
         };
-        let lattice = Lattice::new(0, &[1.4, 1.6], &[axis(0, 0.1), axis(1, 0.6)], |signal| signal == 1)?;
+        let lattice = OrderGrid::new(0, &[1.4, 1.6], &[axis(0, 0.1), axis(1, 0.6)], |signal| signal == 1)?;
         let (pool, control, options) = (pool(1)?, Control::default(), Options::default());
         let (lattice, fixed) = (Cow::Borrowed(&lattice), [None, None]);
-        let catalogue = Catalogue::new(&[record], lattice, &fixed, &options, &pool, &Stop::default())?;
-        let boxes = pool.install(|| Boxes::new(&catalogue));
-        let hunt = Hunt::new(&catalogue, boxes.as_ref(), &pool, &control);
-        assert!(hunt.boxes_exclude(1e-3 * size)?);
+        let catalogue = CandidateIndex::new(&[record], lattice, &fixed, &options, &pool, &Stop::default())?;
+        let boxes = pool.install(|| BranchAndBound::new(&catalogue));
+        let hunt = BatchEvaluation::new(&catalogue, boxes.as_ref(), &pool, &control);
+        assert!(hunt.boxes_are_worthwhile(1e-3 * size)?);
         // Nothing exceeds a limit as large.
-        assert!(!hunt.boxes_exclude(1e3 * size)?);
-        assert!(!Hunt::new(&catalogue, None, &pool, &control).boxes_exclude(1e-3 * size)?);
+        assert!(!hunt.boxes_are_worthwhile(1e3 * size)?);
+        assert!(!BatchEvaluation::new(&catalogue, None, &pool, &control).boxes_are_worthwhile(1e-3 * size)?);
         control.stop.set();
-        assert!(hunt.boxes_exclude(1e-3 * size).is_err());
+        assert!(hunt.boxes_are_worthwhile(1e-3 * size).is_err());
         Ok(())
     }
 }

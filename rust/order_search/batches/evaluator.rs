@@ -1,40 +1,42 @@
-//! Evaluates the candidates of an order search: in parallel, ordered, stoppable, every one accounted for.
+//! Evaluator of an order search: parallel, reproducible, stoppable, with every candidate counted.
 //!
-//! Candidates stream by in rounds. All of a round get coefficients, several side by side, and those that a proved lower
-//! bound excludes are done; the others are followed, likely ones first, each until its partial sum passes the worst
-//! score kept: what is left out cannot be among the kept ones, so the table is that of brute force, ties by index.
+//! Candidates are processed in batches. All candidates of a batch get coefficients in parallel lanes, and a lower
+//! bound excludes most of them. The others are simulated in the order of their score estimates. Each simulation stops
+//! once its partial sum exceeds the worst score in the table. An excluded candidate cannot enter the table, so the
+//! table equals that of brute force, ties by index.
 //!
-//! How a search is cut into rounds, and its rounds into waves.
-//!
-//! Rounds form waves of 1, 2, 4, … A round knows the rows kept before its wave and what it finds itself, nothing else,
-//! so it comes to the same bits, counts too, whenever it is done on processors of one kind: on any number of threads, on
-//! another machine with the same vector instructions, or continued from a checkpoint. On another kind of processor the
-//! last digits may differ: the dense products and the transforms choose their kernels by the instructions they find.
+//! Generations hold 1, 2, 4, … batches. A batch depends only on the rows found before its generation and on its own.
+//! Its result and counts are therefore bitwise reproducible on processors of one kind: with any number of threads, on
+//! another machine with the same vector instructions, or after resuming from a checkpoint. On another kind of
+//! processor the last digits may differ, because dense products and transforms select their kernels by instruction
+//! set.
 
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
 
 use crate::error::Result;
-use crate::order_search::batches::batch::Hunt;
-use crate::order_search::batches::incumbent::Scouted;
-use crate::order_search::batches::vector_generation::Made;
-use crate::order_search::branch_and_bound::Boxes;
-use crate::order_search::candidate_index::Catalogue;
-use crate::order_search::control::{another, Checkpoint, Control, Place};
-use crate::order_search::grid::independent::Lattice;
-use crate::order_search::grid::traversal::visit;
+use crate::order_search::batches::batch::BatchEvaluation;
+use crate::order_search::batches::incumbent::InitialIncumbent;
+use crate::order_search::batches::vector_generation::GeneratedVectors;
+use crate::order_search::branch_and_bound::BranchAndBound;
+use crate::order_search::candidate_index::CandidateIndex;
+use crate::order_search::control::{mismatch_error, BatchPosition, Checkpoint, Control};
+use crate::order_search::grid::independent::OrderGrid;
+use crate::order_search::grid::traversal::low_discrepancy_order;
 use crate::order_search::options::{Criterion, Options};
-use crate::order_search::result::{Counts, Kept, Outcome, Part, Row};
+use crate::order_search::result::{Counts, Outcome, Part, Row, TopRows};
 use crate::parallel::pool;
 use crate::regressors::Record;
 
-/// Searches a lattice over one equation on one or several records.
+/// Search an order grid for one equation on one or several records.
 ///
-/// `fixed` gives known coefficients, one place a term. The table is that of brute force for any number of threads.
+/// The slice `fixed` holds the fixed coefficients, one entry per term. The table equals that of brute force for any
+/// number of threads.
 ///
 /// # Errors
-/// A setting out of range, records without the signals of the equation, fixed coefficients that are not one a term, a
-/// bank beyond the memory limit, threads that do not start, [`crate::error::Error::Interrupted`].
+/// An option out of range, records without the signals of the equation, a number of fixed coefficients unlike the
+/// number of terms, regressors beyond the memory limit, threads that do not start,
+/// [`crate::error::Error::Interrupted`].
 ///
 /// ```
 /// # use ftlm::order_search::control::Control;
@@ -47,7 +49,7 @@ use crate::regressors::Record;
 /// // y is the integral of order 0.8 of u: D^0.8 y = u.
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-/// let lattice = Lattice::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+/// let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
 /// let found = search(&[record], &lattice, &[None], &Options::default(), &Control::default())?;
 /// assert_eq!(lattice.structure(found.rows[0].index).order, 0.8);
 /// assert!((found.rows[0].coefficients[0] - 1.0).abs() < 1e-9);
@@ -55,77 +57,79 @@ use crate::regressors::Record;
 /// ```
 pub fn search(
     records: &[Record],
-    lattice: &Lattice,
+    lattice: &OrderGrid,
     fixed: &[Option<f64>],
     options: &Options,
     control: &Control,
 ) -> Result<Outcome> {
     let pool = pool(options.threads)?;
-    let ready = Search::new(records, Cow::Borrowed(lattice), fixed, options, &pool, control)?;
+    let ready = BatchEvaluator::new(records, Cow::Borrowed(lattice), fixed, options, &pool, control)?;
     let mut all = Part::default();
     let mut first = 0;
-    for last in waves(rounds(lattice.count(), options)) {
+    for last in generation_ends(batch_count(lattice.count(), options)) {
         let seed = all.seed();
-        all.join(ready.rounds(first, last, &seed, None, &pool, control)?, options.keep);
+        all.join(ready.evaluate_batches(first, last, &seed, None, &pool, control)?, options.top);
         first = last;
     }
     Ok(all.outcome(options.norm, ready.catalogue.problem.samples()))
 }
 
-/// A search over a lattice, ready for its rounds.
-pub struct Search<'a> {
-    catalogue: Catalogue<'a>,
-    /// Where whole boxes of candidates are excluded at once.
-    boxes: Option<Boxes>,
-    /// No candidate above this raw score can be kept, as far as scouts can tell.
+/// Evaluator of an order search, prepared for its batches.
+pub struct BatchEvaluator<'a> {
+    catalogue: CandidateIndex<'a>,
+    /// Branch and bound, if it excludes whole boxes of candidates.
+    boxes: Option<BranchAndBound>,
+    /// Raw score above which no candidate can enter the table, from the initial sample.
     limit: f64,
 }
 
-impl<'a> Search<'a> {
-    /// Builds what all rounds share: regressors, their products, test vectors and a first limit from scouts.
+impl<'a> BatchEvaluator<'a> {
+    /// Build the data shared by all batches: regressors, their products, test vectors and an initial limit.
     ///
     /// # Errors
     /// As [`search`].
     pub fn new(
         records: &[Record],
-        lattice: Cow<'a, Lattice>,
+        lattice: Cow<'a, OrderGrid>,
         fixed: &[Option<f64>],
         options: &Options,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Self> {
         let count = lattice.count();
-        let mut catalogue = Catalogue::new(records, lattice, fixed, options, pool, &control.stop)?;
+        let mut catalogue = CandidateIndex::new(records, lattice, fixed, options, pool, &control.stop)?;
         control.total.store(count, Ordering::Relaxed);
         control.check_stop()?;
         let problem = &catalogue.problem;
-        // Scouts of a few candidates, each refined, would cost as much as the search.
-        let few = problem.refines() && count <= FEW;
-        if few || (problem.bound.is_none() && problem.squares.is_none()) {
+        // An initial sample of few refined candidates would cost as much as the search.
+        let few = problem.refines() && count <= MAX_UNSAMPLED_CANDIDATES;
+        if few || (problem.bound.is_none() && problem.residual_sums.is_none()) {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
-        let pay = count >= BOXED && Boxes::pay(&catalogue);
-        let closely = proved_closely(count, options);
-        let Scouted { mut kept, mut tried, hard, which } =
-            Hunt::new(&catalogue, None, pool, control).scout(pay, closely)?;
+        let pay = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&catalogue);
+        let closely = uses_close_bounds(count, options);
+        let InitialIncumbent { mut kept, mut tried, needs_close_bounds: hard, selected_vectors: which } =
+            BatchEvaluation::new(&catalogue, None, pool, control).find_incumbent(pay, closely)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
-            problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
+            problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&which));
         }
-        // Of equation errors in squares the Gram matrix says all.
-        if pay && catalogue.problem.squares.is_none() && kept.limit < f64::INFINITY {
-            let (adapted, bytes) = catalogue.problem.no_adapted();
-            catalogue.problem.adapted = Some(adapted);
+        // The Gram matrix determines squared equation errors completely.
+        if pay && catalogue.problem.residual_sums.is_none() && kept.limit < f64::INFINITY {
+            let (adapted, bytes) = catalogue.problem.empty_tailored_vectors();
+            catalogue.problem.tailored_vectors = Some(adapted);
             for time in 0.. {
                 let best = kept.rows.first().map(|row| row.index);
-                let Made { vectors, left, again } =
-                    Hunt::new(&catalogue, None, pool, control).made(kept.limit, time, best)?;
-                catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
-                if let Some(adapted) = &mut catalogue.problem.adapted {
-                    adapted.each.extend(vectors);
+                let GeneratedVectors { vectors, open: left, is_worth_repeating: again } =
+                    BatchEvaluation::new(&catalogue, None, pool, control)
+                        .generate_tailored_vectors(kept.limit, time, best)?;
+                catalogue.spare_bytes =
+                    catalogue.spare_bytes.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
+                if let Some(adapted) = &mut catalogue.problem.tailored_vectors {
+                    adapted.vectors.extend(vectors);
                 }
-                // What no vector excludes is likely to be good.
-                Hunt::new(&catalogue, None, pool, control).on_from(&left, &mut kept, &mut tried)?;
+                // Candidates that no vector excludes are likely to be good.
+                BatchEvaluation::new(&catalogue, None, pool, control).refine_from(&left, &mut kept, &mut tried)?;
                 if !again {
                     break;
                 }
@@ -133,32 +137,35 @@ impl<'a> Search<'a> {
         }
         let limit = kept.limit;
         if hard {
-            let spare = catalogue.spare;
-            catalogue.spare -= pool.install(|| catalogue.problem.with_roots(spare));
-            let along = Hunt::new(&catalogue, None, pool, control).along(limit)?;
+            let spare = catalogue.spare_bytes;
+            catalogue.spare_bytes -= pool.install(|| catalogue.problem.add_unstable_zeros(spare));
+            let along = BatchEvaluation::new(&catalogue, None, pool, control).generate_linearized_vectors(limit)?;
             if let Some(along) = along {
-                catalogue.spare = catalogue.spare.saturating_sub(along.held());
-                catalogue.problem.tangents = Some(along);
+                catalogue.spare_bytes = catalogue.spare_bytes.saturating_sub(along.memory_bytes());
+                catalogue.problem.linearized_vectors = Some(along);
             }
         }
-        let mut boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
+        let mut boxes = pool.install(|| if pay { BranchAndBound::new(&catalogue) } else { None });
         control.check_stop()?;
-        // What scouts leave open boxes may leave open, too, and test vectors made for candidates with them.
-        if hard && boxes.is_some() && !Hunt::new(&catalogue, boxes.as_ref(), pool, control).boxes_exclude(limit)? {
+        // Boxes, and tailored test vectors with them, may fail on the candidates that are open in the initial sample.
+        if hard
+            && boxes.is_some()
+            && !BatchEvaluation::new(&catalogue, boxes.as_ref(), pool, control).boxes_are_worthwhile(limit)?
+        {
             boxes = None;
-            catalogue.problem.adapted = None;
+            catalogue.problem.tailored_vectors = None;
         }
         Ok(Self { catalogue, boxes, limit })
     }
 
-    /// Does rounds `first … last − 1` of one wave.
+    /// Evaluate batches `first … last − 1` of one generation.
     ///
-    /// `seed` gives index and raw score of the rows kept before the wave. `from` goes on from a checkpoint of the same
-    /// stretch and seed that holds all rows found since its start; where it stands in a round that visits its candidates
-    /// in another order here (it may on another kind of processor), the stretch is begun again.
+    /// `seed` holds index and raw score of the rows found before the generation. `from` resumes a checkpoint of the
+    /// same range and seed that holds all rows found since its start. The range is restarted if the checkpoint belongs
+    /// to another evaluation order, as on another kind of processor.
     ///
     /// # Errors
-    /// [`crate::error::Error::Interrupted`], or rounds, seed or checkpoint that do not fit this search.
+    /// [`crate::error::Error::Interrupted`], or batches, seed or checkpoint of another search.
     ///
     /// ```
     /// # use std::borrow::Cow;
@@ -166,26 +173,26 @@ impl<'a> Search<'a> {
     /// # use ftlm::order_search::grid::{Lattice, TermAxis};
     /// # use ftlm::order_search::options::Options;
     /// # use ftlm::order_search::result::Part;
-    /// # use ftlm::order_search::batches::{rounds, waves, Search};
+    /// # use ftlm::order_search::batches::{batch_count, generation_ends, BatchEvaluator};
     /// # use ftlm::parallel::pool;
     /// # use ftlm::regressors::Record;
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
     /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
     /// # let record = Record::new(0.1, vec![output, input], None)?;
     /// # let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-    /// # let lattice = Lattice::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+    /// # let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
     /// let (options, control, pool) = (Options::default(), Control::default(), pool(1)?);
-    /// let ready = Search::new(&[record], Cow::Borrowed(&lattice), &[None], &options, &pool, &control)?;
+    /// let evaluator = BatchEvaluator::new(&[record], Cow::Borrowed(&lattice), &[None], &options, &pool, &control)?;
     /// let (mut all, mut first) = (Part::default(), 0);
-    /// for last in waves(rounds(lattice.count(), &options)) {
+    /// for last in generation_ends(batch_count(lattice.count(), &options)) {
     ///     let seed = all.seed();
-    ///     all.join(ready.rounds(first, last, &seed, None, &pool, &control)?, options.keep);
+    ///     all.join(evaluator.evaluate_batches(first, last, &seed, None, &pool, &control)?, options.top);
     ///     first = last;
     /// }
     /// assert_eq!(all.counts.candidates, 4);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn rounds(
+    pub fn evaluate_batches(
         &self,
         first: u64,
         last: u64,
@@ -194,48 +201,54 @@ impl<'a> Search<'a> {
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Part> {
-        let Catalogue { lattice, options, .. } = &self.catalogue;
+        let CandidateIndex { lattice, options, .. } = &self.catalogue;
         let count = lattice.count();
-        let (all, length) = (rounds(count, options), round_length(count, options, algorithm(count, options)));
+        let (all, length) =
+            (batch_count(count, options), batch_size(count, options, algorithm_version(count, options)));
         let begun = from.is_none();
-        let from = from.unwrap_or_else(|| Checkpoint { place: Place::start(first), anew: true, part: Part::default() });
-        if !(first <= from.place.round && from.place.round <= last && last <= all) {
-            let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.round);
-            return Err(another(what));
+        let from = from.unwrap_or_else(|| Checkpoint {
+            place: BatchPosition::start(first),
+            replaces_previous: true,
+            part: Part::default(),
+        });
+        if !(first <= from.place.batch && from.place.batch <= last && last <= all) {
+            let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.batch);
+            return Err(mismatch_error(what));
         }
-        if !from.place.sound() {
-            let Place { followed, end, size, limit, .. } = from.place;
-            return Err(another(format!(
+        if !from.place.is_valid() {
+            let BatchPosition { evaluated_count: followed, end, size, limit, .. } = from.place;
+            return Err(mismatch_error(format!(
                 "a checkpoint stands at {followed} of {end} ({size} at a time, limit {limit})"
             )));
         }
-        if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || strange(*score)) {
-            return Err(another(format!("a row of score {score} has index {index} among {count} candidates")));
+        if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || is_invalid_score(*score)) {
+            return Err(mismatch_error(format!("a row of score {score} has index {index} among {count} candidates")));
         }
         self.check(&from.part)?;
-        // Rounds are spread over the lattice, so that early waves see all of it and later ones get a good limit.
-        let order = visit(all);
-        let mut hunt = Hunt::new(&self.catalogue, self.boxes.as_ref(), pool, control);
+        // Batches are distributed over the grid, so that early generations sample all of it and later ones start with a
+        // good limit.
+        let order = low_discrepancy_order(all);
+        let mut hunt = BatchEvaluation::new(&self.catalogue, self.boxes.as_ref(), pool, control);
         let Checkpoint { mut place, part, .. } = from;
         control.total.store(count, Ordering::Relaxed);
-        let known = part.counts.done();
+        let known = part.counts.processed_count();
         control.count(known, 0);
-        hunt.part = part;
-        hunt.anew = begun;
-        while place.round < last {
-            let start = order(place.round) * length;
+        hunt.result = part;
+        hunt.replaces_previous = begun;
+        while place.batch < last {
+            let start = order(place.batch) * length;
             let bounds = (start, count.min(start + length));
             let own = |row: &Row| bounds.0 <= row.index && row.index < bounds.1;
-            let mut kept = Kept::new(options.keep, self.limit);
+            let mut kept = TopRows::new(options.top, self.limit);
             let seeds = seed.iter().map(|&(index, score)| Row { index, score, coefficients: vec![], initial: vec![] });
-            kept.take(seeds);
-            kept.lower(options.early_stopping);
-            kept.take(hunt.part.rows.iter().filter(|row| own(row)).cloned());
-            hunt.part.rows.retain(|row| !own(row));
-            if !hunt.round(bounds, &mut kept, place)? {
-                // Its candidates would be followed twice or never: what it came to elsewhere is of no use here.
+            kept.insert_rows(seeds);
+            kept.lower_limit(options.pruning);
+            kept.insert_rows(hunt.result.rows.iter().filter(|row| own(row)).cloned());
+            hunt.result.rows.retain(|row| !own(row));
+            if !hunt.evaluate_batch(bounds, &mut kept, place)? {
+                // Its candidates would be evaluated twice or never, so the foreign result is discarded.
                 control.done.fetch_sub(known, Ordering::Relaxed);
-                (hunt.part, hunt.anew, place) = (Part::default(), true, Place::start(first));
+                (hunt.result, hunt.replaces_previous, place) = (Part::default(), true, BatchPosition::start(first));
                 continue;
             }
             let part = Part {
@@ -243,103 +256,107 @@ impl<'a> Search<'a> {
                 counts: Counts { candidates: bounds.1 - bounds.0, ..Counts::default() },
                 failures: Vec::new(),
             };
-            hunt.part.join(part, options.keep);
-            place = Place::start(place.round + 1);
+            hunt.result.join(part, options.top);
+            place = BatchPosition::start(place.batch + 1);
         }
-        Ok(hunt.part)
+        Ok(hunt.result)
     }
 
-    /// Refuses what another search came to.
+    /// Raise an error for a partial result of another search.
     fn check(&self, part: &Part) -> Result<()> {
         let (count, width) = (self.catalogue.lattice.count(), self.catalogue.lattice.width());
-        let other = |row: &Row| row.coefficients.len() != width || row.index >= count || strange(row.score);
+        let other = |row: &Row| row.coefficients.len() != width || row.index >= count || is_invalid_score(row.score);
         if part.rows.iter().any(other) || part.failures.iter().any(|failure| failure.0 >= count) {
-            return Err(another("a checkpoint holds rows of another search".into()));
+            return Err(mismatch_error("a checkpoint holds rows of another search".into()));
         }
-        let done = part.counts.done();
-        if part.counts.boxed > part.counts.bounded {
-            let Counts { boxed, bounded, .. } = part.counts;
-            return Err(another(format!("a checkpoint has {boxed} candidates in boxes among {bounded} excluded ones")));
+        let done = part.counts.processed_count();
+        if part.counts.excluded_by_box > part.counts.excluded_by_bound {
+            let Counts { excluded_by_box: boxed, excluded_by_bound: bounded, .. } = part.counts;
+            return Err(mismatch_error(format!(
+                "a checkpoint has {boxed} candidates in boxes among {bounded} excluded ones"
+            )));
         }
         if done > count || part.counts.candidates > count {
-            return Err(another(format!("a checkpoint accounts for {done} candidates, but there are {count}")));
+            return Err(mismatch_error(format!("a checkpoint accounts for {done} candidates, but there are {count}")));
         }
         Ok(())
     }
 }
 
-/// Whether this is no raw sum of errors.
-fn strange(score: f64) -> bool {
+/// Whether a value cannot be a raw sum of errors.
+fn is_invalid_score(score: f64) -> bool {
     score.is_nan() || score < 0.0
 }
 
-/// Candidates of one round where the Gram matrix alone ranks (16 ns each), where bounds screen (a microsecond or so), and
-/// where every candidate is followed: a round is long enough to be worth sending away, and short enough to be lost.
-const ROUND_PLAIN: u64 = 1 << 18;
-const ROUND_BOUNDED: u64 = 1 << 16;
-const ROUND_FOLLOWED: u64 = 1 << 12;
-/// Candidates from which on boxes may screen ([`crate::order_search::branch_and_bound`]), in rounds that grow with the
-/// lattice up to the longest: the tables of boxes that two rounds share are made twice.
-pub(super) const BOXED: u64 = 1 << 25;
-const ROUND_LONGEST: u64 = 1 << 22;
-/// Candidates from which on those that are ranked by free runs are proved closely: by the zeros of their divisors and by
-/// test vectors that follow coefficients ([`crate::order_search::batches`]). A smaller search is done before these are
-/// made.
-const PROVED: u64 = 1 << 18;
-/// Refined candidates that are followed without scouts, one round of them.
-pub(super) const FEW: u64 = ROUND_FOLLOWED;
+/// Candidates per batch: ranked by the Gram matrix alone (16 ns each), screened by bounds (about 1 µs), all simulated.
+/// A batch is long enough to be sent to another machine, and short enough to be lost.
+const BATCH_SIZE_GRAM: u64 = 1 << 18;
+const BATCH_SIZE_BOUNDED: u64 = 1 << 16;
+const BATCH_SIZE_SIMULATED: u64 = 1 << 12;
+/// Minimum candidates for branch and bound, and maximum batch size. Batches grow with the grid because the tables of
+/// boxes shared by two batches are computed twice.
+pub(super) const MIN_BOX_CANDIDATES: u64 = 1 << 25;
+const MAX_BATCH_SIZE: u64 = 1 << 22;
+/// Minimum candidates for close bounds if simulation ranks: unstable zeros and linearized test vectors. A smaller
+/// search ends before these are built.
+const MIN_CLOSE_BOUND_CANDIDATES: u64 = 1 << 18;
+/// Maximum refined candidates that are evaluated without an initial sample, one batch.
+pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 
-/// Number of the algorithm by which the rounds of a search over so many candidates are cut and done.
+/// Version of the algorithm that divides and evaluates a search over this many candidates.
 #[must_use]
-pub fn algorithm(candidates: u64, options: &Options) -> u64 {
-    let bounded = options.criterion == Criterion::OutputError || (candidates >= BOXED && !options.refines());
-    if options.early_stopping && bounded {
+pub fn algorithm_version(candidates: u64, options: &Options) -> u64 {
+    let bounded =
+        options.criterion == Criterion::OutputError || (candidates >= MIN_BOX_CANDIDATES && !options.refines());
+    if options.pruning && bounded {
         5
     } else {
         1
     }
 }
 
-/// Whether so many candidates are proved closely.
-pub(super) fn proved_closely(candidates: u64, options: &Options) -> bool {
-    candidates >= PROVED && options.scored_by_free_runs()
+/// Whether a search over this many candidates uses close bounds.
+pub(super) fn uses_close_bounds(candidates: u64, options: &Options) -> bool {
+    candidates >= MIN_CLOSE_BOUND_CANDIDATES && options.ranks_by_simulation()
 }
 
-/// Candidates in a round of a search over so many, by this algorithm.
-pub(super) fn round_length(candidates: u64, options: &Options, algorithm: u64) -> u64 {
-    if options.refines() || !options.early_stopping {
-        ROUND_FOLLOWED
-    } else if options.scored_by_products() && algorithm < 3 {
-        ROUND_PLAIN
-    } else if algorithm < 2 || candidates < BOXED {
-        ROUND_BOUNDED
+/// Number of candidates per batch of a search, for this version of the algorithm.
+pub(super) fn batch_size(candidates: u64, options: &Options, algorithm: u64) -> u64 {
+    if options.refines() || !options.pruning {
+        BATCH_SIZE_SIMULATED
+    } else if options.ranks_by_gram_matrix() && algorithm < 3 {
+        BATCH_SIZE_GRAM
+    } else if algorithm < 2 || candidates < MIN_BOX_CANDIDATES {
+        BATCH_SIZE_BOUNDED
     } else {
-        (candidates / (BOXED / ROUND_BOUNDED)).next_power_of_two().clamp(ROUND_BOUNDED, ROUND_LONGEST)
+        (candidates / (MIN_BOX_CANDIDATES / BATCH_SIZE_BOUNDED))
+            .next_power_of_two()
+            .clamp(BATCH_SIZE_BOUNDED, MAX_BATCH_SIZE)
     }
 }
 
-/// Rounds of a search over so many candidates.
+/// Number of batches of a search over this many candidates.
 #[must_use]
-pub fn rounds(candidates: u64, options: &Options) -> u64 {
-    rounds_by(algorithm(candidates, options), candidates, options)
+pub fn batch_count(candidates: u64, options: &Options) -> u64 {
+    batch_count_by_version(algorithm_version(candidates, options), candidates, options)
 }
 
-/// The same by an earlier algorithm, whose finished rounds are still to be read.
+/// Number of batches for an earlier version of the algorithm, whose completed batches must be read.
 #[must_use]
-pub fn rounds_by(algorithm: u64, candidates: u64, options: &Options) -> u64 {
-    candidates.div_ceil(round_length(candidates, options, algorithm))
+pub fn batch_count_by_version(algorithm: u64, candidates: u64, options: &Options) -> u64 {
+    candidates.div_ceil(batch_size(candidates, options, algorithm))
 }
 
-/// Where each wave of so many rounds ends: 1, 3, 7, …
+/// End of each generation for this number of batches: 1, 3, 7, …
 ///
 /// ```
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::order_search::batches::{rounds, waves};
-/// let rounds = rounds(400_000, &Options::default());
-/// assert_eq!((rounds, waves(rounds)), (7, vec![1, 3, 7]));
+/// let batches = batch_count(400_000, &Options::default());
+/// assert_eq!((batches, generation_ends(batches)), (7, vec![1, 3, 7]));
 /// ```
 #[must_use]
-pub fn waves(rounds: u64) -> Vec<u64> {
+pub fn generation_ends(rounds: u64) -> Vec<u64> {
     let mut ends = Vec::new();
     let mut end: u64 = 0;
     while end < rounds {

@@ -1,55 +1,58 @@
-//! Scouts: candidates tried beforehand, all over the lattice, which give a first good score and choose the test vectors.
+//! Incumbent of a search from an initial sample of the grid and a local refinement.
 //!
-//! What is learnt around the best of the scouts: a limit that is all but the last one.
+//! The sample also selects the test vectors.
 
 use std::collections::HashSet;
 
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::order_search::batches::batch::Hunt;
-use crate::order_search::batches::vector_generation::thinned;
+use crate::order_search::batches::batch::BatchEvaluation;
+use crate::order_search::batches::vector_generation::subsample;
 use crate::order_search::candidate::columns::Columns;
 use crate::order_search::candidate::normal_equations::Solve;
-use crate::order_search::control::Place;
-use crate::order_search::grid::traversal::{visit, Cursor};
-use crate::order_search::result::Kept;
-use crate::order_search::screening::{by_guess, screen, Open};
+use crate::order_search::control::BatchPosition;
+use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor};
+use crate::order_search::result::TopRows;
+use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 
-/// Candidates tried beforehand, spread over the lattice: they choose the test vectors and give the first good score.
-const SCOUTS: u64 = 2048;
-/// Test vectors that a search works with.
-const VECTORS: usize = 16;
-/// Candidates among which the most likely ones are refined beforehand: guesses are cheap, and what is kept of a good
-/// part of the lattice excludes most of it.
-const GUESSED: u64 = 1 << 18;
+/// Candidates of the initial sample, distributed over the grid. They select the test vectors and give the first
+/// incumbent.
+const INITIAL_SAMPLE_CANDIDATES: u64 = 2048;
+/// Maximum test vectors used in a search.
+const MAX_SEARCH_VECTORS: usize = 16;
+/// Candidates among which the most promising are refined first. Estimates are cheap, and rows from a large part of the
+/// grid exclude most of it.
+const RANKED_CANDIDATES: u64 = 1 << 18;
 
-/// Where test vectors leave fewer than one of so many scouts open at the best score that scouts found, closer proofs do
-/// not pay: they left 0.3 to 2 % (and 9 % at twice the noise) where a true equation is near, 53 to 100 % where a search
-/// takes seconds because none is.
-const EASY: usize = 8;
+/// Inverse of the minimum open fraction of the sample for close bounds. Below it they are not worthwhile. Measured: 0.3
+/// to 2 % open (9 % at twice the noise) near a true equation, 53 to 100 % in searches that take seconds because there
+/// is none.
+const HARD_SEARCH_OPEN_RATIO: usize = 8;
 
-/// What scouts came to.
-pub(super) struct Scouted {
-    /// The rows that give a first limit, and what else has been followed.
-    pub(super) kept: Kept,
+/// Incumbent found by the initial sample.
+pub(super) struct InitialIncumbent {
+    /// Rows that give the initial limit, and the candidates evaluated for them.
+    pub(super) kept: TopRows,
     pub(super) tried: HashSet<u64>,
-    /// Whether test vectors leave so many open at it that candidates are to be proved closely.
-    pub(super) hard: bool,
-    /// The test vectors to work with, the best first.
-    pub(super) which: Option<Vec<usize>>,
+    /// Whether so many candidates remain open at this limit that close bounds are worthwhile.
+    pub(super) needs_close_bounds: bool,
+    /// Indices of the selected test vectors, the best first.
+    pub(super) selected_vectors: Option<Vec<usize>>,
 }
 
-impl Hunt<'_> {
-    /// A first limit and test vectors; the neighbours of the best are followed where `thorough` is true. Whether candidates are hard to exclude is asked if `closely`.
-    pub(super) fn scout(&mut self, thorough: bool, closely: bool) -> Result<Scouted> {
+impl BatchEvaluation<'_> {
+    /// Find an initial incumbent and select test vectors. `thorough` also evaluates the neighbors of the best rows.
+    /// `closely` also tests whether close bounds are worthwhile.
+    pub(super) fn find_incumbent(&mut self, thorough: bool, closely: bool) -> Result<InitialIncumbent> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
         let count = lattice.count();
-        let order = visit(count);
+        let order = low_discrepancy_order(count);
         let refined = problem.refines();
-        let indices: Vec<u64> = (0..count.min(if refined { GUESSED } else { SCOUTS })).map(order).collect();
-        let found: Vec<Option<(Open, Vec<f64>)>> = self.pool.install(|| {
+        let indices: Vec<u64> =
+            (0..count.min(if refined { RANKED_CANDIDATES } else { INITIAL_SAMPLE_CANDIDATES })).map(order).collect();
+        let found: Vec<Option<(OpenCandidate, Vec<f64>)>> = self.pool.install(|| {
             indices
                 .par_iter()
                 .map(|&index| {
@@ -74,53 +77,53 @@ impl Hunt<'_> {
                     if let Some(bound) = &problem.bound {
                         if !refined {
                             each = vec![0.0; bound.len()];
-                            bound.each(columns, &mut each);
+                            bound.bound_per_vector(columns, &mut each);
                         }
                         guess = bound.evaluate(f64::INFINITY, columns).1;
-                    } else if let Some(squares) = &problem.squares {
+                    } else if let Some(squares) = &problem.residual_sums {
                         guess = squares.error(&sources, &solve.coefficients).1[0];
                     }
-                    Some((Open { index, bound: 0.0, guess }, each))
+                    Some((OpenCandidate { index, bound: 0.0, guess }, each))
                 })
                 .collect()
         });
         self.check_stop()?;
-        let found: Vec<(Open, Vec<f64>)> = found.into_iter().flatten().collect();
-        let mut likely: Vec<Open> = found.iter().map(|(open, _)| *open).collect();
-        by_guess(&mut likely);
-        let keep = catalogue.options.keep;
+        let found: Vec<(OpenCandidate, Vec<f64>)> = found.into_iter().flatten().collect();
+        let mut likely: Vec<OpenCandidate> = found.iter().map(|(open, _)| *open).collect();
+        sort_by_guess(&mut likely);
+        let keep = catalogue.options.top;
         likely.truncate(keep.max(16).saturating_mul(4));
-        let mut kept = Kept::new(keep, f64::INFINITY);
-        self.follow(&likely, &mut kept, Place::start(0), false)?;
+        let mut kept = TopRows::new(keep, f64::INFINITY);
+        self.simulate_open(&likely, &mut kept, BatchPosition::start(0), false)?;
         let mut tried: HashSet<u64> = likely.iter().map(|open| open.index).collect();
         let many = |limit: f64| {
             let waiting = found.iter().filter(|(_, each)| !each.iter().any(|bound| *bound > limit)).count();
-            waiting * EASY >= found.len()
+            waiting * HARD_SEARCH_OPEN_RATIO >= found.len()
         };
         let mut hard = false;
         if thorough {
-            self.nearby(&mut kept, &mut tried)?;
+            self.refine_incumbent(&mut kept, &mut tried)?;
             hard = closely && many(kept.limit);
         } else if closely && kept.rows.first().is_some_and(|best| many(best.score)) {
-            // The best score of so few is near the last limit, which the worst of those kept is far from.
-            self.nearby(&mut kept, &mut tried)?;
+            // In a small sample the best score is near the final limit. The worst row of the table is not.
+            self.refine_incumbent(&mut kept, &mut tried)?;
             hard = many(kept.limit);
         }
         let limit = kept.limit;
-        // Where no coefficients are known yet all test vectors count.
+        // Without initial coefficients all test vectors are used.
         let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
-            choose(&each, VECTORS.min(bound.len()), limit)
+            select_test_vectors(&each, MAX_SEARCH_VECTORS.min(bound.len()), limit)
         });
-        Ok(Scouted { kept, tried, hard, which })
+        Ok(InitialIncumbent { kept, tried, needs_close_bounds: hard, selected_vectors: which })
     }
 }
 
-/// The test vectors that together exclude most of a sample, those that exclude most by themselves first.
-fn choose(each: &[Vec<f64>], wanted: usize, limit: f64) -> Vec<usize> {
+/// Select the test vectors that together exclude most of a sample, in greedy order.
+fn select_test_vectors(each: &[Vec<f64>], wanted: usize, limit: f64) -> Vec<usize> {
     let mut open: Vec<bool> = vec![true; each.len()];
     let mut chosen: Vec<usize> = Vec::new();
-    // Where one excludes no more than another the smaller threshold tells: how near it comes.
+    // Among vectors with equal exclusions, the one with the larger bounds is preferred.
     let gain = |j: usize, open: &[bool]| -> (usize, f64) {
         let values = each.iter().zip(open).filter(|(_, open)| **open).map(|(e, _)| e[j]);
         values.fold((0, 0.0), |(n, sum), v| (n + usize::from(v > limit), sum + v / (v + limit).max(f64::MIN_POSITIVE)))
@@ -138,58 +141,65 @@ fn choose(each: &[Vec<f64>], wanted: usize, limit: f64) -> Vec<usize> {
     chosen
 }
 
-/// Rows whose neighbours are followed.
-const BEST: usize = 64;
-/// Most candidates followed around the best ones.
-const FOLLOWED: usize = 1 << 14;
-/// Most directions in which neighbours are looked for: all of up to five orders, else pairs of orders.
-const DIRECTIONS: usize = 243;
-/// Stretches of candidates, and their length, among which the hard ones are looked for.
-const SAMPLED: (u64, u64) = (2048, 64);
-/// Most hard candidates that are followed.
-const HARD: usize = 512;
+/// Rows whose neighbors are evaluated.
+const LOCAL_SEARCH_ROWS: usize = 64;
+/// Maximum neighbors evaluated around the best rows.
+const MAX_NEIGHBOR_EVALUATIONS: usize = 1 << 14;
+/// Maximum directions of neighbors: all combinations of up to five orders, else pairs of orders.
+const MAX_NEIGHBOR_DIRECTIONS: usize = 243;
+/// Number of sampled blocks of candidates, and their length.
+const SAMPLE_BLOCKS_AND_LENGTH: (u64, u64) = (2048, 64);
+/// Maximum open candidates that are evaluated.
+const MAX_OPEN_EVALUATIONS: usize = 512;
 
-impl Hunt<'_> {
-    /// Goes down from the best rows, and from what is found all over the lattice by the limit that they give.
-    pub(super) fn nearby(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
-        self.neighbours(kept, tried)?;
-        let hard = self.hard(kept)?;
-        self.on_from(&hard, kept, tried)
+impl BatchEvaluation<'_> {
+    /// Refine the incumbent from the best rows, and from open candidates sampled over the whole grid.
+    pub(super) fn refine_incumbent(&mut self, kept: &mut TopRows, tried: &mut HashSet<u64>) -> Result<()> {
+        self.search_neighbors(kept, tried)?;
+        let hard = self.sample_unexcluded(kept)?;
+        self.refine_from(&hard, kept, tried)
     }
 
-    /// Follows these and goes down from the best.
-    pub(super) fn on_from(&mut self, open: &[Open], kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
-        let anew: Vec<Open> = open.iter().filter(|open| tried.insert(open.index)).copied().collect();
-        self.follow(&anew, kept, Place::start(0), false)?;
-        self.neighbours(kept, tried)
+    /// Evaluate these candidates, then search around the best rows.
+    pub(super) fn refine_from(
+        &mut self,
+        open: &[OpenCandidate],
+        kept: &mut TopRows,
+        tried: &mut HashSet<u64>,
+    ) -> Result<()> {
+        let anew: Vec<OpenCandidate> = open.iter().filter(|open| tried.insert(open.index)).copied().collect();
+        self.simulate_open(&anew, kept, BatchPosition::start(0), false)?;
+        self.search_neighbors(kept, tried)
     }
 
-    /// Follows neighbours of the best rows, far ones first, until none is better.
-    pub(super) fn neighbours(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
+    /// Evaluate neighbors of the best rows, distant ones first, until none improves them.
+    pub(super) fn search_neighbors(&mut self, kept: &mut TopRows, tried: &mut HashSet<u64>) -> Result<()> {
         let lattice = &*self.catalogue.lattice;
         let longest = lattice.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
         let longest = longest.chain([lattice.blocks().len()]).max().unwrap_or(1);
         let mut stride = (longest / 8).max(1).next_power_of_two();
         let first = tried.len();
         while stride > 0 {
-            let best = |kept: &Kept| kept.rows.iter().take(BEST).map(|row| row.index).collect::<Vec<u64>>();
+            let best =
+                |kept: &TopRows| kept.rows.iter().take(LOCAL_SEARCH_ROWS).map(|row| row.index).collect::<Vec<u64>>();
             let before = best(kept);
-            let mut around: Vec<u64> = before.iter().flat_map(|&index| self.around(index, stride)).collect();
+            let mut around: Vec<u64> = before.iter().flat_map(|&index| self.grid_neighbors(index, stride)).collect();
             around.retain(|&index| tried.insert(index));
-            let open: Vec<Open> = around.iter().map(|&index| Open { index, bound: 0.0, guess: 0.0 }).collect();
-            self.follow(&open, kept, Place::start(0), false)?;
+            let open: Vec<OpenCandidate> =
+                around.iter().map(|&index| OpenCandidate { index, bound: 0.0, guess: 0.0 }).collect();
+            self.simulate_open(&open, kept, BatchPosition::start(0), false)?;
             if best(kept) == before {
                 stride /= 2;
             }
-            if tried.len() - first > FOLLOWED {
+            if tried.len() - first > MAX_NEIGHBOR_EVALUATIONS {
                 break;
             }
         }
         Ok(())
     }
 
-    /// Neighbours of a candidate at this distance in any of its orders that vary.
-    fn around(&self, index: u64, stride: usize) -> Vec<u64> {
+    /// Neighbors of a candidate at this distance in any of its varying orders.
+    fn grid_neighbors(&self, index: u64, stride: usize) -> Vec<u64> {
         let lattice = &*self.catalogue.lattice;
         let cursor = Cursor::at(lattice, index);
         let mut here = vec![0; lattice.width()];
@@ -198,11 +208,14 @@ impl Hunt<'_> {
         for group in lattice.groups() {
             group.terms.iter().zip(&group.axes).for_each(|(&term, axis)| lengths[term] = axis.len());
         }
-        // The order of the equation itself comes last.
+        // The order of the equation comes last.
         here.push(cursor.block());
         lengths.push(lattice.blocks().len());
         let vary: Vec<usize> = (0..here.len()).filter(|&i| lengths[i] > 1).collect();
-        let whole = u32::try_from(vary.len()).ok().and_then(|n| 3_usize.checked_pow(n)).filter(|n| *n <= DIRECTIONS);
+        let whole = u32::try_from(vary.len())
+            .ok()
+            .and_then(|n| 3_usize.checked_pow(n))
+            .filter(|n| *n <= MAX_NEIGHBOR_DIRECTIONS);
         let moves: Vec<Vec<(usize, usize)>> = match whole {
             Some(count) => (1..count)
                 .map(|number| {
@@ -232,20 +245,20 @@ impl Hunt<'_> {
         moves.into_iter().filter_map(there).collect()
     }
 
-    /// Some candidates all over the lattice that no bound excludes, the most likely first.
-    fn hard(&mut self, kept: &Kept) -> Result<Vec<Open>> {
+    /// Sample of candidates that no bound excludes, the most promising first.
+    fn sample_unexcluded(&mut self, kept: &TopRows) -> Result<Vec<OpenCandidate>> {
         let catalogue = self.catalogue;
-        if catalogue.problem.squares.is_none() {
-            return Ok(self.waiting(kept.limit, 0)?.0);
+        if catalogue.problem.residual_sums.is_none() {
+            return Ok(self.sample_open(kept.limit, 0)?.0);
         }
-        let (count, (stretches, length)) = (catalogue.lattice.count(), SAMPLED);
-        let order = visit(count.div_ceil(length));
+        let (count, (stretches, length)) = (catalogue.lattice.count(), SAMPLE_BLOCKS_AND_LENGTH);
+        let order = low_discrepancy_order(count.div_ceil(length));
         let starts: Vec<u64> = (0..stretches.min(count.div_ceil(length))).map(|i| order(i) * length).collect();
-        let mut hard: Vec<Open> = self.pool.install(|| {
+        let mut hard: Vec<OpenCandidate> = self.pool.install(|| {
             starts.par_iter().flat_map(|&at| screen(catalogue, at, count.min(at + length), kept.limit).0).collect()
         });
         self.check_stop()?;
-        by_guess(&mut hard);
-        Ok(thinned(&hard, HARD))
+        sort_by_guess(&mut hard);
+        Ok(subsample(&hard, MAX_OPEN_EVALUATIONS))
     }
 }

@@ -1,8 +1,8 @@
-//! A search over a lattice, round by round.
+//! Batch evaluation of an order search over one equation.
 
 mod batch;
 mod evaluator;
 mod incumbent;
 mod vector_generation;
 
-pub use evaluator::{algorithm, rounds, rounds_by, search, waves, Search};
+pub use evaluator::{algorithm_version, batch_count, batch_count_by_version, generation_ends, search, BatchEvaluator};

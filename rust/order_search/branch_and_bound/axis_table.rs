@@ -1,60 +1,61 @@
-//! One order of a slab: what its values make of everything that the bound asks for, and how far from straight that runs.
+//! Axis tables of one order of a slice: projections, coefficients and deviations from linearity.
 //!
-//! Column x of each value is taken to û, what the slab's other columns leave of it, of unit size. Over a stretch of
-//! values any quantity is its straight line between the ends, within an eighth of the stretch's length squared times
-//! the largest second difference between: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi − i)/2.
+//! û is the column x of a value after projection on the slice's remaining columns, scaled to unit norm. Over an
+//! interval any quantity deviates from linear interpolation between the ends by at most one eighth of the squared
+//! length times the largest second difference: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi −
+//! i)/2.
 
 use crate::order_search::candidate::normal_equations::Normal;
-use crate::order_search::dual_bound::test_vectors::{Probes, NONE};
-use crate::simd::WIDTH;
+use crate::order_search::dual_bound::test_vectors::{TestVectors, NO_INDEX};
+use crate::simd::LANE_COUNT;
 
 /// One value for each of [`WIDTH`] test vectors.
-pub(super) type Wide = [f64; WIDTH];
-pub(super) const ZERO: Wide = [0.0; WIDTH];
+pub(super) type Wide = [f64; LANE_COUNT];
+pub(super) const ZERO_LANES: Wide = [0.0; LANE_COUNT];
 
 /// ⟨t, x⟩ and g‖t‖, real and imaginary parts.
-pub(super) type Seen = [Wide; 4];
+pub(super) type VectorProducts = [Wide; 4];
 
-/// Of a stretch of 2^l values: what its inner ones differ from straight by, and its largest values.
+/// Second differences and largest values over an interval of 2^l values.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
-    /// Largest second differences of ⟨t, û⟩ and of g‖t‖, largest ‖Fᵀt − g t‖ and way from that of the partner.
-    pub(super) bent: [Wide; 4],
+    /// Largest second differences of ⟨t, û⟩ and g‖t‖, largest ‖Fᵀt − g t‖, and its distance from that of the partner.
+    pub(super) second_differences: [Wide; 4],
 }
 
-/// The same of numbers that no test vector enters.
+/// Largest sums of coefficients over an interval, independent of the test vectors.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Plain {
+pub(super) struct CoefficientSums {
     /// Largest sum of the moduli of û's coefficients.
     pub(super) sum: f64,
 }
 
-/// Stretches of one length.
+/// Intervals of one length.
 pub(super) struct Level {
-    pub(super) plain: Vec<Plain>,
-    /// Largest second differences of the coefficients of û on the other columns, k a stretch.
+    pub(super) coefficient_sums: Vec<CoefficientSums>,
+    /// Largest second differences of û's coefficients on the remaining columns, k per interval.
     pub(super) mixed: Vec<f64>,
-    /// Groups of test vectors within stretches.
+    /// Groups of test vectors within intervals.
     pub(super) nodes: Vec<Node>,
 }
 
-/// The other columns of a slab.
-pub(super) struct Others<'a> {
+/// Columns of a slice whose orders do not vary.
+pub(super) struct RemainingColumns<'a> {
     pub(super) normal: &'a Normal,
-    pub(super) probes: &'a [Probes],
-    /// Their columns and the inverse of their correlations.
+    pub(super) test_vectors: &'a [TestVectors],
+    /// Remaining columns and the inverse of their correlation matrix.
     pub(super) columns: &'a [usize],
     pub(super) inverse: &'a [f64],
-    /// Sum of its diagonal.
+    /// Trace of that inverse.
     pub(super) trace: f64,
-    /// What rounding may add to a product of unit columns.
+    /// Rounding-error bound of a product of unit columns.
     pub(super) rounding: f64,
-    /// One of the columns that is the output's own, whose coefficient that of an own one of the sides may cancel.
+    /// Remaining column of the output itself. Its coefficient may cancel that of an own column of the sides.
     pub(super) partner: Option<usize>,
 }
 
-impl Others<'_> {
-    /// Coefficients on the other columns of the column with these products.
+impl RemainingColumns<'_> {
+    /// Solve for the coefficients of a column on the remaining columns, given its products with them.
     pub(super) fn solve(&self, products: &[f64], out: &mut [f64]) {
         let k = self.columns.len();
         for (i, out) in out.iter_mut().enumerate() {
@@ -62,36 +63,37 @@ impl Others<'_> {
         }
     }
 
-    /// How far an own column's Fᵀt − g t is from the partner's at most; nothing of another column, or without a partner.
+    /// Upper bound of the distance of an own column's Fᵀt − g t from the partner's. Zero for any other column or
+    /// without a partner.
     #[inline(always)]
-    fn way(&self, record: usize, group: usize, column: usize) -> Wide {
-        let probes = &self.probes[record];
-        let (mut way, row) = (ZERO, probes.rows[column]);
-        if let Some(partner) = self.partner.filter(|_| row != NONE) {
+    fn distance_to_partner(&self, record: usize, group: usize, column: usize) -> Wide {
+        let probes = &self.test_vectors[record];
+        let (mut way, row) = (ZERO_LANES, probes.rows[column]);
+        if let Some(partner) = self.partner.filter(|_| row != NO_INDEX) {
             let at = |row: usize| &probes.effects[row * probes.groups + group][3];
             let (a, b) = (at(row), at(probes.rows[self.columns[partner]]));
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 way[n] = (a[n] - b[n]).abs();
             }
         }
         way
     }
 
-    /// ⟨t, x⟩ and g‖t‖ of a column of unit size, and its ‖Fᵀt − g t‖.
+    /// ⟨t, x⟩ and g‖t‖ of a unit column, and its ‖Fᵀt − g t‖.
     #[inline(always)]
-    pub(super) fn seen(&self, record: usize, group: usize, column: usize) -> (Seen, Wide) {
-        let probes = &self.probes[record];
+    pub(super) fn vector_products(&self, record: usize, group: usize, column: usize) -> (VectorProducts, Wide) {
+        let probes = &self.test_vectors[record];
         let inverse = self.normal.inverse()[column];
         let [re, im] = &probes.products[column * probes.groups + group];
         let row = probes.rows[column];
-        let (mut seen, mut rest) = ([ZERO; 4], ZERO);
-        for n in 0..WIDTH {
+        let (mut seen, mut rest) = ([ZERO_LANES; 4], ZERO_LANES);
+        for n in 0..LANE_COUNT {
             seen[0][n] = re[n] * inverse;
             seen[1][n] = im[n] * inverse;
         }
-        if row != NONE {
+        if row != NO_INDEX {
             let [a, b, c, _] = &probes.effects[row * probes.groups + group];
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 seen[2][n] = a[n] * inverse;
                 seen[3][n] = b[n] * inverse;
                 rest[n] = c[n] * inverse;
@@ -101,27 +103,27 @@ impl Others<'_> {
     }
 }
 
-/// One order of a slab, over these values.
-pub(super) struct Side {
+/// Tables along one order of a slice.
+pub(super) struct AxisTable {
     pub(super) columns: Vec<usize>,
-    /// 1/‖x − its part along the others‖, and û·y.
+    /// 1/‖x − its projection on the remaining columns‖, and û·y.
     pub(super) scale: Vec<f64>,
     pub(super) target: Vec<f64>,
-    /// Products with the other columns, and û's coefficients on them (to be subtracted), k a value.
+    /// Products with the remaining columns, and û's coefficients on them (to be subtracted), k per value.
     pub(super) shared: Vec<f64>,
     pub(super) mixed: Vec<f64>,
-    /// What is to be subtracted for û from the coefficient on the partner and that on the order's own column together,
-    /// as if both were the partner; nothing where there is none.
+    /// Coefficient of û on the partner plus that on the own column, as if both were the partner. Empty without a
+    /// partner.
     pub(super) paired: Vec<f64>,
     /// Groups of test vectors within values.
-    pub(super) seen: Vec<Seen>,
+    pub(super) vector_products: Vec<VectorProducts>,
     pub(super) levels: Vec<Level>,
 }
 
-impl Side {
-    /// Over these columns; none where one of them is all but a combination of the others.
+impl AxisTable {
+    /// Build the tables for these columns. `None` if a column is nearly a combination of the remaining columns.
     #[inline(always)]
-    pub(super) fn new(others: &Others<'_>, columns: Vec<usize>) -> Option<Self> {
+    pub(super) fn new(others: &RemainingColumns<'_>, columns: Vec<usize>) -> Option<Self> {
         let (k, n, normal) = (others.columns.len(), columns.len(), others.normal);
         let (mut scale, mut target, mut shared) = (vec![0.0; n], vec![0.0; n], vec![0.0; n * k]);
         let (mut mixed, mut raw) = (vec![0.0; n * k], vec![0.0; n * k]);
@@ -133,7 +135,7 @@ impl Side {
             others.solve(shared, raw);
             let left = 1.0 - shared.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
             let sum = 1.0 + raw.iter().map(|a| a.abs()).sum::<f64>();
-            // What is not a number ends here too.
+            // This also rejects NaN.
             if left.is_nan() || left <= 1e3 * others.rounding * others.trace * sum * sum {
                 return None;
             }
@@ -144,31 +146,32 @@ impl Side {
                 *m = a * scale[i];
             }
         }
-        let groups: usize = others.probes.iter().map(|p| p.groups).sum();
+        let groups: usize = others.test_vectors.iter().map(|p| p.groups).sum();
         let mut seen = Vec::with_capacity(n * groups);
         let mut rests = Vec::with_capacity(n * groups);
-        let mut sound = ZERO;
+        let mut sound = ZERO_LANES;
         let mut paired = Vec::new();
         if let Some(partner) = others.partner {
             let inverse = normal.inverse();
-            let own = others.probes.first().is_some_and(|probes| columns.iter().all(|&p| probes.rows[p] != NONE));
+            let own =
+                others.test_vectors.first().is_some_and(|probes| columns.iter().all(|&p| probes.rows[p] != NO_INDEX));
             paired.extend(columns.iter().enumerate().map(|(i, &p)| {
                 let alone = if own { scale[i] * inverse[p] / inverse[others.columns[partner]] } else { 0.0 };
                 mixed[i * k + partner] - alone
             }));
         }
-        let along: Vec<Vec<Seen>> = others
+        let along: Vec<Vec<VectorProducts>> = others
             .columns
             .iter()
-            .map(|&s| each_group(others.probes).map(|(r, g)| others.seen(r, g, s).0).collect())
+            .map(|&s| vector_groups(others.test_vectors).map(|(r, g)| others.vector_products(r, g, s).0).collect())
             .collect();
         for (i, &column) in columns.iter().enumerate() {
-            for (at, (r, g)) in each_group(others.probes).enumerate() {
-                let (mut here, mut rest) = others.seen(r, g, column);
+            for (at, (r, g)) in vector_groups(others.test_vectors).enumerate() {
+                let (mut here, mut rest) = others.vector_products(r, g, column);
                 for (s, along) in along.iter().enumerate() {
                     let a = raw[i * k + s];
                     for (here, along) in here.iter_mut().zip(&along[at]) {
-                        for n in 0..WIDTH {
+                        for n in 0..LANE_COUNT {
                             here[n] -= a * along[n];
                         }
                     }
@@ -176,11 +179,11 @@ impl Side {
                 for here in &mut here {
                     here.iter_mut().for_each(|v| *v *= scale[i]);
                 }
-                let mut way = others.way(r, g, column);
+                let mut way = others.distance_to_partner(r, g, column);
                 rest.iter_mut().for_each(|v| *v *= scale[i]);
                 way.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
                 for values in here.iter().chain([&rest, &way]) {
-                    for n in 0..WIDTH {
+                    for n in 0..LANE_COUNT {
                         sound[n] += 0.0 * values[n];
                     }
                 }
@@ -188,16 +191,17 @@ impl Side {
                 rests.push([rest, way]);
             }
         }
-        // What is not a number, or none that anything follows from, ends here: no multiple of it is 0.
+        // Reject NaN and infinity, whose multiple by 0 is NaN.
         if sound.iter().any(|v| v.is_nan()) {
             return None;
         }
-        let mut side = Self { columns, scale, target, shared, mixed, paired, seen, levels: Vec::new() };
+        let mut side =
+            Self { columns, scale, target, shared, mixed, paired, vector_products: seen, levels: Vec::new() };
         side.build(k, groups, &rests);
         Some(side)
     }
 
-    /// Stretches of 1, 2, 4, … values.
+    /// Build the levels with intervals of 1, 2, 4, … values.
     #[inline(always)]
     fn build(&mut self, k: usize, groups: usize, rests: &[[Wide; 2]]) {
         let n = self.columns.len();
@@ -207,11 +211,14 @@ impl Side {
         };
         // Second differences at a value.
         let bent = |i: usize, g: usize| -> [Wide; 2] {
-            let (a, b, c) =
-                (&self.seen[(i - 1) * groups + g], &self.seen[i * groups + g], &self.seen[(i + 1) * groups + g]);
-            let mut out = [ZERO; 2];
+            let (a, b, c) = (
+                &self.vector_products[(i - 1) * groups + g],
+                &self.vector_products[i * groups + g],
+                &self.vector_products[(i + 1) * groups + g],
+            );
+            let mut out = [ZERO_LANES; 2];
             for half in 0..2 {
-                for n in 0..WIDTH {
+                for n in 0..LANE_COUNT {
                     let re = (a[2 * half][n] - b[2 * half][n]) + (c[2 * half][n] - b[2 * half][n]);
                     let im = (a[2 * half + 1][n] - b[2 * half + 1][n]) + (c[2 * half + 1][n] - b[2 * half + 1][n]);
                     out[half][n] = (re * re + im * im).sqrt();
@@ -220,14 +227,17 @@ impl Side {
             out
         };
         let mut levels = vec![Level {
-            plain: (0..n)
+            coefficient_sums: (0..n)
                 .map(|i| {
                     let mixed: f64 = self.mixed[i * k..(i + 1) * k].iter().map(|m| m.abs()).sum();
-                    Plain { sum: self.scale[i] + mixed }
+                    CoefficientSums { sum: self.scale[i] + mixed }
                 })
                 .collect(),
             mixed: vec![0.0; n * k],
-            nodes: rests.iter().map(|&[rest, way]| Node { bent: [ZERO, ZERO, rest, way] }).collect(),
+            nodes: rests
+                .iter()
+                .map(|&[rest, way]| Node { second_differences: [ZERO_LANES, ZERO_LANES, rest, way] })
+                .collect(),
         }];
         let mut length = 1;
         while length < n {
@@ -235,20 +245,21 @@ impl Side {
             let halves = n.div_ceil(length);
             let count = n.div_ceil(2 * length);
             let mut level = Level {
-                plain: Vec::with_capacity(count),
+                coefficient_sums: Vec::with_capacity(count),
                 mixed: Vec::with_capacity(count * k),
                 nodes: Vec::with_capacity(count * groups),
             };
             for node in 0..count {
                 let (left, right) = (2 * node, 2 * node + 1);
-                let mut all = below.plain[left];
+                let mut all = below.coefficient_sums[left];
                 let start = level.mixed.len();
                 level.mixed.extend_from_slice(&below.mixed[left * k..(left + 1) * k]);
                 if right < halves {
-                    // The last of the left half and the first of the right one are now within, unless it is the end.
+                    // The last value of the left half and the first of the right half become inner values, except at
+                    // the end.
                     let joint = right * length;
                     let inner = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
-                    all.sum = all.sum.max(below.plain[right].sum);
+                    all.sum = all.sum.max(below.coefficient_sums[right].sum);
                     for s in 0..k {
                         let mut value = level.mixed[start + s].max(below.mixed[right * k + s]);
                         for i in [joint - 1, joint] {
@@ -261,12 +272,12 @@ impl Side {
                     for g in 0..groups {
                         let mut node = below.nodes[left * groups + g];
                         let mut most = |part: usize, with: &Wide| {
-                            for (most, with) in node.bent[part].iter_mut().zip(with) {
+                            for (most, with) in node.second_differences[part].iter_mut().zip(with) {
                                 *most = most.max(*with);
                             }
                         };
                         let other = &below.nodes[right * groups + g];
-                        (0..4).for_each(|part| most(part, &other.bent[part]));
+                        (0..4).for_each(|part| most(part, &other.second_differences[part]));
                         for i in [joint - 1, joint] {
                             if inner(i) {
                                 let [a, b] = bent(i, g);
@@ -279,7 +290,7 @@ impl Side {
                 } else {
                     level.nodes.extend_from_slice(&below.nodes[left * groups..(left + 1) * groups]);
                 }
-                level.plain.push(all);
+                level.coefficient_sums.push(all);
             }
             levels.push(level);
             length *= 2;
@@ -288,7 +299,7 @@ impl Side {
     }
 }
 
-/// All groups of test vectors: record and number.
-pub(super) fn each_group(probes: &[Probes]) -> impl Iterator<Item = (usize, usize)> + '_ {
+/// All groups of test vectors: record and group number.
+pub(super) fn vector_groups(probes: &[TestVectors]) -> impl Iterator<Item = (usize, usize)> + '_ {
     probes.iter().enumerate().flat_map(|(r, probes)| (0..probes.groups).map(move |g| (r, g)))
 }

@@ -1,71 +1,87 @@
-//! The candidates of a slab that no box excludes: boxes are halved until they are excluded or small.
+//! Bisection of the boxes of a slice until they are excluded or small, and screening of the remaining candidates.
 
 use std::borrow::Cow;
 use std::ops::Range;
 
 use crate::error::Result;
 use crate::linalg::small;
-use crate::order_search::branch_and_bound::axis_table::{Others, Side};
-use crate::order_search::branch_and_bound::box_bound::{Common, Slab, Stretch, Strip, MOST_OTHERS};
+use crate::order_search::branch_and_bound::axis_table::{AxisTable, RemainingColumns};
+use crate::order_search::branch_and_bound::box_bound::{
+    Interval, RowCoefficients, SearchConstants, SliceTables, MAX_REMAINING_COLUMNS,
+};
 use crate::order_search::candidate::problem::Problem;
-use crate::order_search::candidate_index::Catalogue;
+use crate::order_search::candidate_index::CandidateIndex;
 use crate::order_search::dual_bound::lower_bound::Bound;
-use crate::order_search::dual_bound::test_vectors::{Probes, NONE};
+use crate::order_search::dual_bound::test_vectors::{TestVectors, NO_INDEX};
 use crate::order_search::grid::traversal::{self, Cursor};
-use crate::order_search::grid::Lattice;
+use crate::order_search::grid::OrderGrid;
 use crate::order_search::options::{Criterion, Estimator, Norm, Options};
-use crate::order_search::screening::{Open, Screen};
+use crate::order_search::screening::{OpenCandidate, Screen};
 use crate::parallel::{pool, Stop};
 use crate::regressors::Record;
-use crate::simd::{self, WIDTH};
+use crate::simd::{self, LANE_COUNT};
 
-/// Fewest candidates of a slab for which its tables pay.
-pub(crate) const LEAST: u64 = 4096;
-/// Levels that a box begins with: stretches of 32 values.
-const COARSE: usize = 5;
-/// Levels, of both orders together, below which candidates are screened one by one.
-const FINE: usize = 4;
+/// Minimum number of candidates of a slice for which its tables are worthwhile.
+pub(crate) const MIN_SLICE_CANDIDATES: u64 = 4096;
+/// Initial level of a box: intervals of 32 values.
+const INITIAL_BOX_LEVEL: usize = 5;
+/// Sum of both levels at or below which candidates are screened individually.
+const SCREENING_LEVEL_SUM: usize = 4;
 
-/// What all boxes of a search share.
-pub(crate) struct Boxes {
-    common: Common,
+/// Constants of branch and bound, shared by all boxes of a search.
+pub(crate) struct BranchAndBound {
+    common: SearchConstants,
     rounding: f64,
 }
 
-impl Boxes {
-    /// Whether boxes can be had for a search and pay: it ranks by free runs at rest or by squared equation errors, its
-    /// coefficients are all least squares', and some slab is large.
-    pub(crate) fn pay(catalogue: &Catalogue<'_>) -> bool {
+impl BranchAndBound {
+    /// Whether branch and bound applies to a search and is worthwhile. It needs ranking by simulation with zero initial
+    /// conditions or by squared equation error, least-squares coefficients, and a large slice.
+    pub(crate) fn is_worthwhile(catalogue: &CandidateIndex<'_>) -> bool {
         let (options, lattice) = (&catalogue.options, &*catalogue.lattice);
-        options.early_stopping
+        options.pruning
             && options.estimator == Estimator::LeastSquares
-            && (options.criterion == Criterion::OutputError || options.scored_by_products())
-            && catalogue.problem.equations.whole().is_some()
-            && (2..=MOST_OTHERS + 2).contains(&lattice.width())
-            && lattice
-                .blocks()
-                .iter()
-                .any(|block| lattice.slab(block.start).is_some_and(|slab| lattice.largest(&slab) >= LEAST))
+            && (options.criterion == Criterion::OutputError || options.ranks_by_gram_matrix())
+            && catalogue.problem.equations.unconstrained_equations().is_some()
+            && (2..=MAX_REMAINING_COLUMNS + 2).contains(&lattice.width())
+            && lattice.blocks().iter().any(|block| {
+                lattice
+                    .slice_at(block.start)
+                    .is_some_and(|slab| lattice.max_slice_candidates(&slab) >= MIN_SLICE_CANDIDATES)
+            })
     }
 
-    /// What they share; none where there is no bound, or where it would need too much memory. Runs on the current thread
-    /// pool.
-    pub(crate) fn new(catalogue: &Catalogue<'_>) -> Option<Self> {
+    /// Compute the shared constants. `None` without a dual bound. Runs on the current thread pool.
+    pub(crate) fn new(catalogue: &CandidateIndex<'_>) -> Option<Self> {
         let problem = &catalogue.problem;
-        let (probes, normal) = (probes(problem)?, problem.equations.whole()?);
+        let (probes, normal) = (test_vectors_of(problem)?, problem.equations.unconstrained_equations()?);
         #[allow(clippy::cast_precision_loss)]
         let rounding = f64::EPSILON * problem.samples() as f64;
-        let others = Others { normal, probes, columns: &[], inverse: &[], trace: 0.0, rounding, partner: None };
-        let common = Common::new(&others, catalogue.options.norm, problem.squares.is_some(), problem.size());
+        let others = RemainingColumns {
+            normal,
+            test_vectors: probes,
+            columns: &[],
+            inverse: &[],
+            trace: 0.0,
+            rounding,
+            partner: None,
+        };
+        let common =
+            SearchConstants::new(&others, catalogue.options.norm, problem.residual_sums.is_some(), problem.size());
         Some(Self { common, rounding })
     }
 
-    fn others<'a>(&self, catalogue: &'a Catalogue<'_>, columns: &'a [usize], inverse: &'a [f64]) -> Option<Others<'a>> {
-        let (k, probes) = (columns.len(), probes(&catalogue.problem)?);
-        let partner = probes.first().and_then(|probes| columns.iter().position(|&p| probes.rows[p] != NONE));
-        Some(Others {
-            normal: catalogue.problem.equations.whole()?,
-            probes,
+    fn remaining_columns<'a>(
+        &self,
+        catalogue: &'a CandidateIndex<'_>,
+        columns: &'a [usize],
+        inverse: &'a [f64],
+    ) -> Option<RemainingColumns<'a>> {
+        let (k, probes) = (columns.len(), test_vectors_of(&catalogue.problem)?);
+        let partner = probes.first().and_then(|probes| columns.iter().position(|&p| probes.rows[p] != NO_INDEX));
+        Some(RemainingColumns {
+            normal: catalogue.problem.equations.unconstrained_equations()?,
+            test_vectors: probes,
             partner,
             columns,
             inverse,
@@ -75,38 +91,38 @@ impl Boxes {
     }
 }
 
-/// The test vectors of a search, which has none where squared equation errors rank; none at all where nothing is proved.
-fn probes(problem: &Problem) -> Option<&[Probes]> {
-    match (&problem.squares, &problem.bound) {
+/// Test vectors of a search. Empty if squared equation errors rank, `None` if no bound exists.
+fn test_vectors_of(problem: &Problem) -> Option<&[TestVectors]> {
+    match (&problem.residual_sums, &problem.bound) {
         (Some(_), _) => Some(&[]),
-        (None, bound) => bound.as_ref().map(Bound::probes),
+        (None, bound) => bound.as_ref().map(Bound::test_vectors),
     }
 }
 
-/// Screens candidates `lo … hi − 1` of a slab against a limit: the open ones, and the singular ones among those that no
-/// box excludes; how many are in boxes that are excluded whole. None where boxes prove nothing here.
-pub(crate) fn screen_slab(
-    catalogue: &Catalogue<'_>,
-    boxes: &Boxes,
-    slab: &traversal::Slab,
+/// Screen candidates `lo … hi − 1` of a slice against a limit. Return the candidates not excluded, the singular ones
+/// outside excluded boxes, and the number of candidates in excluded boxes. `None` if boxes prove nothing in this slice.
+pub(crate) fn screen_slice(
+    catalogue: &CandidateIndex<'_>,
+    boxes: &BranchAndBound,
+    slab: &traversal::GridSlice,
     (lo, hi): (u64, u64),
     limit: f64,
-) -> Option<(Vec<Open>, Vec<u64>, u64)> {
-    simd::widest(Walk { catalogue, boxes, slab, lo, hi, limit })
+) -> Option<(Vec<OpenCandidate>, Vec<u64>, u64)> {
+    simd::dispatch_simd(SliceScreening { catalogue, boxes, slab, lo, hi, limit })
 }
 
-/// [`screen_slab`] as a kernel.
-struct Walk<'a> {
-    catalogue: &'a Catalogue<'a>,
-    boxes: &'a Boxes,
-    slab: &'a traversal::Slab,
+/// Kernel form of [`screen_slice`].
+struct SliceScreening<'a> {
+    catalogue: &'a CandidateIndex<'a>,
+    boxes: &'a BranchAndBound,
+    slab: &'a traversal::GridSlice,
     lo: u64,
     hi: u64,
     limit: f64,
 }
 
-impl simd::Kernel for Walk<'_> {
-    type Output = Option<(Vec<Open>, Vec<u64>, u64)>;
+impl simd::Kernel for SliceScreening<'_> {
+    type Output = Option<(Vec<OpenCandidate>, Vec<u64>, u64)>;
 
     #[inline(always)]
     fn run(self) -> Self::Output {
@@ -114,34 +130,34 @@ impl simd::Kernel for Walk<'_> {
         let len = slab.len as u64;
         #[allow(clippy::cast_possible_truncation)]
         let rows = ((lo - slab.lo) / len) as usize..((hi - slab.lo).div_ceil(len)) as usize;
-        let columns = columns(catalogue, slab);
-        let (others, inverse) = others(catalogue, slab, &columns)?;
-        let others = boxes.others(catalogue, &others, &inverse)?;
-        let ready = ready(catalogue, boxes, slab, &others, rows.clone())?;
+        let columns = first_columns(catalogue, slab);
+        let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
+        let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
+        let ready = build_slice_tables(catalogue, boxes, slab, &others, rows.clone())?;
         let start = slab.lo + rows.start as u64 * len;
-        let mut screen = Screen::<WIDTH>::new(columns.len());
-        let (mut found, mut waiting) = ((Vec::new(), Vec::new()), [(0, 0, 0); WIDTH]);
+        let mut screen = Screen::<LANE_COUNT>::new(columns.len());
+        let (mut found, mut waiting) = ((Vec::new(), Vec::new()), [(0, 0, 0); LANE_COUNT]);
         let (mut count, mut boxed) = (0, hi - lo);
         let lengths = [rows.len(), slab.len];
-        let coarse = lengths.map(|n| COARSE.min(n.next_power_of_two().trailing_zeros() as usize));
-        let (mut stack, mut strip) = (Vec::new(), Strip::default());
+        let coarse = lengths.map(|n| INITIAL_BOX_LEVEL.min(n.next_power_of_two().trailing_zeros() as usize));
+        let (mut stack, mut strip) = (Vec::new(), RowCoefficients::default());
         for at in 0..lengths[0].div_ceil(1 << coarse[0]) {
-            ready.lay(&mut strip, at << coarse[0]..lengths[0].min((at + 1) << coarse[0]));
+            ready.compute_coefficients(&mut strip, at << coarse[0]..lengths[0].min((at + 1) << coarse[0]));
             for by in 0..lengths[1].div_ceil(1 << coarse[1]) {
-                stack.push([Stretch { level: coarse[0], at }, Stretch { level: coarse[1], at: by }]);
+                stack.push([Interval { level: coarse[0], at }, Interval { level: coarse[1], at: by }]);
                 while let Some([u, v]) = stack.pop() {
-                    if let Some(cell) = ready.cell(&strip, [u, v]) {
+                    if let Some(cell) = ready.box_quantities(&strip, [u, v]) {
                         if ready.bound([u, v], &cell, limit) > limit {
                             continue;
                         }
                     }
-                    if u.level + v.level > FINE {
+                    if u.level + v.level > SCREENING_LEVEL_SUM {
                         let part = usize::from(v.level > u.level);
                         let halved = [u, v][part];
                         for at in [2 * halved.at + 1, 2 * halved.at] {
                             if at << (halved.level - 1) < lengths[part] {
                                 let mut next = [u, v];
-                                next[part] = Stretch { level: halved.level - 1, at };
+                                next[part] = Interval { level: halved.level - 1, at };
                                 stack.push(next);
                             }
                         }
@@ -157,8 +173,15 @@ impl simd::Kernel for Walk<'_> {
                             boxed -= 1;
                             waiting[count] = (index, ready.sides[0].columns[row], ready.sides[1].columns[value]);
                             count += 1;
-                            if count == WIDTH {
-                                screen.these(catalogue, slab, &columns, &waiting[..count], limit, &mut found);
+                            if count == LANE_COUNT {
+                                screen.screen_slice_candidates(
+                                    catalogue,
+                                    slab,
+                                    &columns,
+                                    &waiting[..count],
+                                    limit,
+                                    &mut found,
+                                );
                                 count = 0;
                             }
                         }
@@ -167,47 +190,51 @@ impl simd::Kernel for Walk<'_> {
             }
         }
         if count > 0 {
-            screen.these(catalogue, slab, &columns, &waiting[..count], limit, &mut found);
+            screen.screen_slice_candidates(catalogue, slab, &columns, &waiting[..count], limit, &mut found);
         }
         let (open, singular) = found;
         Some((open, singular, boxed))
     }
 }
 
-/// Column of every term at the first candidate of a slab.
+/// Column of every term at the first candidate of a slice.
 #[inline(always)]
-fn columns(catalogue: &Catalogue<'_>, slab: &traversal::Slab) -> Vec<usize> {
+fn first_columns(catalogue: &CandidateIndex<'_>, slab: &traversal::GridSlice) -> Vec<usize> {
     slab.digits.iter().enumerate().map(|(term, &digit)| catalogue.columns(slab.block, term)[digit]).collect()
 }
 
-/// Columns of the terms whose orders do not vary, and the inverse of their correlations.
+/// Columns of the terms whose orders do not vary, and the inverse of their correlation matrix.
 #[inline(always)]
-fn others(catalogue: &Catalogue<'_>, slab: &traversal::Slab, columns: &[usize]) -> Option<(Vec<usize>, Vec<f64>)> {
+fn factor_remaining_columns(
+    catalogue: &CandidateIndex<'_>,
+    slab: &traversal::GridSlice,
+    columns: &[usize],
+) -> Option<(Vec<usize>, Vec<f64>)> {
     let others: Vec<usize> =
         (0..columns.len()).filter(|&t| t != slab.outer && t != slab.inner).map(|t| columns[t]).collect();
-    let normal = catalogue.problem.equations.whole()?;
-    let inverse = inverse(&others, |a, b| normal.product(a, b)).ok()?;
+    let normal = catalogue.problem.equations.unconstrained_equations()?;
+    let inverse = inverse_correlation(&others, |a, b| normal.product(a, b)).ok()?;
     Some((others, inverse))
 }
 
-/// The tables of some rows of a slab.
+/// Build the tables of some rows of a slice.
 #[inline(always)]
-fn ready<'a>(
-    catalogue: &Catalogue<'_>,
-    boxes: &'a Boxes,
-    slab: &traversal::Slab,
-    others: &'a Others<'a>,
+fn build_slice_tables<'a>(
+    catalogue: &CandidateIndex<'_>,
+    boxes: &'a BranchAndBound,
+    slab: &traversal::GridSlice,
+    others: &'a RemainingColumns<'a>,
     rows: Range<usize>,
-) -> Option<Slab<'a>> {
+) -> Option<SliceTables<'a>> {
     let columns_of = |term: usize| catalogue.columns(slab.block, term);
     let outer = slab.rows[rows].iter().map(|&digit| columns_of(slab.outer)[digit]).collect();
     let inner = columns_of(slab.inner)[slab.first..slab.first + slab.len].to_vec();
-    let sides = [Side::new(others, outer)?, Side::new(others, inner)?];
-    Some(Slab::new(others, &boxes.common, sides))
+    let sides = [AxisTable::new(others, outer)?, AxisTable::new(others, inner)?];
+    Some(SliceTables::new(others, &boxes.common, sides))
 }
 
-/// Inverse of the correlations of some columns.
-fn inverse(columns: &[usize], product: impl Fn(usize, usize) -> f64) -> Result<Vec<f64>> {
+/// Inverse of the correlation matrix of some columns.
+fn inverse_correlation(columns: &[usize], product: impl Fn(usize, usize) -> f64) -> Result<Vec<f64>> {
     if columns.is_empty() {
         return Ok(Vec::new());
     }
@@ -216,9 +243,9 @@ fn inverse(columns: &[usize], product: impl Fn(usize, usize) -> f64) -> Result<V
     small::inverse(&matrix, columns.len())
 }
 
-/// What is proved of a box of candidates.
+/// Lower bound of the errors of all candidates of a box.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Boxed {
+pub struct BoxBound {
     /// The candidates `first + i·stride + j`, i below `rows` and j below `values`.
     pub first: u64,
     /// See `first`.
@@ -227,15 +254,16 @@ pub struct Boxed {
     pub values: u64,
     /// See `first`.
     pub stride: u64,
-    /// No candidate's raw error at rest, Σ|e| or Σe² with least-squares coefficients, is below this.
+    /// Lower bound of the raw errors Σ|e| or Σe² of all candidates. Coefficients are least-squares estimates, initial
+    /// conditions are zero.
     pub bound: f64,
 }
 
-/// What is proved of every box of the slab that holds a candidate: the boxes of all sizes, down to single candidates, of
-/// output errors in either norm or of equation errors in squares.
+/// Lower bound of every box of the slice that contains a candidate. Boxes of all sizes down to single candidates are
+/// returned, for output errors in either norm or for squared equation errors.
 ///
-/// Empty where the lattice has no slabs (its fastest signal has several terms, or no other has orders to vary) or where
-/// nothing is proved of this one.
+/// Empty if the grid has no slices, which is so if its fastest signal has several terms or no other order varies. Also
+/// empty if nothing is proved of this slice.
 ///
 /// # Errors
 /// As [`crate::order_search::batches::search`].
@@ -249,35 +277,35 @@ pub struct Boxed {
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
-/// let lattice = Lattice::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
+/// let lattice = OrderGrid::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
 /// let boxes = box_bounds(&[record], &lattice, Criterion::OutputError, Norm::L1, 0)?;
 /// assert!(boxes.iter().any(|b| b.rows * b.values == 6) && boxes.iter().any(|b| b.rows * b.values == 1));
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn box_bounds(
     records: &[Record],
-    lattice: &Lattice,
+    lattice: &OrderGrid,
     criterion: Criterion,
     norm: Norm,
     index: u64,
-) -> Result<Vec<Boxed>> {
-    with_slab(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
-        let columns = columns(catalogue, slab);
-        let (others, inverse) = others(catalogue, slab, &columns)?;
-        let others = boxes.others(catalogue, &others, &inverse)?;
-        let ready = ready(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
-        let mut strip = Strip::default();
-        ready.lay(&mut strip, 0..slab.rows.len());
+) -> Result<Vec<BoxBound>> {
+    with_slice(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
+        let columns = first_columns(catalogue, slab);
+        let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
+        let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
+        let ready = build_slice_tables(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
+        let mut strip = RowCoefficients::default();
+        ready.compute_coefficients(&mut strip, 0..slab.rows.len());
         let mut found = Vec::new();
         let levels = [0, 1].map(|side: usize| ready.sides[side].levels.len());
         for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
-            for at in 0..ready.sides[0].levels[a].plain.len() {
-                for by in 0..ready.sides[1].levels[b].plain.len() {
-                    let both = [Stretch { level: a, at }, Stretch { level: b, at: by }];
+            for at in 0..ready.sides[0].levels[a].coefficient_sums.len() {
+                for by in 0..ready.sides[1].levels[b].coefficient_sums.len() {
+                    let both = [Interval { level: a, at }, Interval { level: b, at: by }];
                     let ((u0, u1), (v0, v1)) = (both[0].ends(slab.rows.len()), both[1].ends(slab.len));
-                    let cell = ready.cell(&strip, both);
+                    let cell = ready.box_quantities(&strip, both);
                     let bound = cell.map_or(0.0, |cell| ready.bound(both, &cell, f64::INFINITY));
-                    found.push(Boxed {
+                    found.push(BoxBound {
                         first: slab.lo + (u0 * slab.len + v0) as u64,
                         rows: (u1 - u0 + 1) as u64,
                         values: (v1 - v0 + 1) as u64,
@@ -291,34 +319,34 @@ pub fn box_bounds(
     })
 }
 
-/// The candidates `lo … hi − 1` of the slab that holds `index` that no box excludes and no bound of their own: among them
-/// are all whose raw error at rest is at most `limit`. Empty where [`box_bounds`] is.
+/// Candidates `lo … hi − 1` of the slice containing `index` that no bound excludes. They include all whose raw error is
+/// at most `limit`. Empty if [`box_bounds`] is empty.
 ///
 /// # Errors
 /// As [`crate::order_search::batches::search`].
-pub fn left_open(
+pub fn open_candidates(
     records: &[Record],
-    lattice: &Lattice,
+    lattice: &OrderGrid,
     criterion: Criterion,
     norm: Norm,
     index: u64,
     range: Range<u64>,
     limit: f64,
 ) -> Result<Vec<u64>> {
-    with_slab(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
+    with_slice(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
         let range = (range.start.clamp(slab.lo, slab.hi), range.end.clamp(slab.lo, slab.hi));
-        let (open, ..) = screen_slab(catalogue, boxes, slab, range, limit)?;
+        let (open, ..) = screen_slice(catalogue, boxes, slab, range, limit)?;
         Some(open.iter().map(|open| open.index).collect())
     })
 }
 
-/// What comes of the slab that holds a candidate, with all test vectors; nothing where it has no boxes.
-fn with_slab<T>(
+/// Apply a function to the slice that contains a candidate, with all test vectors. Empty if the slice has no boxes.
+fn with_slice<T>(
     records: &[Record],
-    lattice: &Lattice,
+    lattice: &OrderGrid,
     (criterion, norm): (Criterion, Norm),
     index: u64,
-    work: impl FnOnce(&Catalogue<'_>, &Boxes, &traversal::Slab) -> Option<Vec<T>> + Send,
+    work: impl FnOnce(&CandidateIndex<'_>, &BranchAndBound, &traversal::GridSlice) -> Option<Vec<T>> + Send,
 ) -> Result<Vec<T>>
 where
     T: Send,
@@ -326,20 +354,21 @@ where
     let pool = pool(1)?;
     let options = Options { criterion, norm, ..Options::default() };
     let fixed = vec![None; lattice.width()];
-    let mut catalogue = Catalogue::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool, &Stop::default())?;
+    let mut catalogue =
+        CandidateIndex::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool, &Stop::default())?;
     catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8, &Stop::default()));
     if criterion == Criterion::OutputError {
-        let mut adapted = catalogue.problem.no_adapted().0;
+        let mut adapted = catalogue.problem.empty_tailored_vectors().0;
         for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {
             let mut positions = vec![0; lattice.width()];
             catalogue.positions(&Cursor::at(lattice, made_for), &mut positions);
-            adapted.each.extend(pool.install(|| catalogue.problem.fit(&adapted, &positions)));
+            adapted.vectors.extend(pool.install(|| catalogue.problem.tailor_vector(&adapted, &positions)));
         }
-        catalogue.problem.adapted = Some(adapted);
+        catalogue.problem.tailored_vectors = Some(adapted);
     }
-    let slab = lattice.slab(index).filter(|_| (2..=MOST_OTHERS + 2).contains(&lattice.width()));
+    let slab = lattice.slice_at(index).filter(|_| (2..=MAX_REMAINING_COLUMNS + 2).contains(&lattice.width()));
     let Some(slab) = slab else { return Ok(Vec::new()) };
-    Ok(pool.install(|| work(&catalogue, &Boxes::new(&catalogue)?, &slab)).unwrap_or_default())
+    Ok(pool.install(|| work(&catalogue, &BranchAndBound::new(&catalogue)?, &slab)).unwrap_or_default())
 }
 
 #[cfg(test)]
@@ -347,12 +376,12 @@ mod tests {
     use super::*;
     use crate::error::Error;
     use crate::order_search::branch_and_bound::axis_table::Wide;
-    use crate::order_search::branch_and_bound::box_bound::{Cell, Held};
-    use crate::order_search::dual_bound::test_vectors::Probes;
+    use crate::order_search::branch_and_bound::box_bound::{BoxQuantities, CornerValues};
+    use crate::order_search::dual_bound::test_vectors::TestVectors;
     use crate::order_search::grid::TermAxis;
 
-    /// Two hubs and a link under steps, on which orders near one another and far apart are tried.
-    fn problem(case: u32) -> Result<(Record, Lattice)> {
+    /// Two joint angles and a link deflection under steps, with closely and widely spaced orders.
+    fn problem(case: u32) -> Result<(Record, OrderGrid)> {
         let m = 150;
         let time = |k: i32| f64::from(k) * 0.03;
         let signal = |of: &dyn Fn(i32) -> f64| (0..m).map(of).collect::<Vec<f64>>();
@@ -369,23 +398,23 @@ mod tests {
             2 => axes = vec![axis(0, vec![0.3]), axis(1, some(0.2, 9)), axis(2, some(0.1, 6))],
             _ => axes.push(axis(2, vec![0.4])),
         }
-        Ok((Record::new(0.03, signals, None)?, Lattice::new(0, &[1.7], &axes, |s| s == 2)?))
+        Ok((Record::new(0.03, signals, None)?, OrderGrid::new(0, &[1.7], &axes, |s| s == 2)?))
     }
 
-    /// The bilinear function of these corners at −1 ≤ s, t ≤ 1.
-    fn between(corners: [f64; 4], (s, t): (f64, f64)) -> f64 {
+    /// Bilinear function with these corner values at −1 ≤ s, t ≤ 1.
+    fn interpolate_bilinear(corners: [f64; 4], (s, t): (f64, f64)) -> f64 {
         let shares = [(1.0 - s) * (1.0 - t), (1.0 + s) * (1.0 - t), (1.0 - s) * (1.0 + t), (1.0 + s) * (1.0 + t)];
         corners.iter().zip(shares).map(|(c, share)| 0.25 * c * share).sum()
     }
 
-    /// How far a candidate's ⟨t, w⟩, and its divisor with what is added to it, are from what a box has there, each over
-    /// what the box allows: [`WIDTH`] test vectors.
-    fn far(whole: &Held, one: &Held, place: (f64, f64)) -> [Wide; 2] {
-        let corners = |of: &dyn Fn(usize) -> f64| between(std::array::from_fn(of), place);
+    /// Deviations of a candidate's ⟨t, w⟩ and divisor from the box values, relative to their bounds. One value for each
+    /// of [`WIDTH`] test vectors.
+    fn relative_deviations(whole: &CornerValues, one: &CornerValues, place: (f64, f64)) -> [Wide; 2] {
+        let corners = |of: &dyn Fn(usize) -> f64| interpolate_bilinear(std::array::from_fn(of), place);
         let apart = |part: usize, n: usize| one.values[0][part][n] - corners(&|c| whole.values[c][part][n]);
-        let seen = |n: usize| apart(0, n).hypot(apart(1, n)) / whole.rough[0][n];
+        let seen = |n: usize| apart(0, n).hypot(apart(1, n)) / whole.remainders[0][n];
         let more = |n: usize| (one.slack[0][n] - corners(&|c| whole.slack[c][n])).max(0.0);
-        let size = |n: usize| (apart(2, n).hypot(apart(3, n)) + more(n)) / whole.rough[1][n];
+        let size = |n: usize| (apart(2, n).hypot(apart(3, n)) + more(n)) / whole.remainders[1][n];
         [std::array::from_fn(seen), std::array::from_fn(size)]
     }
 
@@ -395,43 +424,44 @@ mod tests {
         for case in 0..40 {
             let (record, lattice) = problem(case)?;
             let kinds = (Criterion::OutputError, [Norm::L1, Norm::L2][case as usize / 4 % 2]);
-            let found = with_slab(&[record], &lattice, kinds, u64::from(case) * 7, |catalogue, boxes, slab| {
-                let columns = columns(catalogue, slab);
-                let (others, inverse) = others(catalogue, slab, &columns)?;
-                let others = boxes.others(catalogue, &others, &inverse)?;
-                let ready = ready(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
-                let mut strip = Strip::default();
-                ready.lay(&mut strip, 0..slab.rows.len());
-                let groups = others.probes.first().map_or(0, |p: &Probes| p.groups);
-                let held = |both: [Stretch; 2], cell: &Cell, group: usize, together: Option<Option<usize>>| {
-                    let moduli = ready.moduli(both, cell);
-                    let together = together.unwrap_or_else(|| ready.together(both, cell, &moduli, group));
-                    (ready.held(both, cell, &moduli, (0, group), together), together)
-                };
+            let found = with_slice(&[record], &lattice, kinds, u64::from(case) * 7, |catalogue, boxes, slab| {
+                let columns = first_columns(catalogue, slab);
+                let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
+                let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
+                let ready = build_slice_tables(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
+                let mut strip = RowCoefficients::default();
+                ready.compute_coefficients(&mut strip, 0..slab.rows.len());
+                let groups = others.test_vectors.first().map_or(0, |p: &TestVectors| p.groups);
+                let held =
+                    |both: [Interval; 2], cell: &BoxQuantities, group: usize, together: Option<Option<usize>>| {
+                        let moduli = ready.moduli(both, cell);
+                        let together = together.unwrap_or_else(|| ready.joint_partner(both, cell, &moduli, group));
+                        (ready.corner_values(both, cell, &moduli, (0, group), together), together)
+                    };
                 let mut most = Vec::new();
                 let levels = [0, 1].map(|side: usize| ready.sides[side].levels.len());
                 for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
-                    for (at, by) in (0..ready.sides[0].levels[a].plain.len())
-                        .flat_map(|at| (0..ready.sides[1].levels[b].plain.len()).map(move |by| (at, by)))
+                    for (at, by) in (0..ready.sides[0].levels[a].coefficient_sums.len())
+                        .flat_map(|at| (0..ready.sides[1].levels[b].coefficient_sums.len()).map(move |by| (at, by)))
                     {
-                        let both = [Stretch { level: a, at }, Stretch { level: b, at: by }];
+                        let both = [Interval { level: a, at }, Interval { level: b, at: by }];
                         let ends = [both[0].ends(slab.rows.len()), both[1].ends(slab.len)];
-                        let Some(cell) = ready.cell(&strip, both) else { continue };
+                        let Some(cell) = ready.box_quantities(&strip, both) else { continue };
                         for group in (0..groups).filter(|_| a + b > 0) {
                             let (whole, together) = held(both, &cell, group, None);
                             let mut nearest = [0.0_f64; 2];
                             for (i, j) in
                                 (ends[0].0..=ends[0].1).flat_map(|i| (ends[1].0..=ends[1].1).map(move |j| (i, j)))
                             {
-                                let alone = [Stretch { level: 0, at: i }, Stretch { level: 0, at: j }];
-                                let Some(cell) = ready.cell(&strip, alone) else { continue };
+                                let alone = [Interval { level: 0, at: i }, Interval { level: 0, at: j }];
+                                let Some(cell) = ready.box_quantities(&strip, alone) else { continue };
                                 let (one, _) = held(alone, &cell, group, Some(together));
                                 let place = |x: usize, (from, to): (usize, usize)| {
                                     2.0 * (x - from) as f64 / (to - from).max(1) as f64 - 1.0
                                 };
-                                let far = far(&whole, &one, (place(i, ends[0]), place(j, ends[1])));
+                                let far = relative_deviations(&whole, &one, (place(i, ends[0]), place(j, ends[1])));
                                 for (nearest, far) in nearest.iter_mut().zip(far) {
-                                    // What is no number is no proof.
+                                    // NaN counts as a failed bound.
                                     let far = far.map(|v| if v.is_nan() { f64::INFINITY } else { v });
                                     *nearest = far.into_iter().fold(*nearest, f64::max);
                                 }

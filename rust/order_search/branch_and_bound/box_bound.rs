@@ -1,58 +1,57 @@
-//! A lower bound of the errors of all candidates of a box.
+//! Lower bound of the errors of all candidates in a box of two orders.
 //!
-//! With û and v̂ the two columns that vary (of unit size, less their parts along the others) a candidate's coefficients on
-//! them solve p + B q = û·y, B p + q = v̂·y, B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)): they are made for all
-//! candidates ([`Strip`]), and how far they run from bilinear over a box is looked up. Over a box, −1 ≤ s, t ≤ 1, every
-//! other quantity is its straight line between the ends and a remainder
-//! ([`crate::order_search::branch_and_bound::axis_table`]). ⟨t, w⟩, 1 − Σ c g and coefficients are then bilinear in s
-//! and t but for remainders of second order, and what follows of bilinear functions at the corners follows over the
-//! box: |⟨t, w⟩| is at least its part along one direction, which is bilinear, less λ times moduli of bilinear
-//! functions, which is concave in s and in t, so least at a corner.
-//!
-//! Coefficients on the two varying columns of all candidates of some rows of a slab.
+//! û and v̂ are the two varying columns after projection on the remaining ones, scaled to unit norm. The coefficients
+//! on them solve p + B q = û·y, B p + q = v̂·y with B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)). They are
+//! computed for all candidates, and their deviation from bilinear functions over a box is exact. Over a box, −1 ≤ s,
+//! t ≤ 1, every other quantity is a linear interpolation between the ends plus a remainder. ⟨t, w⟩, 1 − Σ c g and the
+//! coefficients are then bilinear in s and t up to remainders of second order. A bound of bilinear functions at the
+//! corners holds over the box: |⟨t, w⟩| is at least its projection on one direction, which is bilinear. Subtracting λ
+//! times moduli of bilinear functions gives a function that is concave in s and in t, with its minimum at a corner.
 
 use std::ops::Range;
 
-use crate::order_search::branch_and_bound::axis_table::{each_group, Others, Seen, Side, Wide, ZERO};
-use crate::order_search::dual_bound::test_vectors::NONE;
+use crate::order_search::branch_and_bound::axis_table::{
+    vector_groups, AxisTable, RemainingColumns, VectorProducts, Wide, ZERO_LANES,
+};
+use crate::order_search::dual_bound::test_vectors::NO_INDEX;
 use crate::order_search::options::Norm;
-use crate::simd::WIDTH;
+use crate::simd::LANE_COUNT;
 
-/// What rounding may change in coefficients, in units of ε and the sum of the diagonal of an inverse correlation
-/// matrix: sixteen times the square of the number of terms, far above what elimination loses.
-const ELIMINATED: f64 = 16.0 * f64::EPSILON;
+/// Rounding error of coefficients, in units of the trace of an inverse correlation matrix. It is sixteen times ε and
+/// the square of the number of terms, far above the error of the elimination.
+const ELIMINATION_ERROR: f64 = 16.0 * f64::EPSILON;
 
-/// Where 1 − B² is no more than this, û and v̂ are one column as far as rounding tells.
-const NOTHING: f64 = 1e-12;
+/// Value of 1 − B² at or below which û and v̂ are numerically collinear.
+const COLLINEARITY_TOLERANCE: f64 = 1e-12;
 
-/// Most other columns of a slab.
-pub(super) const MOST_OTHERS: usize = 16;
+/// Maximum remaining columns of a slice.
+pub(super) const MAX_REMAINING_COLUMNS: usize = 16;
 
-/// What the boxes of all slabs share.
-pub(super) struct Common {
+/// Constants shared by the boxes of all slices.
+pub(super) struct SearchConstants {
     pub(super) norm: Norm,
     /// Whether candidates are ranked by their squared equation error.
-    pub(super) squares: bool,
-    /// Largest moduli over all columns of unit size of ⟨t, x⟩ and of g‖t‖, by group of test vectors.
-    pub(super) tops: Vec<[Wide; 2]>,
-    /// Largest rounding of a column of unit size, by record.
+    pub(super) ranks_equation_error: bool,
+    /// Largest moduli of ⟨t, x⟩ and g‖t‖ over all unit columns, by group of test vectors.
+    pub(super) max_moduli: Vec<[Wide; 2]>,
+    /// Largest rounding-error bound of a unit column, by record.
     pub(super) rounding: Vec<f64>,
-    /// Size of the output over all records.
+    /// Norm of the output over all records.
     pub(super) size: f64,
-    /// Largest over smallest inverse size of two columns.
+    /// Ratio of the largest to the smallest inverse norm of the columns.
     pub(super) ratio: f64,
 }
 
-impl Common {
-    pub(super) fn new(others: &Others<'_>, norm: Norm, squares: bool, size: f64) -> Self {
+impl SearchConstants {
+    pub(super) fn new(others: &RemainingColumns<'_>, norm: Norm, ranks_equation_error: bool, size: f64) -> Self {
         let width = others.normal.inverse().len();
-        let tops = each_group(others.probes)
+        let max_moduli = vector_groups(others.test_vectors)
             .map(|(r, g)| {
-                let mut tops = [ZERO; 2];
+                let mut tops = [ZERO_LANES; 2];
                 for p in 0..width {
-                    let (seen, _) = others.seen(r, g, p);
+                    let (seen, _) = others.vector_products(r, g, p);
                     for half in 0..2 {
-                        for n in 0..WIDTH {
+                        for n in 0..LANE_COUNT {
                             tops[half][n] = tops[half][n].max(seen[2 * half][n].hypot(seen[2 * half + 1][n]));
                         }
                     }
@@ -61,42 +60,49 @@ impl Common {
             })
             .collect();
         let sizes = || others.normal.inverse().iter().copied().filter(|&i| i > 0.0);
-        // What rounding leaves of one coefficient counts as so much of another, and of itself.
+        // A rounding error in one coefficient also counts for another one and for itself.
         let ratio = 1.0 + sizes().fold(0.0, f64::max) / sizes().fold(f64::INFINITY, f64::min);
         let most = |rounding: &[f64]| -> f64 {
             rounding.iter().zip(others.normal.inverse()).map(|(r, i)| r * i).fold(0.0, f64::max)
         };
-        Self { norm, squares, tops, rounding: others.probes.iter().map(|p| most(&p.rounding)).collect(), size, ratio }
+        Self {
+            norm,
+            ranks_equation_error,
+            max_moduli,
+            rounding: others.test_vectors.iter().map(|p| most(&p.rounding)).collect(),
+            size,
+            ratio,
+        }
     }
 }
 
-/// A stretch of values of one order: node `at` of a level.
+/// Interval of values of one order: node `at` of a level of the bisection tree.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Stretch {
+pub(super) struct Interval {
     pub(super) level: usize,
     pub(super) at: usize,
 }
 
-impl Stretch {
-    /// Its first and last value of so many.
+impl Interval {
+    /// First and last value of the interval, out of n values.
     #[inline(always)]
     pub(super) fn ends(self, n: usize) -> (usize, usize) {
         (self.at << self.level, n.min((self.at + 1) << self.level) - 1)
     }
 }
 
-/// Middle, slope and remainder of a quantity over a stretch.
+/// Linear approximation over an interval: midpoint, slope and remainder.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Line {
+pub(super) struct LinearApproximation {
     pub(super) middle: f64,
     pub(super) slope: f64,
-    pub(super) rest: f64,
+    pub(super) remainder: f64,
 }
 
-impl Line {
+impl LinearApproximation {
     #[inline(always)]
-    pub(super) fn new(first: f64, last: f64, rest: f64) -> Self {
-        Self { middle: (first + last) / 2.0, slope: (last - first) / 2.0, rest }
+    pub(super) fn new(first: f64, last: f64, remainder: f64) -> Self {
+        Self { middle: (first + last) / 2.0, slope: (last - first) / 2.0, remainder }
     }
 }
 
@@ -106,94 +112,94 @@ fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
     [(a + b + c + d) / 4.0, ((b + d) - (a + c)) / 4.0, ((c + d) - (a + b)) / 4.0, ((a + d) - (b + c)) / 4.0]
 }
 
-/// What the candidates of a box have in common.
-pub(super) struct Cell {
-    /// Rows and values at the corners.
+/// Quantities shared by all candidates of a box.
+pub(super) struct BoxQuantities {
+    /// Row and value index of the corners.
     pub(super) at: [(usize, usize); 4],
-    /// Eighths of the squares of the sides' lengths.
+    /// One eighth of the squared side lengths.
     pub(super) wide: [f64; 2],
-    /// p and q at the corners and the largest over the box.
+    /// p and q at the corners, and their largest moduli over the box.
     pub(super) ps: [f64; 4],
     pub(super) qs: [f64; 4],
     pub(super) most: [f64; 2],
-    /// How far from bilinear (p + q)/2 and (p − q)/2 run.
-    pub(super) off: [f64; 2],
-    /// Of p the coefficients of s and st, of q those of t and st, in moduli: what bends a product with a line in s or t.
-    pub(super) bends: [f64; 2],
-    /// Largest part of ‖y‖² that û and v̂ explain, where that ranks.
+    /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions.
+    pub(super) bilinear_deviation: [f64; 2],
+    /// Moduli of the coefficients of s and st in p, and of t and st in q. They bound the curvature of a product with a
+    /// linear function of s or t.
+    pub(super) mixed_slopes: [f64; 2],
+    /// Largest part of ‖y‖² explained by û and v̂, if the equation error ranks.
     pub(super) explained: f64,
-    /// Size of the output and of all coefficients, and what rounding may change in one of these.
+    /// Sum of the moduli of output and coefficients, and the rounding-error bound of one coefficient.
     pub(super) all: f64,
-    pub(super) lost: f64,
+    pub(super) rounding: f64,
 }
 
-impl Cell {
-    /// How far p times the first of these quantities along the sides and q times the second run from bilinear.
+impl BoxQuantities {
+    /// Deviation from bilinear of p times the first plus q times the second quantity, both linear along their sides.
     #[inline(always)]
-    pub(super) fn rest(&self, [a, b]: [Line; 2]) -> f64 {
-        let bent = self.bends[0] * a.slope.abs() + self.bends[1] * b.slope.abs();
+    pub(super) fn remainder(&self, [a, b]: [LinearApproximation; 2]) -> f64 {
+        let bent = self.mixed_slopes[0] * a.slope.abs() + self.mixed_slopes[1] * b.slope.abs();
         let slopes = a.slope.abs() + b.slope.abs();
         let (sum, difference) = (a.middle + b.middle, a.middle - b.middle);
-        bent + self.most[0] * a.rest
-            + self.most[1] * b.rest
-            + self.off[0] * (sum.abs() + slopes)
-            + self.off[1] * (difference.abs() + slopes)
+        bent + self.most[0] * a.remainder
+            + self.most[1] * b.remainder
+            + self.bilinear_deviation[0] * (sum.abs() + slopes)
+            + self.bilinear_deviation[1] * (difference.abs() + slopes)
     }
 }
 
-/// Moduli of the coefficients on the other columns at the corners of a box, and how far from bilinear what they are
-/// moduli of runs.
+/// Moduli of the remaining columns' coefficients at the corners of a box, and their deviation from bilinear.
 pub(super) struct Moduli {
-    others: [[f64; 4]; MOST_OTHERS],
-    rests: [f64; MOST_OTHERS],
-    /// Of the coefficients on the partner and on the own column of a side the sum, whose moduli may cancel.
+    others: [[f64; 4]; MAX_REMAINING_COLUMNS],
+    rests: [f64; MAX_REMAINING_COLUMNS],
+    /// Sum of the coefficients on the partner and on the own column of a side. Their moduli may cancel.
     sums: [f64; 4],
     sums_rest: f64,
 }
 
-/// What a group of test vectors holds against the candidates of a box.
-pub(super) struct Held {
+/// Products of a group of test vectors at the corners of a box, with remainders.
+pub(super) struct CornerValues {
     /// ⟨t, w⟩ and the divisor ‖t‖(1 − Σ c g) at the corners: real and imaginary part of each.
     pub(super) values: [[Wide; 4]; 4],
-    /// What is added to the divisor at the corners: Σ|c|‖Fᵀt − g t‖.
+    /// Slack of the divisor at the corners: Σ|c|‖Fᵀt − g t‖.
     pub(super) slack: [Wide; 4],
-    /// How far the first of these, and the other two together, run from bilinear.
-    pub(super) rough: [Wide; 2],
+    /// Deviation from bilinear of ⟨t, w⟩, and of divisor and slack together.
+    pub(super) remainders: [Wide; 2],
 }
 
-/// A slab, ready for its boxes.
-pub(super) struct Slab<'a> {
-    pub(super) others: &'a Others<'a>,
-    pub(super) common: &'a Common,
-    /// The order that changes from row to row, and the one that runs along rows.
-    pub(super) sides: [Side; 2],
-    /// Which of them is one of the output's own signal.
+/// Tables of one slice from which its boxes are bounded.
+pub(super) struct SliceTables<'a> {
+    pub(super) others: &'a RemainingColumns<'a>,
+    pub(super) common: &'a SearchConstants,
+    /// The order that changes from row to row, and the order along a row.
+    pub(super) sides: [AxisTable; 2],
+    /// Index of the side that belongs to the output's own signal.
     own: Option<usize>,
-    /// Coefficients of the output on the other columns.
-    pub(super) along: Vec<f64>,
-    /// Squared size of the output less its part along the others.
+    /// Coefficients of the output on the remaining columns.
+    pub(super) base_coefficients: Vec<f64>,
+    /// Sum of squares of the output's residual after projection on the remaining columns.
     unexplained: f64,
-    /// Of the output less its part along the others: ⟨t, y⟩ and ‖t‖, by group.
-    base: Vec<Seen>,
-    /// ‖Fᵀt − g t‖ of the other columns, k a group.
+    /// ⟨t, y⟩ and ‖t‖ of that residual, by group.
+    base: Vec<VectorProducts>,
+    /// ‖Fᵀt − g t‖ of the remaining columns, k per group.
     rests: Vec<Wide>,
 }
 
-impl<'a> Slab<'a> {
+impl<'a> SliceTables<'a> {
     #[inline(always)]
-    pub(super) fn new(others: &'a Others<'a>, common: &'a Common, sides: [Side; 2]) -> Self {
+    pub(super) fn new(others: &'a RemainingColumns<'a>, common: &'a SearchConstants, sides: [AxisTable; 2]) -> Self {
         let k = others.columns.len();
-        let mut along = vec![0.0; k];
+        let mut base_coefficients = vec![0.0; k];
         let rhs: Vec<f64> = others.columns.iter().map(|&s| others.normal.rhs()[s]).collect();
-        others.solve(&rhs, &mut along);
+        others.solve(&rhs, &mut base_coefficients);
         let (mut base, mut rests) = (Vec::new(), Vec::new());
-        for (r, g) in each_group(others.probes) {
-            let probes = &others.probes[r];
-            let mut here = [probes.target[g][0], probes.target[g][1], probes.size[g], ZERO];
-            for (c, &s) in along.iter().zip(others.columns) {
-                let (seen, rest) = others.seen(r, g, s);
+        for (r, g) in vector_groups(others.test_vectors) {
+            let probes = &others.test_vectors[r];
+            let mut here = [probes.target[g][0], probes.target[g][1], probes.size[g], ZERO_LANES];
+            for (c, &s) in base_coefficients.iter().zip(others.columns) {
+                let (seen, rest) = others.vector_products(r, g, s);
                 for (here, seen) in here.iter_mut().zip(&seen) {
-                    for n in 0..WIDTH {
+                    for n in 0..LANE_COUNT {
                         here[n] -= c * seen[n];
                     }
                 }
@@ -201,19 +207,30 @@ impl<'a> Slab<'a> {
             }
             base.push(here);
         }
-        let explained: f64 = along.iter().zip(&rhs).map(|(c, g)| c * g).sum();
-        let of = |side: &Side| others.probes.first().is_some_and(|p| side.columns.iter().all(|&c| p.rows[c] != NONE));
+        let explained: f64 = base_coefficients.iter().zip(&rhs).map(|(c, g)| c * g).sum();
+        let of = |side: &AxisTable| {
+            others.test_vectors.first().is_some_and(|p| side.columns.iter().all(|&c| p.rows[c] != NO_INDEX))
+        };
         let own = (0..2).find(|&n| of(&sides[n]));
-        Self { others, common, sides, own, along, unexplained: common.size * common.size - explained, base, rests }
+        Self {
+            others,
+            common,
+            sides,
+            own,
+            base_coefficients,
+            unexplained: common.size * common.size - explained,
+            base,
+            rests,
+        }
     }
 
-    /// The coefficients of all candidates of some rows.
+    /// Compute the coefficients of all candidates of some rows.
     #[inline(always)]
-    pub(super) fn lay(&self, strip: &mut Strip, rows: Range<usize>) {
+    pub(super) fn compute_coefficients(&self, strip: &mut RowCoefficients, rows: Range<usize>) {
         let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
         let [u, v] = &self.sides;
         (strip.start, strip.len) = (rows.start, len);
-        let Strip { plus, minus, left, product, .. } = strip;
+        let RowCoefficients { plus, minus, independence: left, product, .. } = strip;
         for all in [&mut *plus, minus, left] {
             all.resize(rows.len() * len, 0.0);
         }
@@ -241,7 +258,7 @@ impl<'a> Slab<'a> {
                 let (b, z) = (product[j] * scales[j], targets[j]);
                 let (above, below) = (1.0 + b, 1.0 - b);
                 let both = above * below;
-                let sound = both > NOTHING;
+                let sound = both > COLLINEARITY_TOLERANCE;
                 let half = if sound { 0.5 / both } else { 0.0 };
                 left[j] = if sound { both } else { 0.0 };
                 plus[j] = (y + z) * below * half;
@@ -250,13 +267,13 @@ impl<'a> Slab<'a> {
         }
     }
 
-    /// What the candidates of a box have in common; none where nothing is proved of it.
+    /// Quantities shared by all candidates of a box. `None` if no bound can be proved.
     #[inline(always)]
-    pub(super) fn cell(&self, strip: &Strip, [su, sv]: [Stretch; 2]) -> Option<Cell> {
+    pub(super) fn box_quantities(&self, strip: &RowCoefficients, [su, sv]: [Interval; 2]) -> Option<BoxQuantities> {
         let [u, v] = &self.sides;
         let ((u0, u1), (v0, v1)) = (su.ends(u.columns.len()), sv.ends(v.columns.len()));
-        let (wu, wv) = (eighth(u1 - u0), eighth(v1 - v0));
-        let (pu, pv) = (u.levels[su.level].plain[su.at], v.levels[sv.level].plain[sv.at]);
+        let (wu, wv) = (eighth_of_square(u1 - u0), eighth_of_square(v1 - v0));
+        let (pu, pv) = (u.levels[su.level].coefficient_sums[su.at], v.levels[sv.level].coefficient_sums[sv.at]);
         let sums = pu.sum + pv.sum;
         let at = [(u0, v0), (u1, v0), (u0, v1), (u1, v1)];
         let places = at.map(|(i, j)| strip.at(i, j));
@@ -266,15 +283,15 @@ impl<'a> Slab<'a> {
             ps[c] = halves[0][c] + halves[1][c];
             qs[c] = halves[0][c] - halves[1][c];
         }
-        let (off, left, explained) = if self.common.squares {
-            let (left, explained) = strip.explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
+        let (off, left, explained) = if self.common.ranks_equation_error {
+            let (left, explained) = strip.max_explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
             ([0.0; 2], left, explained)
         } else {
-            let (off, left) = strip.off([(u0, u1), (v0, v1)], halves.map(bilinear));
+            let (off, left) = strip.bilinear_deviation([(u0, u1), (v0, v1)], halves.map(bilinear));
             (off, left, 0.0)
         };
         let left = left - 2.0 * self.others.rounding * self.others.trace * sums * sums;
-        // What is not a number proves nothing.
+        // NaN proves nothing.
         if left.is_nan() || left <= 0.0 {
             return None;
         }
@@ -282,30 +299,43 @@ impl<'a> Slab<'a> {
         let both = off[0] + off[1];
         let (p, q, p_most, q_most) = (bilinear(ps), bilinear(qs), largest(&ps) + both, largest(&qs) + both);
 
-        // Sizes of coefficients, and what rounding may change in them.
+        // Moduli of the coefficients and their rounding-error bounds.
         let trace = self.others.trace + sums * sums / left;
-        let all =
-            self.common.size + self.along.iter().map(|c| c.abs()).sum::<f64>() + p_most * pu.sum + q_most * pv.sum;
-        let terms = count(self.others.columns.len() + 2);
-        let lost = ELIMINATED * terms * terms * trace * all;
+        let all = self.common.size
+            + self.base_coefficients.iter().map(|c| c.abs()).sum::<f64>()
+            + p_most * pu.sum
+            + q_most * pv.sum;
+        let terms = to_f64(self.others.columns.len() + 2);
+        let lost = ELIMINATION_ERROR * terms * terms * trace * all;
         let bends = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
-        Some(Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, explained, all, lost })
+        Some(BoxQuantities {
+            at,
+            wide: [wu, wv],
+            ps,
+            qs,
+            most: [p_most, q_most],
+            bilinear_deviation: off,
+            mixed_slopes: bends,
+            explained,
+            all,
+            rounding: lost,
+        })
     }
 
-    /// Lower bound of the raw scores of all candidates of a box; ends as soon as it exceeds the limit.
+    /// Lower bound of the raw scores of all candidates of a box. The sum stops once it exceeds the limit.
     #[inline(always)]
-    pub(super) fn bound(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
-        if self.common.squares {
-            self.squares(cell)
+    pub(super) fn bound(&self, both: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
+        if self.common.ranks_equation_error {
+            self.equation_error_bound(cell)
         } else {
-            self.errors(both, cell, limit)
+            self.output_error_bound(both, cell, limit)
         }
     }
 
-    /// Lower bound of their squared equation errors.
+    /// Lower bound of the squared equation errors.
     #[inline(always)]
-    fn squares(&self, cell: &Cell) -> f64 {
-        let rounding = self.others.rounding * cell.all + count(self.others.columns.len() + 2) * cell.lost;
+    fn equation_error_bound(&self, cell: &BoxQuantities) -> f64 {
+        let rounding = self.others.rounding * cell.all + to_f64(self.others.columns.len() + 2) * cell.rounding;
         let bound = self.unexplained - cell.explained - 4.0 * rounding * cell.all;
         // Neither NaN nor an overflow proves anything.
         if bound > 0.0 && bound < f64::MAX && cell.explained > f64::MIN {
@@ -315,19 +345,20 @@ impl<'a> Slab<'a> {
         }
     }
 
-    /// Lower bound of their output errors.
+    /// Lower bound of the output errors.
     #[inline(always)]
-    fn errors(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
+    fn output_error_bound(&self, both: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
         let moduli = self.moduli(both, cell);
         let (mut sum, mut first) = (0.0, 0);
-        for (r, probes) in self.others.probes.iter().enumerate() {
+        for (r, probes) in self.others.test_vectors.iter().enumerate() {
             let mut best = 0.0;
             for group in first..first + probes.groups {
-                let together = self.together(both, cell, &moduli, group);
-                let Held { values, slack, rough } = self.held(both, cell, &moduli, (r, group), together);
-                // All are looked at along the middle's direction.
-                let mut along = [ZERO; 2];
-                for n in 0..WIDTH {
+                let together = self.joint_partner(both, cell, &moduli, group);
+                let CornerValues { values, slack, remainders: rough } =
+                    self.corner_values(both, cell, &moduli, (r, group), together);
+                // All corners are projected on the direction of the midpoint.
+                let mut along = [ZERO_LANES; 2];
+                for n in 0..LANE_COUNT {
                     let re = values[0][0][n] + values[1][0][n] + values[2][0][n] + values[3][0][n];
                     let im = values[0][1][n] + values[1][1][n] + values[2][1][n] + values[3][1][n];
                     let size = (re * re + im * im).sqrt();
@@ -335,9 +366,9 @@ impl<'a> Slab<'a> {
                     along[0][n] = re * inverse;
                     along[1][n] = im * inverse;
                 }
-                let mut bounds = [f64::MAX; WIDTH];
+                let mut bounds = [f64::MAX; LANE_COUNT];
                 for (value, slack) in values.iter().zip(&slack) {
-                    for n in 0..WIDTH {
+                    for n in 0..LANE_COUNT {
                         let seen = value[0][n] * along[0][n] + value[1][n] * along[1][n] - rough[0][n];
                         let size = (value[2][n] * value[2][n] + value[3][n] * value[3][n]).sqrt();
                         // A hair more, for the rounding of the divisor and of the score itself.
@@ -362,87 +393,105 @@ impl<'a> Slab<'a> {
         sum
     }
 
-    /// Moduli of the coefficients on the other columns over a box.
+    /// Moduli of the remaining columns' coefficients over a box.
     #[inline(always)]
-    pub(super) fn moduli(&self, [su, sv]: [Stretch; 2], cell: &Cell) -> Moduli {
+    pub(super) fn moduli(&self, [su, sv]: [Interval; 2], cell: &BoxQuantities) -> Moduli {
         let k = self.others.columns.len();
         let [u, v] = &self.sides;
-        let Cell { at, wide: [wu, wv], ps, qs, lost, .. } = *cell;
+        let BoxQuantities { at, wide: [wu, wv], ps, qs, rounding: lost, .. } = *cell;
         let ((u0, v0), (u1, v1)) = (at[0], at[3]);
         let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
-        let (mut others, mut rests) = ([[0.0; 4]; MOST_OTHERS], [0.0; MOST_OTHERS]);
+        let (mut others, mut rests) = ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);
         for s in 0..k {
             for (c, (i, j)) in at.into_iter().enumerate() {
-                others[s][c] = (self.along[s] - ps[c] * u.mixed[i * k + s] - qs[c] * v.mixed[j * k + s]).abs();
+                others[s][c] =
+                    (self.base_coefficients[s] - ps[c] * u.mixed[i * k + s] - qs[c] * v.mixed[j * k + s]).abs();
             }
-            let a = Line::new(u.mixed[u0 * k + s], u.mixed[u1 * k + s], wu * lu.mixed[su.at * k + s]);
-            let b = Line::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
-            rests[s] = cell.rest([a, b]) + lost;
+            let a = LinearApproximation::new(u.mixed[u0 * k + s], u.mixed[u1 * k + s], wu * lu.mixed[su.at * k + s]);
+            let b = LinearApproximation::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
+            rests[s] = cell.remainder([a, b]) + lost;
         }
         let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
         if let Some(partner) = self.partner() {
             for (c, (i, j)) in at.into_iter().enumerate() {
-                sums[c] = (self.along[partner] - ps[c] * u.paired[i] - qs[c] * v.paired[j]).abs();
+                sums[c] = (self.base_coefficients[partner] - ps[c] * u.paired[i] - qs[c] * v.paired[j]).abs();
             }
             let bent = |values: &[f64], first: usize, last: usize| {
                 let inner =
                     (first + 1..last).map(|i| ((values[i - 1] - values[i]) + (values[i + 1] - values[i])).abs());
                 inner.fold(0.0, f64::max)
             };
-            let a = Line::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
-            let b = Line::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
-            sums_rest = cell.rest([a, b]) + lost * self.common.ratio;
+            let a = LinearApproximation::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
+            let b = LinearApproximation::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
+            sums_rest = cell.remainder([a, b]) + lost * self.common.ratio;
         }
         Moduli { others, rests, sums, sums_rest }
     }
 
-    /// The other column whose coefficient may cancel against that of a side's own column.
+    /// The remaining column whose coefficient may cancel that of a side's own column.
     #[inline(always)]
     fn partner(&self) -> Option<usize> {
         self.others.partner.filter(|_| self.own.is_some())
     }
 
-    /// The partner, where a group of test vectors proves more with its column and the own one looked at together.
+    /// The partner, if its column and the own column together give a group of test vectors a tighter bound.
     #[inline(always)]
-    pub(super) fn together(&self, [su, sv]: [Stretch; 2], cell: &Cell, moduli: &Moduli, group: usize) -> Option<usize> {
+    pub(super) fn joint_partner(
+        &self,
+        [su, sv]: [Interval; 2],
+        cell: &BoxQuantities,
+        moduli: &Moduli,
+        group: usize,
+    ) -> Option<usize> {
         let partner = self.partner()?;
         let (k, groups) = (self.others.columns.len(), self.base.len());
         let [u, v] = &self.sides;
-        let bu = &u.levels[su.level].nodes[su.at * groups + group].bent;
-        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].bent;
+        let bu = &u.levels[su.level].nodes[su.at * groups + group].second_differences;
+        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].second_differences;
         let own = if self.own == Some(0) { &cell.ps } else { &cell.qs };
         let rest = &self.rests[group * k + partner];
         let (mut apart, mut joint) = (0.0, 0.0);
-        for n in 0..WIDTH {
+        for n in 0..LANE_COUNT {
             apart += moduli.others[partner][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
             joint += moduli.sums[0] * rest[n] + own[0].abs() * (bu[3][n] + bv[3][n]);
         }
         (joint < apart).then_some(partner)
     }
 
-    /// What a group of test vectors, of a record, holds against the candidates of a box.
+    /// Products of a group of test vectors of one record at the corners of a box.
     #[inline(always)]
-    pub(super) fn held(
+    pub(super) fn corner_values(
         &self,
-        [su, sv]: [Stretch; 2],
-        cell: &Cell,
+        [su, sv]: [Interval; 2],
+        cell: &BoxQuantities,
         moduli: &Moduli,
         (record, group): (usize, usize),
         together: Option<usize>,
-    ) -> Held {
+    ) -> CornerValues {
         let (k, groups) = (self.others.columns.len(), self.base.len());
         let [u, v] = &self.sides;
-        let Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, all, lost, .. } = *cell;
+        let BoxQuantities {
+            at,
+            wide: [wu, wv],
+            ps,
+            qs,
+            most: [p_most, q_most],
+            bilinear_deviation: off,
+            mixed_slopes: bends,
+            all,
+            rounding: lost,
+            ..
+        } = *cell;
         let both = off[0] + off[1];
         let ((u0, v0), (u1, v1)) = (at[0], at[3]);
-        let bu = &u.levels[su.level].nodes[su.at * groups + group].bent;
-        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].bent;
-        let (a, b) = (&u.seen[u0 * groups + group], &u.seen[u1 * groups + group]);
-        let (c, d) = (&v.seen[v0 * groups + group], &v.seen[v1 * groups + group]);
-        let (base, tops) = (&self.base[group], &self.common.tops[group]);
-        let mut rough = [[0.0; WIDTH]; 2];
+        let bu = &u.levels[su.level].nodes[su.at * groups + group].second_differences;
+        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].second_differences;
+        let (a, b) = (&u.vector_products[u0 * groups + group], &u.vector_products[u1 * groups + group]);
+        let (c, d) = (&v.vector_products[v0 * groups + group], &v.vector_products[v1 * groups + group]);
+        let (base, tops) = (&self.base[group], &self.common.max_moduli[group]);
+        let mut rough = [[0.0; LANE_COUNT]; 2];
         for half in 0..2 {
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 let mut sizes = [0.0; 4];
                 for part in 2 * half..2 * half + 2 {
                     let (mu, mv) = ((a[part][n] + b[part][n]) * 0.5, (c[part][n] + d[part][n]) * 0.5);
@@ -461,12 +510,12 @@ impl<'a> Slab<'a> {
                     + lost * tops[half][n];
             }
         }
-        let rounding = self.others.probes[record].target_rounding + (all + lost) * self.common.rounding[record];
+        let rounding = self.others.test_vectors[record].target_rounding + (all + lost) * self.common.rounding[record];
         rough[0].iter_mut().for_each(|rough| *rough += rounding);
-        // Of the varying columns (a scale is at least 1), then of the others.
-        let mut slack = [ZERO; 4];
+        // Slack of the varying columns (their scale is at least 1), then of the remaining ones.
+        let mut slack = [ZERO_LANES; 4];
         let part = if together.is_some() { 3 } else { 2 };
-        for n in 0..WIDTH {
+        for n in 0..LANE_COUNT {
             rough[1][n] += (both + lost) * (bu[part][n] + bv[part][n]);
             for corner in 0..4 {
                 slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
@@ -477,23 +526,23 @@ impl<'a> Slab<'a> {
             let paired = together == Some(s);
             let (sizes, beyond) =
                 if paired { (&moduli.sums, moduli.sums_rest) } else { (&moduli.others[s], moduli.rests[s]) };
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 rough[1][n] += beyond * rest[n];
                 for corner in 0..4 {
                     slack[corner][n] += sizes[corner] * rest[n];
                 }
             }
         }
-        let mut values = [[ZERO; 4]; 4];
+        let mut values = [[ZERO_LANES; 4]; 4];
         for (corner, value) in values.iter_mut().enumerate() {
             let (of_u, of_v) = ([a, b][corner % 2], [c, d][corner / 2]);
             for part in 0..4 {
-                for n in 0..WIDTH {
+                for n in 0..LANE_COUNT {
                     value[part][n] = base[part][n] - ps[corner] * of_u[part][n] - qs[corner] * of_v[part][n];
                 }
             }
         }
-        Held { values, slack, rough }
+        CornerValues { values, slack, remainders: rough }
     }
 
     #[inline(always)]
@@ -505,65 +554,65 @@ impl<'a> Slab<'a> {
     }
 }
 
-/// An eighth of a length squared.
+/// One eighth of a squared length.
 #[inline(always)]
-fn eighth(length: usize) -> f64 {
-    let length = count(length);
+fn eighth_of_square(length: usize) -> f64 {
+    let length = to_f64(length);
     length * length / 8.0
 }
-/// Candidates of a row that are looked at side by side.
-const LANES: usize = 4;
-const PLACES: [f64; LANES] = [0.0, 1.0, 2.0, 3.0];
+/// Candidates of a row that are processed in parallel lanes.
+const ROW_LANES: usize = 4;
+const LANE_OFFSETS: [f64; ROW_LANES] = [0.0, 1.0, 2.0, 3.0];
 
-/// Coefficients on û and v̂ of all candidates of some rows of a slab.
+/// Coefficients on û and v̂ of all candidates of some rows of a slice.
 #[derive(Default)]
-pub(super) struct Strip {
-    /// Their first row, and how many values a row has.
+pub(super) struct RowCoefficients {
+    /// First row, and number of values in a row.
     pub(super) start: usize,
     /// See `start`.
     pub(super) len: usize,
-    /// (p + q)/2, (p − q)/2 and 1 − B²; all of them 0 where that is next to nothing, or no number.
+    /// (p + q)/2, (p − q)/2 and 1 − B². All are 0 if 1 − B² is negligible or NaN.
     pub(super) plus: Vec<f64>,
     pub(super) minus: Vec<f64>,
-    pub(super) left: Vec<f64>,
-    /// B, and products with the other columns one after the other, of a row.
+    pub(super) independence: Vec<f64>,
+    /// B, and products with the remaining columns one after the other, of a row.
     pub(super) product: Vec<f64>,
 }
 
-impl Strip {
+impl RowCoefficients {
     #[inline(always)]
     pub(super) fn at(&self, row: usize, value: usize) -> usize {
         (row - self.start) * self.len + value
     }
 
-    /// How far from bilinear functions (p + q)/2 and (p − q)/2 run over a box, and the least 1 − B².
+    /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions over a box, and the smallest 1 − B².
     #[inline(always)]
-    pub(super) fn off(
+    pub(super) fn bilinear_deviation(
         &self,
         [(u0, u1), (v0, v1)]: [(usize, usize); 2],
         [plus, minus]: [[f64; 4]; 2],
     ) -> ([f64; 2], f64) {
-        let (mut far, mut left) = ([[0.0_f64; LANES]; 2], [f64::INFINITY; LANES]);
+        let (mut far, mut left) = ([[0.0_f64; ROW_LANES]; 2], [f64::INFINITY; ROW_LANES]);
         let width = v1 - v0 + 1;
-        let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / count(b - a) } else { 0.0 });
+        let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / to_f64(b - a) } else { 0.0 });
         for row in 0..=u1 - u0 {
-            let s = count(row) * down - 1.0;
+            let s = to_f64(row) * down - 1.0;
             let (x, y) = (plus[2] + plus[3] * s, minus[2] + minus[3] * s);
             let (first, second) = (plus[0] + plus[1] * s - x, minus[0] + minus[1] * s - y);
             let (x, y, start) = (x * across, y * across, self.at(u0 + row, v0));
-            let plus = self.plus[start..start + width].chunks_exact(LANES);
-            let minus = self.minus[start..start + width].chunks_exact(LANES);
-            let lefts = self.left[start..start + width].chunks_exact(LANES);
+            let plus = self.plus[start..start + width].chunks_exact(ROW_LANES);
+            let minus = self.minus[start..start + width].chunks_exact(ROW_LANES);
+            let lefts = self.independence[start..start + width].chunks_exact(ROW_LANES);
             let rest = [plus.remainder(), minus.remainder(), lefts.remainder()];
-            let mut place = PLACES;
+            let mut place = LANE_OFFSETS;
             for ((plus, minus), lefts) in plus.zip(minus).zip(lefts) {
-                for n in 0..LANES {
+                for n in 0..ROW_LANES {
                     let a = (plus[n] - (first + x * place[n])).abs();
                     let b = (minus[n] - (second + y * place[n])).abs();
                     far[0][n] = if a > far[0][n] { a } else { far[0][n] };
                     far[1][n] = if b > far[1][n] { b } else { far[1][n] };
                     left[n] = if lefts[n] < left[n] { lefts[n] } else { left[n] };
-                    place[n] += PLACES[LANES - 1] + 1.0;
+                    place[n] += LANE_OFFSETS[ROW_LANES - 1] + 1.0;
                 }
             }
             for n in 0..rest[0].len() {
@@ -574,22 +623,22 @@ impl Strip {
                 left[n] = if rest[2][n] < left[n] { rest[2][n] } else { left[n] };
             }
         }
-        let most = |x: [f64; LANES]| x.into_iter().fold(0.0_f64, f64::max);
+        let most = |x: [f64; ROW_LANES]| x.into_iter().fold(0.0_f64, f64::max);
         ([most(far[0]), most(far[1])], left.into_iter().fold(f64::INFINITY, f64::min))
     }
 
-    /// The least 1 − B² over a box, and the most of ‖y‖² that û and v̂ explain.
+    /// Smallest 1 − B² over a box, and the largest part of ‖y‖² explained by û and v̂.
     #[inline(always)]
-    pub(super) fn explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
-        let (mut left, mut most) = ([f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]);
+    pub(super) fn max_explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
+        let (mut left, mut most) = ([f64::INFINITY; ROW_LANES], [f64::NEG_INFINITY; ROW_LANES]);
         let width = v1 - v0 + 1;
         for row in u0..u1 + 1 {
             let (y, start) = (y[row], self.at(row, v0));
-            let here = [&self.plus, &self.minus, &self.left].map(|from| &from[start..start + width]);
+            let here = [&self.plus, &self.minus, &self.independence].map(|from| &from[start..start + width]);
             let z = &z[v0..v0 + width];
             let mut at = 0;
             while at < width {
-                let lanes = LANES.min(width - at);
+                let lanes = ROW_LANES.min(width - at);
                 for n in 0..lanes {
                     let explained = here[0][at + n] * (y + z[at + n]) + here[1][at + n] * (y - z[at + n]);
                     most[n] = if explained > most[n] { explained } else { most[n] };
@@ -602,9 +651,9 @@ impl Strip {
     }
 }
 
-/// So many, to reckon with.
+/// A count as a floating-point number.
 #[inline(always)]
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn count(n: usize) -> f64 {
+pub(super) fn to_f64(n: usize) -> f64 {
     n as f64
 }

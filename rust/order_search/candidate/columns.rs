@@ -1,6 +1,4 @@
-//! The regressors that the candidates of a search need, each once.
-//!
-//! Columns of a bank that several candidates name side by side.
+//! Regressors required by the candidates of a search, and columns that several candidates share in parallel lanes.
 
 use std::collections::HashSet;
 
@@ -8,21 +6,21 @@ use crate::equation::{grains, Initial, ORDER_GRAIN};
 use crate::regressors::{Index, Key};
 use crate::simd::Lanes;
 
-/// Collects the regressors of candidates from their orders.
-pub(crate) struct Needed<'a> {
+/// Set of the regressors that candidates require, from their orders.
+pub(crate) struct RequiredRegressors<'a> {
     initial: &'a Initial,
     index: Index,
     alphas: HashSet<i64>,
     orders: HashSet<(i64, usize, i64)>,
 }
 
-impl<'a> Needed<'a> {
+impl<'a> RequiredRegressors<'a> {
     pub(crate) fn new(initial: &'a Initial) -> Self {
         Self { initial, index: Index::default(), alphas: HashSet::new(), orders: HashSet::new() }
     }
 
-    /// Adds the initial terms that every structure of this α needs.
-    pub(crate) fn alpha(&mut self, alpha: f64) {
+    /// Add the initial terms that every structure of this α requires.
+    pub(crate) fn add_alpha(&mut self, alpha: f64) {
         if !self.alphas.insert(grains(alpha)) {
             return;
         }
@@ -34,22 +32,22 @@ impl<'a> Needed<'a> {
             Initial::Powers(powers) => powers.iter().for_each(|&e| {
                 self.index.insert(Key::initial(e));
             }),
-            Initial::Caputo => self.powers(0.0, alpha),
+            Initial::Caputo => self.add_powers(0.0, alpha),
         }
     }
 
-    /// Adds all regressors that a term of this order needs under this α.
-    pub(crate) fn term(&mut self, alpha: f64, signal: usize, order: f64) {
+    /// Add all regressors that a term of this order requires under this α.
+    pub(crate) fn add_term(&mut self, alpha: f64, signal: usize, order: f64) {
         if self.orders.insert((grains(alpha), signal, grains(order))) {
             self.index.insert(Key::integral(signal, alpha - order));
             if *self.initial.under() == Initial::Caputo {
-                self.powers(alpha - order, order);
+                self.add_powers(alpha - order, order);
             }
         }
     }
 
-    /// Adds t^{from + i} for i = 0, 1, … below an order.
-    fn powers(&mut self, from: f64, order: f64) {
+    /// Add t^{from + i} for i = 0, 1, … below an order.
+    fn add_powers(&mut self, from: f64, order: f64) {
         let mut i = 0.0;
         while i < order - ORDER_GRAIN {
             self.index.insert(Key::initial(from + i));
@@ -57,44 +55,44 @@ impl<'a> Needed<'a> {
         }
     }
 
-    /// All of them, neighbours on a lattice beside each other.
-    pub(crate) fn index(mut self) -> Index {
+    /// Return all regressors. Neighbors on the order grid are adjacent.
+    pub(crate) fn into_index(mut self) -> Index {
         self.index.sort();
         self.index
     }
 }
 
-/// Columns of one term of L candidates.
+/// Columns of one term for L candidates.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Columns<const L: usize> {
     pub(crate) at: [usize; L],
-    /// Whether they are all one, and whether each is the next one.
+    /// Whether all columns are equal, and whether they are consecutive.
     same: bool,
-    run: bool,
+    consecutive: bool,
 }
 
 impl<const L: usize> Columns<L> {
     pub(crate) fn new(at: [usize; L]) -> Self {
-        Self { at, same: L == 1, run: false }
+        Self { at, same: L == 1, consecutive: false }
     }
 
-    /// One column for all candidates.
+    /// Return one column for all candidates.
     #[inline(always)]
     pub(crate) fn one(at: usize) -> Self {
-        Self { at: [at; L], same: true, run: false }
+        Self { at: [at; L], same: true, consecutive: false }
     }
 
-    /// Columns that ascend.
+    /// Return columns given in ascending order.
     #[inline(always)]
-    pub(super) fn ascending(at: [usize; L]) -> Self {
-        Self { at, same: L == 1, run: at[L - 1] - at[0] == L - 1 }
+    pub(super) fn from_ascending(at: [usize; L]) -> Self {
+        Self { at, same: L == 1, consecutive: at[L - 1] - at[0] == L - 1 }
     }
 
     #[inline(always)]
     pub(crate) fn compare(&mut self) {
         let first = self.at[0];
         self.same = self.at.iter().all(|&p| p == first);
-        self.run = !self.same && self.at.iter().enumerate().all(|(n, &p)| p == first + n);
+        self.consecutive = !self.same && self.at.iter().enumerate().all(|(n, &p)| p == first + n);
     }
 
     /// Elements of a vector at these columns.
@@ -102,7 +100,7 @@ impl<const L: usize> Columns<L> {
     pub(super) fn of(&self, vector: &[f64]) -> Lanes<L> {
         if self.same {
             [vector[self.at[0]]; L]
-        } else if self.run {
+        } else if self.consecutive {
             part_of(&vector[self.at[0]..])
         } else {
             let mut out = [0.0; L];
@@ -111,7 +109,7 @@ impl<const L: usize> Columns<L> {
         }
     }
 
-    /// Elements of a symmetric matrix (row-major) at these columns and those rows.
+    /// Elements of a symmetric matrix (row-major) at these columns and the given rows.
     #[inline(always)]
     pub(super) fn with(&self, rows: &Self, matrix: &[f64], stride: usize) -> Lanes<L> {
         if rows.same {

@@ -1,5 +1,6 @@
-//! The coefficient step of an order search by refined instrumental variables: spectra of every regressor, made once for
-//! all candidates.
+//! Coefficient step of an order search by refined instrumental variables.
+//!
+//! The spectra of all regressors are computed once for all candidates.
 
 use crate::error::{Error, Result};
 use crate::estimation::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
@@ -8,11 +9,11 @@ use crate::parallel::{self, Stop};
 use crate::regressors::{Bank, Index, Record};
 use crate::series::Kernel;
 
-/// Low-pass behind which the first coefficients are estimated, in units of the output's own band.
+/// Cutoff of the low-pass filter for the initial coefficients, relative to the output's bandwidth.
 const START_BAND: f64 = 2.0;
 
-/// What the refinement of any candidate reads of one record.
-struct Shelf {
+/// Spectra of one record that the refinement of every candidate reads.
+struct RecordSpectra {
     /// Spectrum of each column of the bank.
     columns: Vec<Kernel>,
     /// Spectrum of the kernel of each column of the output itself.
@@ -20,22 +21,23 @@ struct Shelf {
     target: Kernel,
 }
 
-/// Refines the coefficients of candidates.
+/// Refinement of coefficients by instrumental variables.
 pub(crate) struct Refiner {
-    shelves: Vec<Shelf>,
+    spectra: Vec<RecordSpectra>,
     settings: Settings,
 }
 
 impl Refiner {
-    /// Spectra of the columns of `banks`, which are those of the records' clean signals; of no use once it was told to stop.
+    /// Compute the spectra of the columns of `banks`, which belong to the records' noise-free signals. Unusable after a
+    /// stop request.
     pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings, stop: &Stop) -> Self {
-        let shelves = records
+        let spectra = records
             .iter()
             .zip(banks)
             .map(|(record, bank)| {
                 let all = || (0..bank.len()).collect();
                 let spectrum = |x: &[f64]| Kernel::new(if stop.is_set() { &[] } else { x });
-                Shelf {
+                RecordSpectra {
                     columns: parallel::map(all(), || (), |(), p| spectrum(bank.column(p))),
                     kernels: parallel::map(
                         all(),
@@ -46,11 +48,11 @@ impl Refiner {
                 }
             })
             .collect();
-        Self { shelves, settings }
+        Self { spectra, settings }
     }
 
-    /// Refines coefficients in place: of the terms, then of the initial terms record by record. What it comes to once it was
-    /// told to stop is of no use.
+    /// Refine coefficients in place: those of the terms, then those of the initial terms by record. The result is
+    /// unusable after a stop request.
     pub(crate) fn refine(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -61,7 +63,7 @@ impl Refiner {
         stop: &Stop,
     ) -> std::result::Result<(), Failure> {
         let sources: Vec<Source<'_>> = self
-            .shelves
+            .spectra
             .iter()
             .zip(banks)
             .zip(targets)
@@ -75,7 +77,7 @@ impl Refiner {
             })
             .collect();
         let start: Vec<f64> = coefficients.iter().chain(weights.iter()).copied().collect();
-        // An initial term that the start left out is a combination of others.
+        // An initial term with weight 0 in the initial guess is a combination of others.
         let n = initial.len();
         let dropped: Vec<(usize, usize)> =
             weights.iter().enumerate().filter(|(_, w)| **w == 0.0).map(|(i, _)| (i / n, i % n)).collect();
@@ -92,13 +94,13 @@ impl Refiner {
     }
 }
 
-/// Bank and target behind which the first coefficients are estimated: clean signals, low-passed.
+/// Bank and target for the initial coefficients: noise-free signals, low-pass filtered.
 ///
 /// # Errors
 /// As [`Bank::counted`].
 pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
     let band = START_BAND * power_frequency(record.signal(output), record.step());
-    let smooth = record.cleaned().through(&low_pass(band, record)?)?;
+    let smooth = record.clean_record().with_filter(&low_pass(band, record)?)?;
     let target = smooth.signal(output).to_vec();
-    Ok((Bank::counted(index, &smooth, output, stop)?, target))
+    Ok((Bank::new_interruptible(index, &smooth, output, stop)?, target))
 }

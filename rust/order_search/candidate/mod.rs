@@ -1,4 +1,4 @@
-//! One candidate of a search: its coefficients, then its error.
+//! Coefficients and error of a single candidate.
 
 pub(crate) mod columns;
 mod instrumental_variables;

@@ -1,30 +1,31 @@
-//! Coefficients of candidates from normal equations that are made once, several candidates side by side.
+//! Coefficients of candidates from precomputed normal equations, several candidates in parallel lanes.
 //!
-//! The squared equation error of candidates from a Gram matrix alone.
+//! The squared equation error follows from the Gram matrix alone.
 
 use crate::error::Result;
-use crate::estimation::multi_innovation::{Innovation, Rows};
+use crate::estimation::multi_innovation::{Innovation, RowBasis};
 use crate::fractional::operational_matrices;
 use crate::linalg::dense;
-use crate::linalg::small::{packed, solve_lanes, PIVOT_FLOOR};
+use crate::linalg::small::{packed_index, solve_lanes, PIVOT_FLOOR};
 use crate::order_search::candidate::columns::Columns;
 use crate::parallel::Stop;
 use crate::regressors::Bank;
 use crate::simd::Lanes;
 
-/// Normal equations over a bank's columns, weighted as the estimator asks, scaled to a diagonal of ones.
+/// Normal equations over a bank's columns, weighted by the estimator and scaled to a unit diagonal.
 pub(crate) struct Normal {
     width: usize,
     /// Correlation matrix, row-major width × width; rows of columns that vanish are 0.
     correlation: Vec<f64>,
     rhs: Vec<f64>,
-    /// Size of each column, and its inverse or 0.
+    /// Norm of each column, and its inverse or 0.
     size: Vec<f64>,
     inverse: Vec<f64>,
 }
 
 impl Normal {
-    /// From a Gram matrix over columns and target, (width + 1)² row-major, and what the prior adds to its diagonal.
+    /// Build the equations from a Gram matrix over columns and target, (width + 1)² row-major. `prior` is added to its
+    /// diagonal.
     pub(super) fn new(gram: &[f64], width: usize, prior: f64) -> Self {
         let stride = width + 1;
         let diagonal = |p: usize| gram[p * stride + p] + prior;
@@ -54,18 +55,18 @@ impl Normal {
         &self.correlation[a * self.width..(a + 1) * self.width]
     }
 
-    /// Products of the columns, of unit size, with the target.
+    /// Products of the unit columns with the target.
     pub(crate) fn rhs(&self) -> &[f64] {
         &self.rhs
     }
 
-    /// Inverse size of each column, 0 for one that vanishes.
+    /// Inverse norm of each column, 0 for a zero column.
     pub(crate) fn inverse(&self) -> &[f64] {
         &self.inverse
     }
 }
 
-/// Memory of a solve of L candidates side by side.
+/// Workspace for solving L candidates in parallel lanes.
 pub(crate) struct Solve<const L: usize> {
     gram: Vec<Lanes<L>>,
     /// Right-hand side, then the scaled solution.
@@ -81,36 +82,36 @@ impl<const L: usize> Solve<L> {
     }
 }
 
-/// The normal equations of all candidates: over all records for their terms, over each for its initial terms.
+/// Normal equations of all candidates: over all records for their terms, over each record for its initial terms.
 pub(crate) struct NormalEquations {
     terms: Normal,
-    /// Per record, for its initial terms; empty at rest.
-    parts: Vec<Normal>,
-    /// Known coefficients of terms, and the terms whose coefficients are estimated.
+    /// Equations of each record for its initial terms. Empty for zero initial conditions.
+    record_equations: Vec<Normal>,
+    /// Coefficients by term, `None` for a free one, and the indices of the free terms.
     fixed: Vec<Option<f64>>,
     free: Vec<usize>,
 }
 
 impl NormalEquations {
-    /// From the equations of all records together and, where there are initial terms, those of each.
-    pub(super) fn new(terms: Normal, parts: Vec<Normal>, fixed: &[Option<f64>]) -> Self {
+    /// Combine the equations of all records and, with initial terms, those of each record.
+    pub(super) fn new(terms: Normal, record_equations: Vec<Normal>, fixed: &[Option<f64>]) -> Self {
         let free = (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect();
-        Self { terms, parts, fixed: fixed.to_vec(), free }
+        Self { terms, record_equations, fixed: fixed.to_vec(), free }
     }
 
-    /// The equations over all records where no coefficient is known and there are no initial terms.
-    pub(crate) fn whole(&self) -> Option<&Normal> {
-        (self.parts.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
+    /// Equations over all records if no coefficient is fixed and there are no initial terms.
+    pub(crate) fn unconstrained_equations(&self) -> Option<&Normal> {
+        (self.record_equations.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
     }
 
-    /// Known coefficients of the terms.
-    pub(super) fn fixed(&self) -> &[Option<f64>] {
+    /// Coefficients by term, `None` for a free one.
+    pub(super) fn fixed_coefficients(&self) -> &[Option<f64>] {
         &self.fixed
     }
 
-    /// Coefficients of L candidates; flags those that are singular.
+    /// Solve for the coefficients of L candidates. Return a flag for each singular one.
     ///
-    /// `positions` gives the column of each term per candidate; the initial terms are those of all.
+    /// `positions` holds the column of each term per candidate. The initial terms are common to all.
     #[inline(always)]
     pub(crate) fn solve<const L: usize>(
         &self,
@@ -120,17 +121,17 @@ impl NormalEquations {
     ) -> [bool; L] {
         let normal = &self.terms;
         let (free, width) = (self.free.len(), normal.width);
-        let k = free + initial.len() * self.parts.len();
+        let k = free + initial.len() * self.record_equations.len();
         let zero = [0.0; L];
         let Solve { gram, rhs, coefficients, initial: weights } = solve;
         gram.clear();
-        gram.resize(packed(k, 0), zero);
+        gram.resize(packed_index(k, 0), zero);
         rhs.clear();
         rhs.resize(k, zero);
         for (a, &ta) in self.free.iter().enumerate() {
             let rows = &positions[ta];
             for (b, &tb) in self.free[..=a].iter().enumerate() {
-                gram[packed(a, b)] = rows.with(&positions[tb], &normal.correlation, width);
+                gram[packed_index(a, b)] = rows.with(&positions[tb], &normal.correlation, width);
             }
             rhs[a] = rows.of(&normal.rhs);
             for (columns, fixed) in positions.iter().zip(&self.fixed) {
@@ -140,18 +141,18 @@ impl NormalEquations {
                 }
             }
         }
-        for (r, part) in self.parts.iter().enumerate() {
+        for (r, part) in self.record_equations.iter().enumerate() {
             for (i, &e) in initial.iter().enumerate() {
                 let a = free + r * initial.len() + i;
                 let row = &part.correlation[e * width..(e + 1) * width];
                 for (b, &tb) in self.free.iter().enumerate() {
-                    // This record's share of a term's column, against the size that the column has on all.
+                    // Contribution of this record to a term's column, relative to the column's norm over all records.
                     let columns = &positions[tb];
                     let (c, size, all) = (columns.of(row), columns.of(&part.size), columns.of(&normal.inverse));
-                    gram[packed(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
+                    gram[packed_index(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
                 }
                 for (j, &f) in initial[..=i].iter().enumerate() {
-                    gram[packed(a, free + r * initial.len() + j)] = [row[f]; L];
+                    gram[packed_index(a, free + r * initial.len() + j)] = [row[f]; L];
                 }
                 rhs[a] = [part.rhs[e]; L];
                 for (columns, fixed) in positions.iter().zip(&self.fixed) {
@@ -181,7 +182,7 @@ impl NormalEquations {
             });
         }
         weights.clear();
-        for (r, part) in self.parts.iter().enumerate() {
+        for (r, part) in self.record_equations.iter().enumerate() {
             for (i, &e) in initial.iter().enumerate() {
                 let x = rhs[free + r * initial.len() + i];
                 weights.push(std::array::from_fn(|n| x[n] * part.inverse[e]));
@@ -191,14 +192,19 @@ impl NormalEquations {
     }
 }
 
-/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major; of no use once it was told to stop.
+/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major. Unusable after a stop request.
 pub(super) fn plain_gram(bank: &Bank, target: &[f64], stop: &Stop) -> Vec<f64> {
     dense::gram(bank.columns(), target, stop)
 }
 
-/// Gives a Gram matrix multi-innovation weights: p on all rows but the last p − 1.
+/// Apply multi-innovation weights to a Gram matrix: p on all rows but the last p − 1.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: Innovation) -> Result<()> {
+pub(super) fn apply_innovation_weights(
+    gram: &mut [f64],
+    bank: &Bank,
+    target: &[f64],
+    innovation: Innovation,
+) -> Result<()> {
     let width = bank.len() + 1;
     // Φ is orthogonal: the unweighted Gram matrix is the same in Haar coordinates.
     let m = target.len();
@@ -207,8 +213,8 @@ pub(super) fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: I
     let mut rows = vec![vec![0.0; width]; tail];
     for j in 0..width {
         let mut values = if j < bank.len() { bank.column(j) } else { target }.to_vec();
-        if innovation.rows == Rows::Haar {
-            operational_matrices::transform(&mut values)?;
+        if innovation.row_basis == RowBasis::Haar {
+            operational_matrices::haar_transform(&mut values)?;
         }
         for (t, row) in rows.iter_mut().enumerate() {
             row[j] = values[m - 1 - t];
@@ -226,24 +232,24 @@ pub(super) fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: I
     Ok(())
 }
 
-/// Gram matrix of columns and target summed over records, and the norms on its diagonal.
-pub(crate) struct Squares {
+/// Gram matrix of columns and target summed over records, with the norms of the columns.
+pub(crate) struct ResidualSumOfSquares {
     stride: usize,
     gram: Vec<f64>,
     /// Its diagonal, and the roots of that.
     diagonal: Vec<f64>,
     norms: Vec<f64>,
-    /// What rounding may add to a squared sum, per unit of the squared sum of norms.
+    /// Rounding-error bound of a squared sum, per unit of the squared sum of norms.
     unit: f64,
-    /// The same where the least sum over all coefficients is asked for, and the least eigenvalue of the terms' correlation
-    /// matrix from which on it holds (docs/mathematics.md, stretches of one term).
+    /// Same bound for the minimum over all coefficients, and the smallest eigenvalue for which it holds. The eigenvalue
+    /// is that of the terms' correlation matrix (docs/mathematics.md).
     slack: f64,
-    flat: f64,
+    min_eigenvalue: f64,
 }
 
-impl Squares {
-    /// From a Gram matrix over so many columns and the target, row-major, how many samples it sums over, of how many terms
-    /// a candidate is and how many times another a row may weigh in the equations that give its coefficients.
+impl ResidualSumOfSquares {
+    /// Build from a Gram matrix over `width` columns and the target, row-major. `samples` is the length of its sums,
+    /// `terms` the number of terms of a candidate. `weights` is the largest weight of a row in the normal equations.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(gram: Vec<f64>, width: usize, samples: usize, terms: usize, weights: usize) -> Self {
         let slack = 4.0 * f64::EPSILON * (samples + 8 * terms + 16) as f64;
@@ -254,12 +260,12 @@ impl Squares {
             gram,
             unit: 4.0 * f64::EPSILON * samples as f64,
             slack,
-            // Whose columns lie this far apart is not singular in the weighted equations either.
-            flat: (2.0 * terms as f64 * slack).max(16.0 * weights as f64 * PIVOT_FLOOR),
+            // Candidates with this minimum eigenvalue are regular in the weighted equations, too.
+            min_eigenvalue: (2.0 * terms as f64 * slack).max(16.0 * weights as f64 * PIVOT_FLOOR),
         }
     }
 
-    /// Place of the target.
+    /// Position of the target.
     #[inline(always)]
     pub(super) fn target(&self) -> usize {
         self.stride - 1
@@ -277,7 +283,7 @@ impl Squares {
         self.gram[a * self.stride + b]
     }
 
-    /// Squared norms of columns and target.
+    /// Squares of the norms of columns and target.
     #[inline(always)]
     pub(super) fn diagonal(&self) -> &[f64] {
         &self.diagonal
@@ -289,19 +295,19 @@ impl Squares {
         &self.norms
     }
 
-    /// What rounding may add to a least squared sum, per unit of the squared sum of norms.
+    /// Rounding-error bound of a minimal squared sum, per unit of the squared sum of norms.
     #[inline(always)]
     pub(super) fn slack(&self) -> f64 {
         self.slack
     }
 
-    /// The least eigenvalue of a correlation matrix of which anything is proved.
+    /// Smallest eigenvalue of a correlation matrix for which the bound holds.
     #[inline(always)]
-    pub(super) fn flat(&self) -> f64 {
-        self.flat
+    pub(super) fn min_eigenvalue(&self) -> f64 {
+        self.min_eigenvalue
     }
 
-    /// Lower bounds of the squared equation error of L candidates, rounding allowed for, and its values.
+    /// Lower bounds of the squared equation error of L candidates, including rounding, and its computed values.
     #[inline(always)]
     pub(crate) fn error<const L: usize>(
         &self,

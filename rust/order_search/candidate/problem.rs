@@ -1,63 +1,64 @@
-//! What all candidates of one equation share, and the way of one candidate through it: coefficients, bound, error.
+//! Data shared by all candidates of one equation, and the evaluation of one candidate: coefficients, bounds, error.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, Error, Result};
-use crate::estimation::multi_innovation::Rows;
+use crate::estimation::multi_innovation::RowBasis;
 use crate::fractional::operational_matrices;
 use crate::order_search::candidate::columns::Columns;
 use crate::order_search::candidate::instrumental_variables::{start_bank, Refiner};
-use crate::order_search::candidate::normal_equations::{plain_gram, weigh, Normal, NormalEquations, Solve, Squares};
-use crate::order_search::candidate::simulation::March;
+use crate::order_search::candidate::normal_equations::{
+    apply_innovation_weights, plain_gram, Normal, NormalEquations, ResidualSumOfSquares, Solve,
+};
+use crate::order_search::candidate::simulation::BlockSimulation;
 use crate::order_search::control::Control;
-use crate::order_search::dual_bound::infeasibility::Reach;
-use crate::order_search::dual_bound::linearized_vectors::{Held, Tangent, Tangents};
+use crate::order_search::dual_bound::infeasibility::InfeasibilityProof;
+use crate::order_search::dual_bound::linearized_vectors::{LinearizedVector, LinearizedVectors, VectorLookup};
 use crate::order_search::dual_bound::lower_bound::Bound;
-use crate::order_search::dual_bound::tailored_vectors::{Adapted, Fitted, Memory};
-use crate::order_search::dual_bound::unstable_zeros::Roots;
+use crate::order_search::dual_bound::tailored_vectors::{NormCache, TailoredVector, TailoredVectors};
+use crate::order_search::dual_bound::unstable_zeros::UnstableZeros;
 use crate::order_search::options::{Criterion, Estimator, Options};
 use crate::order_search::result::{Failure, Row, Verdict};
 use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::simd::{self, WIDTH};
+use crate::simd::{self, LANE_COUNT};
 
-/// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
-const TRANSFORMS: u64 = 6;
-/// The same where coefficients are refined: a few steps of a division and a dozen transforms each.
-const REFINING: u64 = 100;
+/// Cost of one simulation, in transforms. Building test vectors must cost a small fraction of all simulations.
+const SIMULATION_COST_TRANSFORMS: u64 = 6;
+/// Cost of one refinement, in transforms: a few division steps and a dozen transforms each.
+const REFINEMENT_COST_TRANSFORMS: u64 = 100;
 
 /// Columns and coefficients of a candidate.
-pub(crate) type Known = (Vec<usize>, Vec<f64>);
+pub(crate) type SolvedCandidate = (Vec<usize>, Vec<f64>);
 
-/// Everything the candidates of one equation share.
+/// Data shared by all candidates of one equation.
 pub(crate) struct Problem {
     index: Index,
     banks: Vec<Bank>,
     targets: Vec<Vec<f64>>,
     pub(crate) equations: NormalEquations,
-    /// Where the equation error in squares ranks: its own Gram matrix, without weights and prior.
-    pub(crate) squares: Option<Squares>,
+    /// Gram matrix without weights and prior, if the squared equation error ranks.
+    pub(crate) residual_sums: Option<ResidualSumOfSquares>,
     pub(crate) bound: Option<Bound>,
-    /// Test vectors made for candidates of the search, where these pay.
-    pub(crate) adapted: Option<Adapted>,
-    /// What proves that free runs explode, and test vectors that follow coefficients, where candidates are to be proved
-    /// closely.
-    pub(crate) roots: Option<Roots>,
-    pub(crate) tangents: Option<Tangents>,
+    /// Test vectors tailored to candidates of the search, if they are worthwhile.
+    pub(crate) tailored_vectors: Option<TailoredVectors>,
+    /// Test for unstable zeros, and linearized test vectors, if candidates are bounded closely.
+    pub(crate) unstable_zeros: Option<UnstableZeros>,
+    pub(crate) linearized_vectors: Option<LinearizedVectors>,
     refiner: Option<Refiner>,
-    /// Where coefficients are refined: the banks that the bound speaks of, until it is made.
+    /// Banks for the dual bound until it is built, if coefficients are refined.
     bound_banks: Vec<Bank>,
     options: Options,
     samples: usize,
 }
 
-/// [`Bound::evaluate`] as a kernel.
-struct Bounding<'a, F> {
+/// Kernel form of [`Bound::evaluate`].
+struct BoundKernel<'a, F> {
     bound: &'a Bound,
     limit: f64,
     columns: F,
 }
 
-impl<'a, F> simd::Kernel for Bounding<'a, F>
+impl<'a, F> simd::Kernel for BoundKernel<'a, F>
 where
     F: Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
 {
@@ -69,74 +70,74 @@ where
     }
 }
 
-/// [`Bound::excludes`] as a kernel.
-struct Excluding<'a> {
+/// Kernel form of [`Bound::proves_infeasible`].
+struct InfeasibilityKernel<'a> {
     bound: &'a Bound,
     limit: f64,
     terms: &'a [usize],
     fixed: &'a [Option<f64>],
     initial: &'a [usize],
     start: &'a [f64],
-    reach: &'a mut Reach,
+    reach: &'a mut InfeasibilityProof,
 }
 
-impl simd::Kernel for Excluding<'_> {
+impl simd::Kernel for InfeasibilityKernel<'_> {
     type Output = bool;
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.bound.excludes(self.limit, self.terms, self.fixed, self.initial, self.start, self.reach)
+        self.bound.proves_infeasible(self.limit, self.terms, self.fixed, self.initial, self.start, self.reach)
     }
 }
 
-/// [`Adapted::exclude`] as a kernel.
-struct Adapting<'a> {
-    adapted: &'a Adapted,
+/// Kernel form of the exclusion by tailored test vectors.
+struct TailoredVectorKernel<'a> {
+    adapted: &'a TailoredVectors,
     limit: f64,
     terms: &'a [usize],
     coefficients: &'a [f64],
-    memory: &'a mut Memory,
+    memory: &'a mut NormCache,
 }
 
-impl simd::Kernel for Adapting<'_> {
+impl simd::Kernel for TailoredVectorKernel<'_> {
     type Output = bool;
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.adapted.exclude(self.terms, self.coefficients, self.limit, self.memory)
+        self.adapted.excludes_candidate(self.terms, self.coefficients, self.limit, self.memory)
     }
 }
 
-/// [`Tangents::exclude`] as a kernel.
-struct Following<'a> {
-    tangents: &'a Tangents,
+/// Kernel form of the exclusion by linearized test vectors.
+struct LinearizedVectorKernel<'a> {
+    tangents: &'a LinearizedVectors,
     limit: f64,
     terms: &'a [usize],
     coefficients: &'a [f64],
-    held: &'a mut Held,
+    held: &'a mut VectorLookup,
 }
 
-impl simd::Kernel for Following<'_> {
+impl simd::Kernel for LinearizedVectorKernel<'_> {
     type Output = bool;
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.tangents.exclude(self.terms, self.coefficients, self.limit, self.held)
+        self.tangents.excludes_candidate(self.terms, self.coefficients, self.limit, self.held)
     }
 }
 
-/// Memory of one thread.
+/// Workspace of one thread.
 pub(crate) struct Scratch {
-    memory: Memory,
-    held: Held,
-    reach: Reach,
+    norm_cache: NormCache,
+    lookup: VectorLookup,
+    infeasibility: InfeasibilityProof,
     start: Vec<f64>,
     one: Solve<1>,
-    march: March,
+    simulation: BlockSimulation,
     /// Coefficients of the last candidate's terms, and of its initial terms by record.
     coefficients: Vec<f64>,
     weights: Vec<f64>,
-    /// Columns of the candidate at hand.
+    /// Columns of the current candidate.
     pub(crate) positions: Vec<usize>,
     pub(crate) initial: Vec<usize>,
 }
@@ -144,12 +145,12 @@ pub(crate) struct Scratch {
 impl Default for Scratch {
     fn default() -> Self {
         Self {
-            memory: Memory::default(),
-            held: Held::default(),
-            reach: Reach::default(),
+            norm_cache: NormCache::default(),
+            lookup: VectorLookup::default(),
+            infeasibility: InfeasibilityProof::default(),
             start: Vec::new(),
             one: Solve::new(),
-            march: March::default(),
+            simulation: BlockSimulation::default(),
             coefficients: Vec::new(),
             weights: Vec::new(),
             positions: Vec::new(),
@@ -159,7 +160,7 @@ impl Default for Scratch {
 }
 
 impl Problem {
-    /// Builds banks and Gram matrices for the regressors in `index`, whose memory was counted.
+    /// Build banks and Gram matrices for the regressors in `index`, whose memory has been budgeted.
     pub(crate) fn new(
         records: &[Record],
         output: usize,
@@ -173,21 +174,22 @@ impl Problem {
         }
         options.check()?;
         check_finite("fixed coefficients", &fixed.iter().flatten().copied().collect::<Vec<_>>())?;
-        if matches!(options.estimator, Estimator::MultiInnovation(innovation) if innovation.rows == Rows::Haar) {
+        if matches!(options.estimator, Estimator::MultiInnovation(innovation) if innovation.row_basis == RowBasis::Haar)
+        {
             for record in records {
                 operational_matrices::check_power_of_two(record.m())?;
             }
         }
         let width = index.keys().len();
         let refined = options.refines();
-        // Noise of a measured output that drives an equation would rank like a fault of the equation.
+        // Noise of a measured output that enters as an input would be ranked like an error of the equation.
         let banks = records
             .iter()
             .map(|r| {
                 if refined {
-                    Bank::counted(&index, &r.cleaned(), output, stop)
+                    Bank::new_interruptible(&index, &r.clean_record(), output, stop)
                 } else {
-                    Bank::counted(&index, r, output, stop)
+                    Bank::new_interruptible(&index, r, output, stop)
                 }
             })
             .collect::<Result<Vec<_>>>()?;
@@ -195,7 +197,7 @@ impl Problem {
         let samples = records.iter().map(Record::m).sum();
         let elements = (width + 1) * (width + 1);
         let mut sum = vec![0.0; elements];
-        let mut unweighted = if options.scored_by_products() { vec![0.0; elements] } else { Vec::new() };
+        let mut unweighted = if options.ranks_by_gram_matrix() { vec![0.0; elements] } else { Vec::new() };
         let prior = match options.estimator {
             Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,
             Estimator::MultiInnovation(innovation) => 1.0 / innovation.prior_covariance,
@@ -211,7 +213,7 @@ impl Problem {
             stop.check()?;
             unweighted.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
             if let Estimator::MultiInnovation(innovation) = options.estimator {
-                weigh(&mut gram, bank, target, innovation)?;
+                apply_innovation_weights(&mut gram, bank, target, innovation)?;
             }
             sum.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
             if options.initial != Initial::Rest {
@@ -222,11 +224,11 @@ impl Problem {
             Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings, stop)),
             _ => None,
         };
-        // D e = w holds for integrals of the output as it was measured.
-        let bound_banks = if refined && options.early_stopping && options.criterion == Criterion::OutputError {
+        // D e = w holds for integrals of the measured output.
+        let bound_banks = if refined && options.pruning && options.criterion == Criterion::OutputError {
             records
                 .iter()
-                .map(|r| Bank::counted(&index, &r.cleaned_but(output), output, stop))
+                .map(|r| Bank::new_interruptible(&index, &r.clean_record_except(output), output, stop))
                 .collect::<Result<_>>()?
         } else {
             Vec::new()
@@ -236,13 +238,13 @@ impl Problem {
             banks,
             targets,
             equations: NormalEquations::new(Normal::new(&sum, width, prior), parts, fixed),
-            squares: options
-                .scored_by_products()
-                .then(|| Squares::new(unweighted, width, samples, fixed.len(), options.weights())),
+            residual_sums: options
+                .ranks_by_gram_matrix()
+                .then(|| ResidualSumOfSquares::new(unweighted, width, samples, fixed.len(), options.weights())),
             bound: None,
-            adapted: None,
-            roots: None,
-            tangents: None,
+            tailored_vectors: None,
+            unstable_zeros: None,
+            linearized_vectors: None,
             refiner,
             bound_banks,
             options: options.clone(),
@@ -250,21 +252,26 @@ impl Problem {
         })
     }
 
-    /// Makes test vectors for about this many candidates, as far as they pay; on the current thread pool.
+    /// Build test vectors for about this many candidates, as far as they are worthwhile. Runs on the current thread
+    /// pool.
     pub(crate) fn with_bound(mut self, candidates: u64, stop: &Stop) -> Self {
         let banks = std::mem::take(&mut self.bound_banks);
-        let (banks, transforms) = if self.refines() { (&banks, 4 * REFINING) } else { (&self.banks, TRANSFORMS) };
-        if self.options.early_stopping && self.squares.is_none() && !banks.is_empty() {
+        let (banks, transforms) = if self.refines() {
+            (&banks, 4 * REFINEMENT_COST_TRANSFORMS)
+        } else {
+            (&self.banks, SIMULATION_COST_TRANSFORMS)
+        };
+        if self.options.pruning && self.residual_sums.is_none() && !banks.is_empty() {
             let output_error = self.options.criterion == Criterion::OutputError;
             let own = (0..self.index.keys().len()).filter(|&p| !banks[0].kernel(p).is_empty()).count() as u64;
-            // Two transforms for each own column and test vector; the products cost as much as a transform or so.
+            // Two transforms for each own column and test vector. The products cost about one transform.
             let each = 2 * own + 4;
             #[allow(clippy::cast_possible_truncation)]
-            let groups = (candidates.saturating_mul(transforms) / 4 / (each * WIDTH as u64))
-                .min((Bound::POOL / WIDTH) as u64) as usize;
+            let groups = (candidates.saturating_mul(transforms) / 4 / (each * LANE_COUNT as u64))
+                .min((Bound::MAX_TEST_VECTORS / LANE_COUNT) as u64) as usize;
             if groups > 0 {
                 let data = (&banks[..], &self.targets[..]);
-                self.bound = Some(Bound::new(data, self.options.norm, output_error, groups * WIDTH, stop));
+                self.bound = Some(Bound::new(data, self.options.norm, output_error, groups * LANE_COUNT, stop));
             }
         }
         self
@@ -275,64 +282,85 @@ impl Problem {
         self.refiner.is_some()
     }
 
-    /// No test vectors of candidates yet, and the bytes that each will take.
-    pub(crate) fn no_adapted(&self) -> (Adapted, u64) {
-        (Adapted::new(&self.banks, &self.targets, self.options.norm), Adapted::bytes(&self.banks))
+    /// Return an empty set of tailored test vectors, and the memory that each needs [bytes].
+    pub(crate) fn empty_tailored_vectors(&self) -> (TailoredVectors, u64) {
+        (TailoredVectors::new(&self.banks, &self.targets, self.options.norm), TailoredVectors::bytes(&self.banks))
     }
 
-    /// The test vector of the candidate with these columns and its least-squares coefficients, at rest.
-    pub(crate) fn fit(&self, adapted: &Adapted, positions: &[usize]) -> Option<Fitted> {
-        let coefficients = self.alone(positions)?;
+    /// Build the tailored test vector of the candidate with these columns. Coefficients are least-squares estimates,
+    /// initial conditions are zero.
+    pub(crate) fn tailor_vector(&self, adapted: &TailoredVectors, positions: &[usize]) -> Option<TailoredVector> {
+        let coefficients = self.least_squares_coefficients(positions)?;
         adapted.fit(&self.banks, &self.targets, positions, &coefficients)
     }
 
     /// Whether these test vectors exclude that candidate.
-    pub(crate) fn excluded_by(&self, adapted: &Adapted, positions: &[usize], limit: f64) -> bool {
-        let Some(coefficients) = self.alone(positions) else { return false };
-        let mut memory = Memory::default();
-        simd::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, memory: &mut memory })
+    pub(crate) fn excluded_by_tailored(&self, adapted: &TailoredVectors, positions: &[usize], limit: f64) -> bool {
+        let Some(coefficients) = self.least_squares_coefficients(positions) else { return false };
+        let mut memory = NormCache::default();
+        simd::dispatch_simd(TailoredVectorKernel {
+            adapted,
+            limit,
+            terms: positions,
+            coefficients: &coefficients,
+            memory: &mut memory,
+        })
     }
 
-    /// No test vectors that follow coefficients yet.
-    pub(crate) fn no_tangents(&self) -> Tangents {
-        Tangents::new(&self.banks, &self.targets, self.options.norm)
+    /// Return an empty set of linearized test vectors.
+    pub(crate) fn empty_linearized_vectors(&self) -> LinearizedVectors {
+        LinearizedVectors::new(&self.banks, &self.targets, self.options.norm)
     }
 
-    /// The one of the candidate with these columns and coefficients, at rest.
-    pub(crate) fn tangent(&self, tangents: &Tangents, terms: &[usize], c: &[f64], limit: f64) -> Option<Tangent> {
+    /// Build the linearized test vector of the candidate with these columns and coefficients. Initial conditions are
+    /// zero.
+    pub(crate) fn linearize_vector(
+        &self,
+        tangents: &LinearizedVectors,
+        terms: &[usize],
+        c: &[f64],
+        limit: f64,
+    ) -> Option<LinearizedVector> {
         tangents.fit((&self.banks, &self.targets), terms, c, limit)
     }
 
-    /// Those of some candidates, by columns and coefficients, that it does not exclude.
-    pub(crate) fn left_by(&self, tangents: &Tangents, made: &Tangent, all: &[Known], limit: f64) -> Vec<Known> {
-        all.iter().filter(|(terms, c)| !tangents.excludes(made, terms, c, limit)).cloned().collect()
+    /// Return the candidates, by columns and coefficients, that this vector does not exclude.
+    pub(crate) fn not_excluded_by(
+        &self,
+        tangents: &LinearizedVectors,
+        made: &LinearizedVector,
+        all: &[SolvedCandidate],
+        limit: f64,
+    ) -> Vec<SolvedCandidate> {
+        all.iter().filter(|(terms, c)| !tangents.vector_excludes(made, terms, c, limit)).cloned().collect()
     }
 
-    /// Makes what proves that free runs explode, where its tables fit into so many bytes: how many they take. Runs on the
-    /// current thread pool.
-    pub(crate) fn with_roots(&mut self, spare: u64) -> u64 {
-        let bytes = Roots::bytes(&self.banks);
-        if bytes > spare || !Roots::pay(&self.targets) {
+    /// Build the test for unstable zeros if its tables fit into this memory [bytes]. Return the memory used. Runs on
+    /// the current thread pool.
+    pub(crate) fn add_unstable_zeros(&mut self, spare: u64) -> u64 {
+        let bytes = UnstableZeros::bytes(&self.banks);
+        if bytes > spare || !UnstableZeros::is_affordable(&self.targets) {
             return 0;
         }
-        self.roots = Some(Roots::new(&self.banks, &self.targets, self.options.norm));
+        self.unstable_zeros = Some(UnstableZeros::new(&self.banks, &self.targets, self.options.norm));
         bytes
     }
 
-    /// Least-squares coefficients of the candidate with these columns, at rest; none where it is singular.
-    pub(crate) fn alone(&self, positions: &[usize]) -> Option<Vec<f64>> {
+    /// Least-squares coefficients of the candidate with these columns, with zero initial conditions. `None` if it is
+    /// singular.
+    pub(crate) fn least_squares_coefficients(&self, positions: &[usize]) -> Option<Vec<f64>> {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let mut one = Solve::new();
         let [singular] = self.equations.solve(&sources, &[], &mut one);
         (!singular).then(|| one.coefficients.iter().map(|c| c[0]).collect())
     }
 
-    /// Size of the output over all records.
+    /// Norm of the output over all records.
     pub(crate) fn size(&self) -> f64 {
         self.targets.iter().flatten().map(|y| y * y).sum::<f64>().sqrt()
     }
 
-    /// Samples of all records.
+    /// Number of samples of all records.
     pub(crate) fn samples(&self) -> usize {
         self.samples
     }
@@ -355,9 +383,9 @@ impl Problem {
         );
     }
 
-    /// Evaluates a structure given the positions of its terms; leaves its coefficients in the scratch.
+    /// Evaluate a structure given the positions of its terms. Its coefficients are stored in the scratch.
     ///
-    /// `bounded` tells whether the bound, where there is one, is asked first.
+    /// The flag `bounded` selects whether the dual bound, if there is one, is tried first.
     pub(crate) fn evaluate(
         &self,
         positions: &[usize],
@@ -368,7 +396,17 @@ impl Problem {
         control: &Control,
     ) -> Verdict {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
-        let Scratch { memory, held, reach, start, one, march, coefficients, weights, .. } = scratch;
+        let Scratch {
+            norm_cache: memory,
+            lookup: held,
+            infeasibility: reach,
+            start,
+            one,
+            simulation: march,
+            coefficients,
+            weights,
+            ..
+        } = scratch;
         let [singular] = self.equations.solve(&sources, initial, one);
         if singular {
             return Verdict::Failed(Failure::Singular);
@@ -378,38 +416,38 @@ impl Problem {
         weights.clear();
         weights.extend(one.initial.iter().map(|c| c[0]));
         if let (Some(_), Some(bound), true) = (&self.refiner, &self.bound, limit < f64::INFINITY) {
-            // The refinement may change the coefficients in any way: only what holds of all of them excludes.
+            // Refinement may change the coefficients arbitrarily, so only a bound over all coefficients excludes.
             start.clear();
             start.extend(coefficients.iter().chain(weights.iter()));
-            let (terms, fixed) = (positions, self.equations.fixed());
-            if simd::widest(Excluding { bound, limit, terms, fixed, initial, start, reach }) {
+            let (terms, fixed) = (positions, self.equations.fixed_coefficients());
+            if simd::dispatch_simd(InfeasibilityKernel { bound, limit, terms, fixed, initial, start, reach }) {
                 return Verdict::Bounded(limit);
             }
         }
         if let Some(refiner) = &self.refiner {
             let (data, places) = ((&self.banks[..], &self.targets[..]), (positions, initial));
-            let fixed = self.equations.fixed();
+            let fixed = self.equations.fixed_coefficients();
             if let Err(failure) = refiner.refine(data, places, fixed, coefficients, weights, &control.stop) {
-                // What was told to stop has found nothing.
-                return if control.stopped() { Verdict::Stopped(0.0) } else { Verdict::Failed(failure) };
+                // A stop request invalidates the result.
+                return if control.is_stopped() { Verdict::Stopped(0.0) } else { Verdict::Failed(failure) };
             }
         }
         let (coefficients, weights) = (&coefficients[..], &weights[..]);
         let of_record = |r: usize| &weights[r * initial.len()..(r + 1) * initial.len()];
         if let (true, Some(bound)) = (bounded && limit < f64::INFINITY, &self.bound) {
             let columns = |r: usize| (positions, coefficients, initial, of_record(r));
-            let (lowest, _) = simd::widest(Bounding { bound, limit, columns });
+            let (lowest, _) = simd::dispatch_simd(BoundKernel { bound, limit, columns });
             if lowest > limit {
                 return Verdict::Bounded(lowest);
             }
         }
-        if let (Some(adapted), true) = (&self.adapted, limit < f64::INFINITY) {
-            if simd::widest(Adapting { adapted, limit, terms: positions, coefficients, memory }) {
+        if let (Some(adapted), true) = (&self.tailored_vectors, limit < f64::INFINITY) {
+            if simd::dispatch_simd(TailoredVectorKernel { adapted, limit, terms: positions, coefficients, memory }) {
                 return Verdict::Bounded(limit);
             }
         }
-        if let (Some(tangents), true) = (&self.tangents, limit < f64::INFINITY) {
-            if simd::widest(Following { tangents, limit, terms: positions, coefficients, held }) {
+        if let (Some(tangents), true) = (&self.linearized_vectors, limit < f64::INFINITY) {
+            if simd::dispatch_simd(LinearizedVectorKernel { tangents, limit, terms: positions, coefficients, held }) {
                 return Verdict::Bounded(limit);
             }
         }
@@ -424,7 +462,7 @@ impl Problem {
                 Criterion::OutputError => {
                     let own = terms.clone().map(|(p, c)| (bank.kernel(p), c)).filter(|(kernel, _)| !kernel.is_empty());
                     let driven = terms.filter(|&(p, _)| bank.kernel(p).is_empty()).chain(starts).map(column);
-                    march.run(target, own, driven, norm, raw, limit, control)
+                    march.accumulate_error(target, own, driven, norm, raw, limit, control)
                 }
             };
             match verdict {
@@ -435,12 +473,12 @@ impl Problem {
         Verdict::Score(raw)
     }
 
-    /// A raw sum in the norm asked for.
+    /// Score of a raw sum in the selected norm.
     pub(crate) fn score(&self, raw: f64) -> f64 {
         self.options.norm.score(raw, self.samples)
     }
 
-    /// The row of the candidate that was evaluated last, with so many initial terms a record.
+    /// Row of the last evaluated candidate, with this many initial terms per record.
     pub(crate) fn row(&self, index: u64, raw: f64, initial: usize, scratch: &Scratch) -> Row {
         Row {
             index,
@@ -450,7 +488,7 @@ impl Problem {
         }
     }
 
-    /// Evaluates a structure on its own: the row it makes.
+    /// Evaluate a structure separately and return its verdict and row.
     pub(crate) fn evaluate_structure(
         &self,
         structure: &Structure,

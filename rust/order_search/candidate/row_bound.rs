@@ -1,66 +1,67 @@
-//! Lower bounds of the squared equation error along a stretch of candidates that differ in one term: this term comes last
-//! in the factorisation of the products, and the factor of the others is shared.
+//! Lower bounds of the squared equation error for a row of candidates that differ in one term.
+//!
+//! The varying term comes last in the factorization L D Lᵀ of the products, so the factor of the others is shared.
 
 use crate::order_search::candidate::columns::{part_of, Columns};
-use crate::order_search::candidate::normal_equations::Squares;
+use crate::order_search::candidate::normal_equations::ResidualSumOfSquares;
 use crate::simd::Lanes;
 
-/// Most terms but the one that changes.
-const MOST: usize = 7;
+/// Maximum number of common terms, without the term that changes.
+const MAX_COMMON_TERMS: usize = 7;
 
-/// The factor L D Lᵀ of the products of all terms but one, and what these alone leave of the target.
-pub(crate) struct Shared<'a> {
-    squares: &'a Squares,
+/// Factor L D Lᵀ of the products of all common terms, and the target's residual after them.
+pub(crate) struct CommonFactor<'a> {
+    squares: &'a ResidualSumOfSquares,
     count: usize,
-    columns: [usize; MOST],
+    columns: [usize; MAX_COMMON_TERMS],
     /// Rows of L below its diagonal of ones, and D⁻¹.
-    lower: [[f64; MOST]; MOST],
-    inverse: [f64; MOST],
-    /// Products with the target behind L⁻¹, and the coefficients of these terms alone.
-    values: [f64; MOST],
-    alone: [f64; MOST],
-    norms: [f64; MOST],
-    /// What these terms leave of the target's squared norm.
-    left: f64,
-    /// Trace of the inverse of their correlation matrix, which no inverse of an eigenvalue exceeds.
+    lower: [[f64; MAX_COMMON_TERMS]; MAX_COMMON_TERMS],
+    inverse: [f64; MAX_COMMON_TERMS],
+    /// Products with the target after L⁻¹, and the coefficients of the common terms alone.
+    values: [f64; MAX_COMMON_TERMS],
+    common_coefficients: [f64; MAX_COMMON_TERMS],
+    norms: [f64; MAX_COMMON_TERMS],
+    /// Sum of squares of the target's residual after the common terms.
+    residual: f64,
+    /// Trace of the inverse of their correlation matrix, an upper bound of every inverse eigenvalue.
     trace: f64,
 }
 
-impl<'a> Shared<'a> {
-    /// Of the terms with these columns but for one of them; none where they are too many, or so nearly dependent that
-    /// nothing is proved of any candidate.
+impl<'a> CommonFactor<'a> {
+    /// Factor the terms with these columns except one. `None` if they are too many, or so nearly dependent that nothing
+    /// can be proved.
     #[inline(always)]
-    pub(crate) fn new(squares: &'a Squares, columns: &[usize], but: usize) -> Option<Self> {
-        let count = columns.len().checked_sub(1).filter(|count| *count <= MOST)?;
-        let zero = [0.0; MOST];
+    pub(crate) fn new(squares: &'a ResidualSumOfSquares, columns: &[usize], but: usize) -> Option<Self> {
+        let count = columns.len().checked_sub(1).filter(|count| *count <= MAX_COMMON_TERMS)?;
+        let zero = [0.0; MAX_COMMON_TERMS];
         let mut shared = Self {
             squares,
             count,
-            columns: [0; MOST],
-            lower: [zero; MOST],
+            columns: [0; MAX_COMMON_TERMS],
+            lower: [zero; MAX_COMMON_TERMS],
             inverse: zero,
             values: zero,
-            alone: zero,
+            common_coefficients: zero,
             norms: zero,
-            left: squares.product(squares.target(), squares.target()),
+            residual: squares.product(squares.target(), squares.target()),
             trace: 0.0,
         };
         for i in 0..count {
             shared.columns[i] = columns[i + usize::from(i >= but)];
             shared.extend(i);
         }
-        // Also where it is not a number.
-        (shared.trace * squares.flat() <= 1.0).then_some(shared)
+        // This form of the condition also rejects NaN.
+        (shared.trace * squares.min_eigenvalue() <= 1.0).then_some(shared)
     }
 
-    /// Takes term `i` into the factor.
+    /// Add term `i` to the factor.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangles, whose elements are told by their places
     fn extend(&mut self, i: usize) {
         let (squares, column) = (self.squares, self.columns[i]);
         let whole = squares.product(column, column);
         let (mut pivot, mut value) = (whole, squares.product(squares.target(), column));
-        let mut row = [0.0; MOST];
+        let mut row = [0.0; MAX_COMMON_TERMS];
         for j in 0..i {
             row[j] = squares.product(column, self.columns[j]);
             for l in 0..j {
@@ -76,7 +77,7 @@ impl<'a> Shared<'a> {
         self.values[i] = value;
         self.norms[i] = squares.norms()[column];
         let last = value * self.inverse[i];
-        self.left -= value * last;
+        self.residual -= value * last;
         // What the others make of this column, from the last one back; so much less is left for them to do.
         let mut sum = whole;
         for j in (0..i).rev() {
@@ -85,33 +86,33 @@ impl<'a> Shared<'a> {
                 row[j] -= self.lower[l][j] * row[l];
             }
             sum += row[j] * row[j] * self.norms[j] * self.norms[j];
-            self.alone[j] -= row[j] * last;
+            self.common_coefficients[j] -= row[j] * last;
         }
-        self.alone[i] = last;
+        self.common_coefficients[i] = last;
         self.trace += sum * self.inverse[i];
     }
 
-    /// Appends the positions among `columns`, which ascend, of those that this bound does not exclude where they stand
+    /// Append the positions in `columns` (ascending) whose candidates this bound does not exclude. Each column stands
     /// for the term that changes.
     #[inline(always)]
-    pub(crate) fn open<const L: usize>(&self, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
-        // The usual sizes get loops of known length.
+    pub(crate) fn append_open<const L: usize>(&self, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
+        // Common sizes get loops of constant length.
         match self.count {
-            0 => self.open_sized::<L>(0, columns, limit, open),
-            1 => self.open_sized::<L>(1, columns, limit, open),
-            2 => self.open_sized::<L>(2, columns, limit, open),
-            3 => self.open_sized::<L>(3, columns, limit, open),
-            4 => self.open_sized::<L>(4, columns, limit, open),
-            count => self.open_sized::<L>(count, columns, limit, open),
+            0 => self.append_open_sized::<L>(0, columns, limit, open),
+            1 => self.append_open_sized::<L>(1, columns, limit, open),
+            2 => self.append_open_sized::<L>(2, columns, limit, open),
+            3 => self.append_open_sized::<L>(3, columns, limit, open),
+            4 => self.append_open_sized::<L>(4, columns, limit, open),
+            count => self.append_open_sized::<L>(count, columns, limit, open),
         }
     }
 
     #[inline(always)]
-    fn open_sized<const L: usize>(&self, count: usize, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
+    fn append_open_sized<const L: usize>(&self, count: usize, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
         let mut from = 0;
         while from + L <= columns.len() {
-            let changing = Columns::<L>::ascending(part_of(&columns[from..]));
-            self.append(count, &changing, (from, L), limit, open);
+            let changing = Columns::<L>::from_ascending(part_of(&columns[from..]));
+            self.append_open_lanes(count, &changing, (from, L), limit, open);
             from += L;
         }
         if from < columns.len() {
@@ -120,13 +121,13 @@ impl<'a> Shared<'a> {
             at[..rest.len()].copy_from_slice(rest);
             let mut changing = Columns::new(at);
             changing.compare();
-            self.append(count, &changing, (from, rest.len()), limit, open);
+            self.append_open_lanes(count, &changing, (from, rest.len()), limit, open);
         }
     }
 
-    /// Appends those of so many lanes, from this position on, that are not excluded.
+    /// Append the lanes, from this position on, that are not excluded.
     #[inline(always)]
-    fn append<const L: usize>(
+    fn append_open_lanes<const L: usize>(
         &self,
         count: usize,
         changing: &Columns<L>,
@@ -134,23 +135,23 @@ impl<'a> Shared<'a> {
         limit: f64,
         open: &mut Vec<usize>,
     ) {
-        let excluded = self.excluded(count, changing, limit);
+        let excluded = self.exclusion_flags(count, changing, limit);
         if excluded == [true; L] {
             return;
         }
         open.extend((from..from + lanes).zip(excluded).filter(|(_, excluded)| !excluded).map(|(at, _)| at));
     }
 
-    /// Whether no coefficients at all bring the squared error of each of L candidates down to the limit.
+    /// Whether no coefficients reduce the squared error of each of L candidates to the limit.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangles of lanes, whose elements are told by their places
-    fn excluded<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
+    fn exclusion_flags<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
         let squares = self.squares;
         let whole = changing.of(squares.diagonal());
         let norms = changing.of(squares.norms());
         let (mut pivot, mut value) = (whole, changing.of(squares.row(squares.target())));
         // Row of L D of the changing term, then of L.
-        let mut row: [Lanes<L>; MOST] = [[0.0; L]; MOST];
+        let mut row: [Lanes<L>; MAX_COMMON_TERMS] = [[0.0; L]; MAX_COMMON_TERMS];
         for j in 0..count {
             let mut sum = changing.of(squares.row(self.columns[j]));
             for l in 0..j {
@@ -173,7 +174,7 @@ impl<'a> Shared<'a> {
         for n in 0..L {
             inverse[n] = 1.0 / pivot[n];
             last[n] = value[n] * inverse[n];
-            error[n] = self.left - value[n] * last[n];
+            error[n] = self.residual - value[n] * last[n];
             size[n] = squares.norms()[squares.target()] + last[n].abs() * norms[n];
         }
         // What the others make of the changing column, from the last one back; so much less is left for them to do.
@@ -186,13 +187,13 @@ impl<'a> Shared<'a> {
             for n in 0..L {
                 let share = row[j][n] * self.norms[j];
                 sum[n] += share * share;
-                size[n] += (self.alone[j] - row[j][n] * last[n]).abs() * self.norms[j];
+                size[n] += (self.common_coefficients[j] - row[j][n] * last[n]).abs() * self.norms[j];
             }
         }
-        let (slack, flat) = (squares.slack(), squares.flat());
+        let (slack, flat) = (squares.slack(), squares.min_eigenvalue());
         let mut excluded = [false; L];
         for n in 0..L {
-            // Written so that what is not a number excludes nothing.
+            // This form of the condition lets NaN exclude nothing.
             let known = (pivot[n] > 0.0) & ((self.trace + sum[n] * inverse[n]) * flat <= 1.0);
             excluded[n] = known & (error[n] - slack * size[n] * size[n] > limit);
         }
@@ -207,7 +208,7 @@ mod tests {
     use crate::linalg::dense;
     use crate::parallel::Stop;
 
-    /// Numbers in [−1, 1), always the same ones.
+    /// Reproducible numbers in [−1, 1).
     fn noise(state: &mut u64, count: usize) -> Vec<f64> {
         let mut next = || {
             *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -218,8 +219,8 @@ mod tests {
         (0..count).map(|_| next()).collect()
     }
 
-    /// Columns that differ from one of their kind by this share, in units of their own.
-    fn alike(state: &mut u64, count: usize, m: usize, share: f64) -> Vec<Vec<f64>> {
+    /// Columns that deviate from a common one by this fraction, each in its own unit.
+    fn correlated_columns(state: &mut u64, count: usize, m: usize, share: f64) -> Vec<Vec<f64>> {
         let base = noise(state, m);
         let mut one = |i: usize| {
             let unit = libm::pow(10.0, (i % 5) as f64 - 2.0);
@@ -235,18 +236,23 @@ mod tests {
         for case in 0..240_u32 {
             let (m, terms, along) = (30 + case as usize % 170, 1 + case as usize % 6, 3 + case as usize % 23);
             let share = libm::pow(10.0, -f64::from(case % 15) / 2.0);
-            let columns = alike(state, terms - 1 + along, m, share);
+            let columns = correlated_columns(state, terms - 1 + along, m, share);
             let level = libm::pow(10.0, -f64::from(case % 8));
             let sum: Vec<f64> = (0..m).map(|t| columns[..terms].iter().map(|c| c[t]).sum()).collect();
             let target: Vec<f64> = sum.iter().zip(noise(state, m)).map(|(s, v)| s + level * v).collect();
-            let squares =
-                Squares::new(dense::gram(&columns.concat(), &target, &Stop::default()), columns.len(), m, terms, 1);
+            let squares = ResidualSumOfSquares::new(
+                dense::gram(&columns.concat(), &target, &Stop::default()),
+                columns.len(),
+                m,
+                terms,
+                1,
+            );
             let but = case as usize % terms;
             let others: Vec<usize> = (0..terms - 1).collect();
             let changing: Vec<usize> = (terms - 1..columns.len()).collect();
             let mut named = others.clone();
             named.insert(but, changing[0]);
-            let Some(shared) = Shared::new(&squares, &named, but) else {
+            let Some(shared) = CommonFactor::new(&squares, &named, but) else {
                 none += 1;
                 continue;
             };
@@ -256,14 +262,14 @@ mod tests {
                 let error = |t: usize| target[t] - fitted.iter().zip(&c).map(|(x, c)| c * x[t]).sum::<f64>();
                 let score: f64 = (0..m).map(|t| error(t) * error(t)).sum();
                 let mut open = Vec::new();
-                shared.open::<8>(&changing, score, &mut open);
+                shared.append_open::<8>(&changing, score, &mut open);
                 assert!(open.contains(&n), "case {case}: {n} of {along} has score {score:e}");
                 assert!(open.windows(2).all(|pair| pair[0] < pair[1]) && open.iter().all(|&at| at < along));
                 let mut one = Vec::new();
-                shared.open::<1>(&changing, score, &mut one);
+                shared.append_open::<1>(&changing, score, &mut one);
                 assert_eq!(one, open, "one at a time");
                 open.clear();
-                shared.open::<8>(&changing, 0.5 * score, &mut open);
+                shared.append_open::<8>(&changing, 0.5 * score, &mut open);
                 *(if open.contains(&n) { &mut kept } else { &mut proved }) += 1;
             }
         }

@@ -1,33 +1,33 @@
-//! The free run ŷ = N/D of one candidate, marched block by block beside the measurement.
+//! Blockwise simulation ŷ = N/D of one candidate, compared with the measurement block by block.
 
 use crate::order_search::control::Control;
 use crate::order_search::options::Norm;
 use crate::order_search::result::{Failure, Verdict};
-use crate::series::{Division, BLOCK};
+use crate::series::{Division, BLOCK_TERMS};
 
-/// A column with its coefficient.
+/// Column and its coefficient.
 type Weighted<'a> = (&'a [f64], f64);
 
-/// Memory of free runs, one after the other.
-pub(crate) struct March {
+/// Workspace of simulations, reused from one candidate to the next.
+pub(crate) struct BlockSimulation {
     divisor: Vec<f64>,
     block: Vec<f64>,
     division: Option<Division>,
 }
 
-impl Default for March {
+impl Default for BlockSimulation {
     fn default() -> Self {
-        Self { divisor: Vec::new(), block: vec![0.0; BLOCK], division: None }
+        Self { divisor: Vec::new(), block: vec![0.0; BLOCK_TERMS], division: None }
     }
 }
 
-impl March {
-    /// Adds the error of a free run to a raw sum, leaving as soon as this passes the limit or the caller stops.
+impl BlockSimulation {
+    /// Add the error of a simulation to a raw sum. Stops once the sum exceeds the limit or the caller requests a stop.
     ///
-    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`; a kernel is read no further than
-    /// the division has come.
+    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`. A kernel is read only as far as
+    /// the division has advanced.
     #[allow(clippy::too_many_arguments)]
-    pub(crate) fn run<'a>(
+    pub(crate) fn accumulate_error<'a>(
         &mut self,
         target: &[f64],
         own: impl Iterator<Item = Weighted<'a>> + Clone,
@@ -39,7 +39,7 @@ impl March {
     ) -> Verdict {
         let m = target.len();
         let Self { divisor, block, division } = self;
-        // Records may differ in length; a division is kept for one.
+        // Records may differ in length, but a division has a fixed one.
         let division = match division {
             Some(d) if d.terms() == m => {
                 d.reset();
@@ -49,9 +49,9 @@ impl March {
         };
         divisor.clear();
         let mut inverse = [0.0];
-        while division.solved() < m {
-            let lo = division.solved();
-            let hi = (lo + BLOCK).min(m);
+        while division.solved_terms() < m {
+            let lo = division.solved_terms();
+            let hi = (lo + BLOCK_TERMS).min(m);
             let from = divisor.len();
             let needed = division.reads().max(from);
             divisor.resize(needed, 0.0);
@@ -73,8 +73,8 @@ impl March {
             if !raw.is_finite() {
                 return Verdict::Failed(Failure::Diverged);
             }
-            // Written so that the interrupted candidate is never taken for a scored one.
-            if raw > limit || control.stopped() {
+            // An interrupted candidate must not be taken for a scored one.
+            if raw > limit || control.is_stopped() {
                 return Verdict::Stopped(raw);
             }
             division.join(|_, _, len| &divisor[..len]);
@@ -82,7 +82,7 @@ impl March {
         Verdict::Score(raw)
     }
 
-    /// Adds the residuals y − Σ c x to a raw sum, leaving as soon as this passes the limit.
+    /// Add the residuals y − Σ c x to a raw sum. Stops once the sum exceeds the limit.
     pub(crate) fn residuals<'a>(
         &mut self,
         target: &[f64],
@@ -91,9 +91,9 @@ impl March {
         mut raw: f64,
         limit: f64,
     ) -> Verdict {
-        for (i, target) in target.chunks(BLOCK).enumerate() {
+        for (i, target) in target.chunks(BLOCK_TERMS).enumerate() {
             let block = &mut self.block[..target.len()];
-            combine(block, i * BLOCK, columns.clone());
+            combine(block, i * BLOCK_TERMS, columns.clone());
             raw = norm.add(raw, target, block);
             if !raw.is_finite() {
                 return Verdict::Failed(Failure::Diverged);
@@ -106,7 +106,7 @@ impl March {
     }
 }
 
-/// Σ c x over one block that begins at `lo`.
+/// Σ c x over one block that starts at `lo`.
 #[inline]
 fn combine<'a>(block: &mut [f64], lo: usize, columns: impl Iterator<Item = Weighted<'a>>) {
     block.fill(0.0);

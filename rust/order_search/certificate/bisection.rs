@@ -1,72 +1,73 @@
-//! Cells are halved until each is known to hold nothing much better than the best.
+//! Bisection of the cells of a region until no cell can contain an error far below the best one found.
 
 use std::sync::atomic::Ordering;
 
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
-use crate::order_search::certificate::cell_bound::{about, check, Bounded};
-use crate::order_search::certificate::gram_tables::{width, Cell, Region, Tables, DEEPEST};
-use crate::order_search::certificate::regressor_expansion::MOST;
+use crate::order_search::certificate::cell_bound::{check_records, expand_cell, CellBound};
+use crate::order_search::certificate::gram_tables::{cell_width, Cell, GramTables, Region, MAX_CELL_LEVEL};
+use crate::order_search::certificate::regressor_expansion::MAX_TERMS;
 use crate::order_search::control::Control;
 use crate::parallel::pool;
 use crate::regressors::Record;
 
-/// Cells that a thread bounds at a time, and those of which it is known at a time what they came to.
-const CHUNK: usize = 256;
-const AT_ONCE: usize = 1 << 16;
-/// Bytes that cells take of which some are halved.
-const HELD: u64 = 4 * size_of::<Cell>() as u64;
+/// Cells that a task bounds, and cells whose bounds are held in memory at a time.
+const CELLS_PER_TASK: usize = 256;
+const CELLS_PER_PASS: usize = 1 << 16;
+/// Memory per cell while cells are bisected [bytes].
+const CELL_MEMORY_BYTES: u64 = 4 * size_of::<Cell>() as u64;
 
-/// Most orders that are tried on the way down from the best.
-const POLISHED: usize = 400;
-/// Middles near which orders are looked for at a time.
-const LIKELY: usize = 4;
+/// Maximum evaluations of the local search from the best orders.
+const MAX_POLISH_EVALUATIONS: usize = 400;
+/// Midpoints per pass that are tried as new best orders.
+const MIDPOINTS_PER_PASS: usize = 4;
 
-/// How much is asked for.
+/// Options of a certificate.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Asked {
-    /// No orders are to have an error below the best one found times one less this.
-    pub within: f64,
-    /// How many times the size of the output the terms of an equation have together at most: Σ ‖c x‖ ≤ largest·‖y‖.
-    pub largest: f64,
-    /// Cells after which the sweep ends with what it has proved.
-    pub cells: u64,
-    /// Threads, and bytes of memory.
+pub struct CertificateOptions {
+    /// Relative tolerance: no orders may have an error below (1 − tolerance) times the best error found.
+    pub tolerance: f64,
+    /// Largest sum of the terms' norms relative to the output: Σ ‖c x‖ ≤ `max_coefficient`·‖y‖.
+    pub max_coefficient: f64,
+    /// Maximum number of cells. The bisection ends there with the bound proved so far.
+    pub max_cells: u64,
+    /// Number of threads, and memory \[bytes\].
     pub threads: usize,
     /// See `threads`.
     pub memory: u64,
 }
 
-/// What is proved of all orders of a region.
+/// Lower bound of the equation error over all orders of a region.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Certificate {
-    /// No orders, with coefficients whose terms are not larger than asked for, give a smaller root of the mean squared
-    /// equation error; 0 where nothing is proved.
-    pub at_least: f64,
-    /// The smallest found, with the order of the equation and those of its terms; infinite where none was.
+    /// Lower bound of the root mean squared equation error, 0 if nothing is proved. It holds for all orders of the
+    /// region and all admissible coefficients.
+    pub lower_bound: f64,
+    /// Smallest error found, with the order of the equation and those of its terms. Infinite if none was found.
     pub best: f64,
     /// See `best`.
     pub order: f64,
     /// See `best`.
     pub orders: Vec<f64>,
-    /// Cells that were bounded.
+    /// Number of bounded cells.
     pub cells: u64,
-    /// Cells that are left: not far enough above the best, and too small to be halved or one too many.
-    pub open: u64,
+    /// Number of open cells: their bound is too small, and they cannot be bisected further.
+    pub open_cells: u64,
 }
 
-/// Proves that no orders of a region have an equation error, in squares, with coefficients that suit them best, much
-/// below the best that is found on the way; terms that cancel but for next to nothing are left out.
+/// Certify a lower bound of the squared equation error over all orders of a region. Coefficients are optimal for each
+/// order. Equations whose terms nearly cancel are not covered.
 ///
-/// The same bits for any number of threads.
+/// The result is bitwise identical for any number of threads.
 ///
 /// # Errors
-/// No region, or one that holds no orders; records without its signals, a setting out of range, too many cells, memory
-/// that is not there, [`Error::Interrupted`].
+/// No region or one without orders, records without its signals, an option out of range, too many cells, too little
+/// memory, [`Error::Interrupted`].
 ///
 /// ```
-/// # use ftlm::order_search::certificate::{certify, Asked, Range, Region};
+/// # use ftlm::order_search::certificate::{certify, Asked};
+/// # use ftlm::order_search::certificate::{Range, Region};
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
@@ -78,85 +79,92 @@ pub struct Certificate {
 ///     output: 0,
 ///     alpha: (0.5, 1.5),
 ///     terms: vec![Range { signal: 1, lowest: 0.0, highest: 0.0 }],
-///     apart: 0.05,
+///     min_separation: 0.05,
 /// };
-/// let asked = Asked { within: 0.05, largest: 1e3, cells: 1_000_000, threads: 1, memory: 1 << 28 };
-/// let found = certify(&[record], &region, &asked, &Control::default())?;
-/// assert!((found.order - 0.83).abs() < 0.02 && found.open == 0);
-/// assert!(0.95 * found.best <= found.at_least && found.at_least <= found.best);
+/// let (tolerance, max_coefficient, max_cells) = (0.05, 1e3, 1_000_000);
+/// let options = CertificateOptions { tolerance, max_coefficient, max_cells, threads: 1, memory: 1 << 28 };
+/// let found = certify(&[record], &region, &options, &Control::default())?;
+/// assert!((found.order - 0.83).abs() < 0.02 && found.open_cells == 0);
+/// assert!(0.95 * found.best <= found.lower_bound && found.lower_bound <= found.best);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn certify(records: &[Record], region: &Region, asked: &Asked, control: &Control) -> Result<Certificate> {
-    check(records, region.output, region.terms.iter().map(|t| t.signal))?;
+pub fn certify(
+    records: &[Record],
+    region: &Region,
+    asked: &CertificateOptions,
+    control: &Control,
+) -> Result<Certificate> {
+    check_records(records, region.output, region.terms.iter().map(|t| t.signal))?;
     region.check()?;
-    if !(asked.within > 0.0 && asked.within < 1.0) {
+    if !(asked.tolerance > 0.0 && asked.tolerance < 1.0) {
         return Err(Error::OutOfRange {
             name: "within".into(),
-            value: asked.within,
+            value: asked.tolerance,
             range: "(0, 1)".into(),
             remedy: "0.05 asks for a proof that nothing is better by more than 5 %".into(),
         });
     }
-    if !(asked.largest >= 1.0 && asked.largest <= 1e9) {
+    if !(asked.max_coefficient >= 1.0 && asked.max_coefficient <= 1e9) {
         return Err(Error::OutOfRange {
             name: "largest".into(),
-            value: asked.largest,
+            value: asked.max_coefficient,
             range: "[1, 1e9]".into(),
             remedy: "100 leaves out terms that cancel but for a hundredth".into(),
         });
     }
     let pool = pool(asked.threads)?;
     pool.install(|| {
-        let tables = Tables::new(records, region, asked.memory, control)?;
-        Sweep { tables, region, asked, control }.run(records)
+        let tables = GramTables::new(records, region, asked.memory, control)?;
+        CellBisection { tables, region, options: asked, control }.run(records)
     })
 }
 
-/// One at work.
-struct Sweep<'a> {
-    tables: Tables,
+/// Running bisection of the cells of a region.
+struct CellBisection<'a> {
+    tables: GramTables,
     region: &'a Region,
-    asked: &'a Asked,
+    options: &'a CertificateOptions,
     control: &'a Control,
 }
 
-impl Sweep<'_> {
+impl CellBisection<'_> {
     fn run(&self, records: &[Record]) -> Result<Certificate> {
-        let mut cells = self.largest()?;
+        let mut cells = self.initial_cells()?;
         if cells.is_empty() {
-            return Err(Error::EmptyLattice {
-                why: format!("no orders in these intervals are {} below alpha and apart", self.region.apart),
+            return Err(Error::EmptyOrderGrid {
+                why: format!("no orders in these intervals are {} below alpha and apart", self.region.min_separation),
             });
         }
         let (mut best, mut place) = (f64::INFINITY, Vec::new());
         let (mut proved, mut bounded, mut open) = (f64::INFINITY, 0_u64, 0_u64);
-        let target = |best: f64| (1.0 - self.asked.within).powi(2) * best;
-        let most = self.asked.cells.min(self.asked.memory.saturating_sub(self.tables.bytes) / HELD);
-        // What is known beforehand saves halving.
-        for cells in cells.chunks(AT_ONCE) {
+        let target = |best: f64| (1.0 - self.options.tolerance).powi(2) * best;
+        let most =
+            self.options.max_cells.min(self.options.memory.saturating_sub(self.tables.bytes) / CELL_MEMORY_BYTES);
+        // A good incumbent saves bisections.
+        for cells in cells.chunks(CELLS_PER_PASS) {
             let found = self.bounds(cells, 0.0)?;
-            self.better(records, (cells, &found), &mut best, &mut place)?;
+            self.update_best(records, (cells, &found), &mut best, &mut place)?;
         }
         self.polish(records, &mut best, &mut place)?;
         while !cells.is_empty() {
             if bounded + cells.len() as u64 > most {
                 open += cells.len() as u64;
-                proved = cells.iter().fold(proved, |least, cell| least.min(cell.least));
+                proved = cells.iter().fold(proved, |least, cell| least.min(cell.inherited_bound));
                 break;
             }
-            // What is known of; halves will come.
+            // Number of cells known so far. Further halves follow.
             self.control.total.store(bounded + cells.len() as u64, Ordering::Relaxed);
             let mut next = Vec::new();
-            for cells in cells.chunks(AT_ONCE) {
+            for cells in cells.chunks(CELLS_PER_PASS) {
                 let found = self.bounds(cells, target(best))?;
                 self.control.count(cells.len() as u64, 0);
-                self.better(records, (cells, &found), &mut best, &mut place)?;
+                self.update_best(records, (cells, &found), &mut best, &mut place)?;
                 let goal = target(best);
                 for (cell, found) in cells.iter().zip(&found) {
-                    let least = found.least.max(cell.least);
+                    let least = found.lower_bound.max(cell.inherited_bound);
                     if least >= goal {
                         proved = proved.min(least);
-                    } else if let Some(halves) = self.halved(cell, least, &found.costs) {
+                    } else if let Some(halves) = self.halve_cell(cell, least, &found.costs) {
                         next.extend(halves.into_iter().flatten());
                     } else {
                         open += 1;
@@ -176,33 +184,33 @@ impl Sweep<'_> {
         let (order, orders) = self.region.orders(&place).unwrap_or((f64::NAN, Vec::new()));
         let root = |share: f64| if share.is_finite() { (share * mean).sqrt() } else { f64::INFINITY };
         let at_least = if proved.is_finite() { root(proved) * (1.0 - 1e-9) } else { 0.0 };
-        Ok(Certificate { at_least, best: root(best), order, orders, cells: bounded, open })
+        Ok(Certificate { lower_bound: at_least, best: root(best), order, orders, cells: bounded, open_cells: open })
     }
 
-    /// What is known of some cells.
-    fn bounds(&self, cells: &[Cell], goal: f64) -> Result<Vec<Bounded>> {
-        let bounds = |chunk: &'_ [Cell]| -> Vec<Bounded> {
-            let all = chunk.iter().take(if self.control.stopped() { 0 } else { CHUNK });
+    /// Compute the bounds of some cells.
+    fn bounds(&self, cells: &[Cell], goal: f64) -> Result<Vec<CellBound>> {
+        let bounds = |chunk: &'_ [Cell]| -> Vec<CellBound> {
+            let all = chunk.iter().take(if self.control.is_stopped() { 0 } else { CELLS_PER_TASK });
             all.map(|cell| self.bound(cell, goal)).collect()
         };
-        let found = cells.par_chunks(CHUNK).flat_map_iter(bounds).collect();
+        let found = cells.par_chunks(CELLS_PER_TASK).flat_map_iter(bounds).collect();
         self.control.check_stop()?;
         Ok(found)
     }
 
-    /// Takes the best orders of the region near the best middles of some cells.
-    fn better(
+    /// Update the best orders from those near the best midpoints of some cells.
+    fn update_best(
         &self,
         records: &[Record],
-        (cells, found): (&[Cell], &[Bounded]),
+        (cells, found): (&[Cell], &[CellBound]),
         best: &mut f64,
         place: &mut Vec<f64>,
     ) -> Result<()> {
-        let mut likely: Vec<usize> = (0..cells.len()).filter(|&n| found[n].middle < *best).collect();
-        likely.sort_by(|&a, &b| found[a].middle.total_cmp(&found[b].middle).then(a.cmp(&b)));
-        for n in likely.into_iter().take(LIKELY) {
-            let Some(there) = self.region.near(&self.all_within(&cells[n])) else { continue };
-            let left = self.left(records, &there)?;
+        let mut likely: Vec<usize> = (0..cells.len()).filter(|&n| found[n].midpoint_residual < *best).collect();
+        likely.sort_by(|&a, &b| found[a].midpoint_residual.total_cmp(&found[b].midpoint_residual).then(a.cmp(&b)));
+        for n in likely.into_iter().take(MIDPOINTS_PER_PASS) {
+            let Some(there) = self.region.midpoint_orders(&self.cell_intervals(&cells[n])) else { continue };
+            let left = self.relative_residual(records, &there)?;
             if left < *best {
                 (*best, *place) = (left, there);
             }
@@ -210,27 +218,31 @@ impl Sweep<'_> {
         Ok(())
     }
 
-    /// What is known of a cell: by its space too where that may help.
-    fn bound(&self, cell: &Cell, goal: f64) -> Bounded {
+    /// Bound of one cell. The subspace bound is added if the first one misses the goal.
+    fn bound(&self, cell: &Cell, goal: f64) -> CellBound {
         let mut found = self.tables.local(cell).bound();
-        if found.least.max(cell.least) < goal {
-            found.least = found.least.max(self.tables.span(cell).bound(self.asked.largest, goal));
+        if found.lower_bound.max(cell.inherited_bound) < goal {
+            found.lower_bound = found.lower_bound.max(self.tables.span(cell).bound(self.options.max_coefficient, goal));
         }
         found
     }
 
-    /// What orders of integration leave themselves, not read off a table.
-    fn left(&self, records: &[Record], etas: &[f64]) -> Result<f64> {
+    /// Relative squared residual at these orders of integration, computed without tables.
+    fn relative_residual(&self, records: &[Record], etas: &[f64]) -> Result<f64> {
         let terms = self.region.terms.iter().zip(etas).map(|(term, eta)| (term.signal, *eta, 0.0));
-        Ok(about(records, self.region.output, &terms.collect::<Vec<_>>(), &self.control.stop)?.0.bound().middle)
+        Ok(expand_cell(records, self.region.output, &terms.collect::<Vec<_>>(), &self.control.stop)?
+            .0
+            .bound()
+            .midpoint_residual)
     }
 
-    /// Goes down from the best orders, one or two of them at a time: to edges of the region too, where no middle is.
+    /// Refine the best orders by a local search, changing one or two orders at a time. It reaches the edges of the
+    /// region, which have no midpoint.
     fn polish(&self, records: &[Record], best: &mut f64, place: &mut Vec<f64>) -> Result<()> {
         if place.is_empty() {
             return Ok(());
         }
-        // The equation's own order comes last.
+        // The order of the equation comes last.
         let k = place.len();
         let vary: Vec<usize> = (0..k)
             .filter(|&term| self.region.terms[term].lowest < self.region.terms[term].highest)
@@ -242,8 +254,8 @@ impl Sweep<'_> {
             .flat_map(|(i, j)| ways.into_iter().flat_map(move |a| ways.into_iter().map(move |b| [(i, a), (j, b)])))
             .filter(|[(i, a), (j, b)]| *a != 0.0 && (i == j) == (*b == 0.0))
             .collect();
-        let (mut step, mut tried) = (width(1), 0);
-        while step > width(DEEPEST) && tried < POLISHED {
+        let (mut step, mut tried) = (cell_width(1), 0);
+        while step > cell_width(MAX_CELL_LEVEL) && tried < MAX_POLISH_EVALUATIONS {
             let before = *best;
             for moves in &moves {
                 self.control.check_stop()?;
@@ -254,7 +266,7 @@ impl Sweep<'_> {
                     continue;
                 };
                 tried += 1;
-                let left = self.left(records, &there)?;
+                let left = self.relative_residual(records, &there)?;
                 if left < *best {
                     (*best, *place) = (left, there);
                 }
@@ -266,28 +278,28 @@ impl Sweep<'_> {
         Ok(())
     }
 
-    fn all_within(&self, cell: &Cell) -> Vec<(f64, f64)> {
-        (0..self.region.terms.len()).map(|term| self.tables.within(self.region, cell, term)).collect()
+    fn cell_intervals(&self, cell: &Cell) -> Vec<(f64, f64)> {
+        (0..self.region.terms.len()).map(|term| self.tables.order_interval(self.region, cell, term)).collect()
     }
 
     fn holds_orders(&self, cell: &Cell) -> bool {
-        self.region.alphas(&self.all_within(cell)).is_some()
+        self.region.alpha_interval(&self.cell_intervals(cell)).is_some()
     }
 
-    /// The largest cells that hold orders of the region.
+    /// Largest cells that contain orders of the region.
     ///
     /// # Errors
-    /// [`Error::Structure`] where they are too many.
-    fn largest(&self) -> Result<Vec<Cell>> {
-        let mut cells = vec![Cell { level: [0; MOST], at: [0; MOST], least: 0.0 }];
+    /// [`Error::Structure`] if there are too many.
+    fn initial_cells(&self) -> Result<Vec<Cell>> {
+        let mut cells = vec![Cell { level: [0; MAX_TERMS], at: [0; MAX_TERMS], inherited_bound: 0.0 }];
         for term in 0..self.region.terms.len() {
-            let (first, count) = self.tables.largest(self.region, term);
+            let (first, count) = self.tables.initial_intervals(self.region, term);
             let all = cells.len() as u128 * count as u128;
-            if all > 4 * u128::from(self.asked.cells) {
+            if all > 4 * u128::from(self.options.max_cells) {
                 return Err(Error::Structure {
                     what: format!(
                         "these intervals hold up to {all} cells of orders, but {} are allowed",
-                        self.asked.cells
+                        self.options.max_cells
                     ),
                     remedy: "narrow them, or allow more cells".into(),
                 });
@@ -298,8 +310,8 @@ impl Sweep<'_> {
                     let mut cell = *cell;
                     cell.at[term] = u32::try_from(at).unwrap_or(u32::MAX);
                     let within: Vec<(f64, f64)> =
-                        (0..=term).map(|t| self.tables.within(self.region, &cell, t)).collect();
-                    if self.region.alphas(&within).is_some() {
+                        (0..=term).map(|t| self.tables.order_interval(self.region, &cell, t)).collect();
+                    if self.region.alpha_interval(&within).is_some() {
                         next.push(cell);
                     }
                 }
@@ -309,12 +321,14 @@ impl Sweep<'_> {
         Ok(cells)
     }
 
-    /// Both halves along the order that costs most, as far as they hold orders; none where all are too short.
-    fn halved(&self, cell: &Cell, least: f64, costs: &[f64; MOST]) -> Option<[Option<Cell>; 2]> {
-        let may = (0..self.region.terms.len()).filter(|&term| !self.tables.known(term) && cell.level[term] < DEEPEST);
+    /// Both halves of a cell along the order with the largest cost, if they contain orders. `None` if all orders are at
+    /// the finest level.
+    fn halve_cell(&self, cell: &Cell, least: f64, costs: &[f64; MAX_TERMS]) -> Option<[Option<Cell>; 2]> {
+        let may = (0..self.region.terms.len())
+            .filter(|&term| !self.tables.has_fixed_order(term) && cell.level[term] < MAX_CELL_LEVEL);
         let term = may.max_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(b.cmp(&a)))?;
         Some([0, 1].map(|half| {
-            let mut part = Cell { least, ..*cell };
+            let mut part = Cell { inherited_bound: least, ..*cell };
             part.level[term] += 1;
             part.at[term] = 2 * part.at[term] + half;
             self.holds_orders(&part).then_some(part)

@@ -1,84 +1,88 @@
-//! A lower bound of the least squared equation error over a cell of orders.
+//! Lower bound of the least squared equation error over a cell of orders.
 //!
-//! With X the columns at the middle, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the cell the
-//! columns are X + U; what of U lies in the span of X is XA, the rest P is orthogonal to X. For any coefficients c, with
-//! h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
+//! With X the columns at the midpoint, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the
+//! cell the columns are X + U. The part of U in the span of X is XA, the rest P is orthogonal to X. For any
+//! coefficients c, with h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
 //!
 //!   ‖y − (X + U)c‖² = ‖e − Xh − Pc‖² ≥ ‖e‖² − 2τᵀh − 2(γ − Aᵀτ)ᵀc + ‖Xh‖².
 //!
-//! c = (I + A)⁻¹(c₀ + h), so with (I + Aᵀ)β = γ − Aᵀτ the least over h is ‖e‖² − 2βᵀc₀ − (β + τ)ᵀG⁻¹(β + τ). Moduli of U's
-//! products, hence of γ and A, are bounded by the series of the columns; B bounds |β| where B ≥ |γ| + |A|ᵀ(|τ| + B).
+//! c = (I + A)⁻¹(c₀ + h), so with (I + Aᵀ)β = γ − Aᵀτ the minimum over h is ‖e‖² − 2βᵀc₀ − (β + τ)ᵀG⁻¹(β + τ). The
+//! moduli of γ and A are bounded by the expansions of the columns. B bounds |β| if B ≥ |γ| + |A|ᵀ(|τ| + B).
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::dense::inner_products;
-use crate::order_search::certificate::regressor_expansion::{series, unit, Curve, ALL, MOST};
-use crate::order_search::certificate::subspace_bound::Span;
+use crate::order_search::certificate::regressor_expansion::{
+    rounding_unit, taylor_sum, RegressorExpansion, EXPANSION_COLUMNS, MAX_TERMS,
+};
+use crate::order_search::certificate::subspace_bound::DerivativeSubspace;
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
-type Row = [f64; MOST];
+type Row = [f64; MAX_TERMS];
 
-/// What a bound adds to B and takes for granted of inverses: far more than rounding does to either.
-const HAIR: f64 = 1e-6;
-const SIXTEENTH: f64 = 1.0 / 16.0;
+/// Relative margin of B, and of the inverse matrices. It is far above their rounding error.
+const BOUND_MARGIN: f64 = 1e-6;
+const INVERSE_TOLERANCE: f64 = 1.0 / 16.0;
 
-/// Inner products of the columns about the middle of a cell, all of the k terms: first of unit size, as is the target.
+/// Inner products of the columns at the midpoint of a cell, for all k terms. The columns and the target have unit norm.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Local {
+pub(super) struct CellProducts {
     pub(super) k: usize,
     /// x_i·x_j⁽ᵐ⁾, by m, then i, then j.
-    pub(super) products: [[Row; MOST]; ALL],
+    pub(super) products: [[Row; MAX_TERMS]; EXPANSION_COLUMNS],
     /// x_j⁽ᵐ⁾·y and ‖x_j⁽ᵐ⁾‖.
-    pub(super) target: [Row; ALL],
-    pub(super) sizes: [Row; ALL],
-    /// What the series leave out, and half the cell's widths.
+    pub(super) target: [Row; EXPANSION_COLUMNS],
+    pub(super) sizes: [Row; EXPANSION_COLUMNS],
+    /// Remainders of the expansions, and half widths of the cell.
     pub(super) rests: Row,
     pub(super) halves: Row,
-    /// What rounding may add to a product of two unit columns.
+    /// Rounding-error bound of a product of two unit columns.
     pub(super) rounding: f64,
 }
 
-impl Local {
+impl CellProducts {
     pub(super) fn new(k: usize, samples: usize) -> Self {
         Self {
             k,
-            products: [[[0.0; MOST]; MOST]; ALL],
-            target: [[0.0; MOST]; ALL],
-            sizes: [[0.0; MOST]; ALL],
-            rests: [0.0; MOST],
-            halves: [0.0; MOST],
-            // Products of columns that are kept as they are lose an eighth of what a chain of transforms does.
-            rounding: unit(samples) / 8.0,
+            products: [[[0.0; MAX_TERMS]; MAX_TERMS]; EXPANSION_COLUMNS],
+            target: [[0.0; MAX_TERMS]; EXPANSION_COLUMNS],
+            sizes: [[0.0; MAX_TERMS]; EXPANSION_COLUMNS],
+            rests: [0.0; MAX_TERMS],
+            halves: [0.0; MAX_TERMS],
+            // Products of stored columns have an eighth of the rounding error of a chain of transforms.
+            rounding: rounding_unit(samples) / 8.0,
         }
     }
 }
 
-/// What is known of a cell: shares of the squared size of the target.
+/// Bound of a cell, relative to the squared norm of the target.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Bounded {
-    /// No orders of the cell leave less; 0 where nothing is proved.
-    pub(super) least: f64,
-    /// What the middle leaves; infinite where that is not told.
-    pub(super) middle: f64,
-    /// What each order costs the bound.
+pub(super) struct CellBound {
+    /// Lower bound of the relative squared residual of all orders in the cell, 0 if nothing is proved.
+    pub(super) lower_bound: f64,
+    /// Relative squared residual at the midpoint, infinite if it cannot be computed.
+    pub(super) midpoint_residual: f64,
+    /// Loss of the bound caused by the width of each order.
     pub(super) costs: Row,
 }
 
-impl Local {
+impl CellProducts {
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn bound(&self) -> Bounded {
+    pub(super) fn bound(&self) -> CellBound {
         let k = self.k;
-        let mut found = Bounded { least: 0.0, middle: f64::INFINITY, costs: self.halves };
+        let mut found = CellBound { lower_bound: 0.0, midpoint_residual: f64::INFINITY, costs: self.halves };
         let Some(inverse) = inverse(self.products[0], k) else { return found };
         let trace: f64 = (0..k).map(|i| inverse[i][i]).sum();
         let terms = (k * k) as f64;
         let lost = self.rounding * terms;
         let elimination = 64.0 * f64::EPSILON * terms * terms * trace * trace;
-        // What is not a number ends here too.
-        if !(trace * lost < SIXTEENTH * SIXTEENTH && elimination < SIXTEENTH * SIXTEENTH) {
+        // This form of the condition also rejects NaN.
+        if !(trace * lost < INVERSE_TOLERANCE * INVERSE_TOLERANCE
+            && elimination < INVERSE_TOLERANCE * INVERSE_TOLERANCE)
+        {
             return found;
         }
-        let mut c = [0.0; MOST];
+        let mut c = [0.0; MAX_TERMS];
         for i in 0..k {
             c[i] = (0..k).map(|j| inverse[i][j] * self.target[0][j]).sum();
         }
@@ -86,38 +90,38 @@ impl Local {
         let along = |m: usize, j: usize| -> f64 {
             self.target[m][j] - (0..k).map(|i| c[i] * self.products[m][i][j]).sum::<f64>()
         };
-        // ‖e‖² by the form itself, right for any coefficients.
+        // ‖e‖² from the quadratic form, which is valid for any coefficients.
         let explained: f64 = (0..k).map(|i| c[i] * (self.target[0][i] + along(0, i))).sum();
         let square = 1.0 - explained;
         let error = self.rounding * all * all;
         if !(square.is_finite() && square > error) {
             return found;
         }
-        found.middle = square;
+        found.midpoint_residual = square;
         let size = (square + error).sqrt();
-        let (mut tau, mut gamma, mut a) = ([0.0; MOST], [0.0; MOST], [[0.0; MOST]; MOST]);
+        let (mut tau, mut gamma, mut a) = ([0.0; MAX_TERMS], [0.0; MAX_TERMS], [[0.0; MAX_TERMS]; MAX_TERMS]);
         for j in 0..k {
             let half = self.halves[j];
             tau[j] = along(0, j).abs() + self.rounding * all;
             gamma[j] =
-                series(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j]) + size * self.rests[j];
+                taylor_sum(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j]) + size * self.rests[j];
             for i in 0..k {
                 let part = |m: usize| -> (f64, f64) {
                     let terms = (0..k).map(|l| inverse[i][l] * self.products[m][l][j]);
                     terms.fold((0.0, 0.0), |(sum, all), x| (sum + x, all + x.abs()))
                 };
                 let rounded = lost * trace;
-                let within = series(half, |m| {
+                let within = taylor_sum(half, |m| {
                     let (sum, all) = part(m);
                     sum.abs() + rounded * (all + (1.0 + trace) * self.sizes[m][j])
                 });
-                let beyond = (inverse[i][i].max(0.0) * (1.0 + SIXTEENTH)).sqrt() * self.rests[j];
+                let beyond = (inverse[i][i].max(0.0) * (1.0 + INVERSE_TOLERANCE)).sqrt() * self.rests[j];
                 a[i][j] = within + beyond;
             }
         }
         let costs = |j: usize| (0..k).map(|i| a[i][j]).sum::<f64>();
         (0..k).for_each(|j| found.costs[j] = costs(j));
-        let Some(b) = dominating(&a, &gamma, &tau, k) else { return found };
+        let Some(b) = dominating_vector(&a, &gamma, &tau, k) else { return found };
         let (mut first, mut second) = (0.0, 0.0);
         for i in 0..k {
             let cost = 2.0 * c[i].abs() * b[i];
@@ -127,18 +131,18 @@ impl Local {
                 second += (b[i] + tau[i]) * inverse[i][j].abs() * (b[j] + tau[j]);
             }
         }
-        let least = (square - error - first - second * (1.0 + SIXTEENTH)) * (1.0 - HAIR * HAIR);
+        let least = (square - error - first - second * (1.0 + INVERSE_TOLERANCE)) * (1.0 - BOUND_MARGIN * BOUND_MARGIN);
         // Neither NaN nor an overflow proves anything.
         if least > 0.0 && least.is_finite() {
-            found.least = least;
+            found.lower_bound = least;
         }
         found
     }
 }
 
 /// Inverse of a positive definite matrix.
-fn inverse(mut matrix: [Row; MOST], k: usize) -> Option<[Row; MOST]> {
-    let mut out = [[0.0; MOST]; MOST];
+fn inverse(mut matrix: [Row; MAX_TERMS], k: usize) -> Option<[Row; MAX_TERMS]> {
+    let mut out = [[0.0; MAX_TERMS]; MAX_TERMS];
     (0..k).for_each(|i| out[i][i] = 1.0);
     for i in 0..k {
         let pivot = matrix[i][i];
@@ -160,9 +164,9 @@ fn inverse(mut matrix: [Row; MOST], k: usize) -> Option<[Row; MOST]> {
     Some(out)
 }
 
-/// Some B with B > γ + Aᵀ(τ + B), which also shows that I + A is regular; none where it is not found.
-fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
-    let (mut matrix, mut right) = ([[0.0; MOST]; MOST], [0.0; MOST]);
+/// A vector B with B > γ + Aᵀ(τ + B), which proves that I + A is regular. `None` if none is found.
+fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
+    let (mut matrix, mut right) = ([[0.0; MAX_TERMS]; MAX_TERMS], [0.0; MAX_TERMS]);
     for i in 0..k {
         right[i] = gamma[i] + (0..k).map(|j| a[j][i] * tau[j]).sum::<f64>() + f64::MIN_POSITIVE.sqrt();
         for j in 0..k {
@@ -181,26 +185,26 @@ fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> 
             right[l] -= factor * right[i];
         }
     }
-    let mut b = [0.0; MOST];
+    let mut b = [0.0; MAX_TERMS];
     for i in (0..k).rev() {
         let sum: f64 = (i + 1..k).map(|j| matrix[i][j] * b[j]).sum();
         b[i] = (right[i] - sum) / matrix[i][i];
     }
-    b[..k].iter_mut().for_each(|b| *b *= 1.0 + HAIR);
-    // Believed only where it does what is asked of it.
-    let proved = |i: usize| (wanted[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * HAIR) <= b[i];
+    b[..k].iter_mut().for_each(|b| *b *= 1.0 + BOUND_MARGIN);
+    // Accept the vector only if it satisfies the inequality.
+    let proved =
+        |i: usize| (wanted[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * BOUND_MARGIN) <= b[i];
     (0..k).all(proved).then_some(b)
 }
 
-/// What is proved of a cell: at least so much is Σε² of the equation errors, at rest, of every equation whose terms are
-/// integrals of these signals of orders within half widths of middles, (signal, middle, half width) by term; 0 where
-/// nothing is.
+/// Lower bounds of Σε² over a cell of orders, 0 if nothing is proved. ε is the equation error with zero initial
+/// conditions. `terms` lists (signal, midpoint, half width) of the orders of integration, one entry per term.
 ///
-/// The first holds for any coefficients; the second, which a goal is tried for, for those whose terms have together at
-/// most `largest` times the size of the output.
+/// The first bound holds for any coefficients. The second, optimized for `goal`, holds for coefficients whose terms sum
+/// up to at most `largest` times the norm of the output.
 ///
 /// # Errors
-/// No records or terms, too many of these, a signal that is not there or is zero, middles below their half widths.
+/// No records or terms, too many terms, a signal that is missing or zero, a midpoint below its half width.
 ///
 /// ```
 /// # use ftlm::order_search::certificate::cell_bounds;
@@ -219,7 +223,7 @@ pub fn cell_bounds(
     terms: &[(usize, f64, f64)],
     (largest, goal): (f64, f64),
 ) -> Result<(f64, f64)> {
-    check(records, output, terms.iter().map(|t| t.0))?;
+    check_records(records, output, terms.iter().map(|t| t.0))?;
     for &(_, middle, half) in terms {
         if !(half >= 0.0 && half <= middle && middle < 20.0) {
             return Err(Error::OutOfRange {
@@ -230,47 +234,49 @@ pub fn cell_bounds(
             });
         }
     }
-    let (local, span, square) = about(records, output, terms, &Stop::default())?;
-    Ok((local.bound().least * square, span.bound(largest, goal / square) * square))
+    let (local, span, square) = expand_cell(records, output, terms, &Stop::default())?;
+    Ok((local.bound().lower_bound * square, span.bound(largest, goal / square) * square))
 }
 
-/// What a cell with these middles and half widths is bounded from, and the squares of the output.
-pub(super) fn about(
+/// Inner products and subspace of a cell with these midpoints and half widths, and the squared norm of the output.
+pub(super) fn expand_cell(
     records: &[Record],
     output: usize,
     terms: &[(usize, f64, f64)],
     stop: &Stop,
-) -> Result<(Local, Span, f64)> {
+) -> Result<(CellProducts, DerivativeSubspace, f64)> {
     let target: Vec<f64> = records.iter().flat_map(|r| r.signal(output)).copied().collect();
     let square = target.iter().map(|v| v * v).sum::<f64>();
     let curves = terms
         .iter()
-        .map(|&(s, middle, half)| Curve::new(records, s, middle, half, stop))
+        .map(|&(s, middle, half)| RegressorExpansion::new(records, s, middle, half, stop))
         .collect::<Result<Vec<_>>>()?;
     let all: Vec<&[f64]> = curves.iter().flat_map(|c| c.columns.iter().map(Vec::as_slice)).collect();
     let (products, along) = (inner_products(&all, &all, stop), inner_products(&[&target], &all, stop));
     stop.check()?;
-    let product = |(i, n): (usize, usize), (j, m): (usize, usize)| products[(i * ALL + n) * all.len() + j * ALL + m];
-    let target_product = |(j, m): (usize, usize)| along[j * ALL + m] / square.sqrt();
-    let (mut local, mut span) = (Local::new(terms.len(), target.len()), Span::new(target.len()));
+    let product = |(i, n): (usize, usize), (j, m): (usize, usize)| {
+        products[(i * EXPANSION_COLUMNS + n) * all.len() + j * EXPANSION_COLUMNS + m]
+    };
+    let target_product = |(j, m): (usize, usize)| along[j * EXPANSION_COLUMNS + m] / square.sqrt();
+    let (mut local, mut span) = (CellProducts::new(terms.len(), target.len()), DerivativeSubspace::new(target.len()));
     for (j, (curve, &(_, _, half))) in curves.iter().zip(terms).enumerate() {
-        for m in 0..ALL {
+        for m in 0..EXPANSION_COLUMNS {
             for i in 0..terms.len() {
                 local.products[m][i][j] = product((i, 0), (j, m));
             }
             local.target[m][j] = target_product((j, m));
             local.sizes[m][j] = curve.sizes[m];
         }
-        local.rests[j] = curve.rest;
+        local.rests[j] = curve.remainder;
         local.halves[j] = half;
-        span.add(half, curve.sizes, curve.rest);
+        span.add(half, curve.sizes, curve.remainder);
     }
     span.fill(product, target_product);
     Ok((local, span, square))
 }
 
-/// Refuses records and signals of which nothing can be made.
-pub(super) fn check(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
+/// Raise an error for records and signals that cannot be certified.
+pub(super) fn check_records(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
     let Some(first) = records.first() else {
         return Err(Error::Structure { what: "no record is given".into(), remedy: "give at least one run".into() });
     };
@@ -291,10 +297,10 @@ pub(super) fn check(records: &[Record], output: usize, signals: impl Iterator<It
             remedy: "scale it so that its squares are positive numbers".into(),
         });
     }
-    if !(1..=MOST).contains(&signals.len()) {
+    if !(1..=MAX_TERMS).contains(&signals.len()) {
         return Err(Error::Structure {
             what: format!("an equation of {} terms", signals.len()),
-            remedy: format!("certificates are of 1 to {MOST} terms"),
+            remedy: format!("certificates are of 1 to {MAX_TERMS} terms"),
         });
     }
     Ok(())

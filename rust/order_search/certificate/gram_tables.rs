@@ -1,96 +1,96 @@
-//! Inner products of the columns about the middles of all cells, made once.
+//! Gram tables of a certificate: region of orders, its cells, and the inner products at their midpoints.
 //!
-//! The orders that a certificate speaks of, and which cells hold some of them.
+//! The products are computed once for all cells.
 
 use std::collections::BTreeMap;
 
 use crate::error::{Error, Result};
 use crate::linalg::dense::inner_products;
-use crate::order_search::certificate::cell_bound::Local;
-use crate::order_search::certificate::regressor_expansion::{Curve, ALL, MOST};
-use crate::order_search::certificate::subspace_bound::Span;
+use crate::order_search::certificate::cell_bound::CellProducts;
+use crate::order_search::certificate::regressor_expansion::{RegressorExpansion, EXPANSION_COLUMNS, MAX_TERMS};
+use crate::order_search::certificate::subspace_bound::DerivativeSubspace;
 use crate::order_search::control::Control;
 use crate::parallel;
 use crate::regressors::Record;
 
-/// Width of the largest cells: above it a bound proves hardly ever anything.
-const WIDEST: f64 = 0.1;
-/// How often an order's interval is halved in tables, and at all: what lies deeper is told by the series of the tables.
-const TABLED: u8 = 3;
-pub(super) const DEEPEST: u8 = 10;
-/// Derivatives whose products are made, by [`pair`].
-const PAIRS: [(usize, usize); ALL * (ALL + 1) / 2] =
+/// Width of the largest cells. A bound over wider cells rarely proves anything.
+const MAX_CELL_WIDTH: f64 = 0.1;
+/// Maximum bisection levels of an interval: with tables, and in all. Deeper cells use the expansions of the tables.
+const MAX_TABLE_LEVEL: u8 = 3;
+pub(super) const MAX_CELL_LEVEL: u8 = 10;
+/// Pairs of derivatives with tabulated products, in the order of [`pair_position`].
+const DERIVATIVE_PAIRS: [(usize, usize); EXPANSION_COLUMNS * (EXPANSION_COLUMNS + 1) / 2] =
     [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)];
-/// Columns whose products with all others are made at a time.
-const BATCH: usize = 64;
+/// Columns per task whose products with all others are computed.
+const COLUMNS_PER_TASK: usize = 64;
 
-/// A cell: for each term how often its interval was halved, and the number of what is left of it.
+/// Cell of the bisection: level and position of each term's interval.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cell {
-    pub(super) level: [u8; MOST],
-    pub(super) at: [u32; MOST],
-    /// What is proved of the cell that it is a part of.
-    pub(super) least: f64,
+    pub(super) level: [u8; MAX_TERMS],
+    pub(super) at: [u32; MAX_TERMS],
+    /// Lower bound inherited from the parent cell.
+    pub(super) inherited_bound: f64,
 }
 
-/// Stretches of one signal's orders of integration, by level: number of the first, and the node of its middle.
-type Stretches = Vec<(usize, usize)>;
+/// Intervals of one signal's orders of integration by level: number of the first, and its node.
+type LevelIntervals = Vec<(usize, usize)>;
 
-/// What cells are bounded from.
-pub(super) struct Tables {
-    /// Of each term: none where its order of integration is known, and the node that it has then.
-    terms: Vec<(Option<Stretches>, usize)>,
-    /// Halvings in tables.
-    tabled: u8,
-    /// Bytes of them.
+/// Tables from which cells are bounded.
+pub(super) struct GramTables {
+    /// Intervals and node of each term. A term of fixed order has a node and no intervals.
+    terms: Vec<(Option<LevelIntervals>, usize)>,
+    /// Highest level with tables.
+    table_level: u8,
+    /// Memory of the tables [bytes].
     pub(super) bytes: u64,
     nodes: usize,
     samples: usize,
-    /// x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ by [`PAIRS`] of n and m, then j, then i; x_j⁽ᵐ⁾·y by m, then j.
-    products: [Vec<f64>; PAIRS.len()],
-    target: [Vec<f64>; ALL],
-    sizes: Vec<[f64; ALL]>,
+    /// x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ by [`DERIVATIVE_PAIRS`] of n and m, then j, then i, and x_j⁽ᵐ⁾·y by m, then j.
+    products: [Vec<f64>; DERIVATIVE_PAIRS.len()],
+    target: [Vec<f64>; EXPANSION_COLUMNS],
+    sizes: Vec<[f64; EXPANSION_COLUMNS]>,
     rests: Vec<f64>,
 }
 
-/// Share of a stretch within which orders touch it: more than rounding is.
-const TOUCHING: f64 = 1e-6;
+/// Relative distance at which orders touch an interval, above the rounding error.
+const TOUCHING_TOLERANCE: f64 = 1e-6;
 
-/// Place in [`PAIRS`] of n and m, n ≤ m.
-fn pair(n: usize, m: usize) -> usize {
+/// Position of n and m in [`DERIVATIVE_PAIRS`], n ≤ m.
+fn pair_position(n: usize, m: usize) -> usize {
     m * (m + 1) / 2 + n
 }
 
-/// A term at the middle of a cell: node, distance from its middle, half the cell's width.
+/// Term at the midpoint of a cell: node, distance from the node, half width.
 #[derive(Debug, Clone, Copy, Default)]
 struct Middle {
     node: usize,
-    /// Powers of the distance over factorials.
-    off: [f64; ALL],
+    /// Powers of the distance divided by factorials.
+    off: [f64; EXPANSION_COLUMNS],
     half: f64,
 }
 
-/// Width of a stretch.
-pub(super) fn width(level: u8) -> f64 {
-    WIDEST / f64::from(1_u32 << level)
+/// Width of an interval at this level.
+pub(super) fn cell_width(level: u8) -> f64 {
+    MAX_CELL_WIDTH / f64::from(1_u32 << level)
 }
 
-/// Stretches of a level that orders between these lie in or touch: the first and how many.
+/// Intervals of a level that contain or touch orders in this range: the first and their number.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn stretches((low, high): (f64, f64), level: u8) -> (usize, usize) {
-    let first = (low / width(level) - TOUCHING).floor().max(0.0) as usize;
-    let end = (high / width(level) + TOUCHING).ceil().max(0.0) as usize;
+fn level_intervals((low, high): (f64, f64), level: u8) -> (usize, usize) {
+    let first = (low / cell_width(level) - TOUCHING_TOLERANCE).floor().max(0.0) as usize;
+    let end = (high / cell_width(level) + TOUCHING_TOLERANCE).ceil().max(0.0) as usize;
     (first, end.max(first + 1) - first)
 }
 
-/// Middle and half width of each node, by signal.
-struct Laid {
+/// Midpoint and half width of each node, by signal.
+struct NodeLayout {
     nodes: Vec<(usize, f64, f64)>,
-    terms: Vec<(Option<Stretches>, usize)>,
+    terms: Vec<(Option<LevelIntervals>, usize)>,
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn lay(region: &Region, deepest: u8) -> Laid {
+fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
     let mut nodes = Vec::new();
     let mut ranges: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
     let known = |(low, high): (f64, f64)| high - low < 1e-12;
@@ -101,12 +101,12 @@ fn lay(region: &Region, deepest: u8) -> Laid {
             *all = (all.0.min(low), all.1.max(high));
         }
     }
-    let mut of: BTreeMap<usize, Stretches> = BTreeMap::new();
+    let mut of: BTreeMap<usize, LevelIntervals> = BTreeMap::new();
     for (&signal, &range) in &ranges {
         for level in 0..=deepest {
-            let (first, count) = stretches(range, level);
+            let (first, count) = level_intervals(range, level);
             of.entry(signal).or_default().push((first, nodes.len()));
-            let half = width(level) / 2.0;
+            let half = cell_width(level) / 2.0;
             nodes.extend((first..first + count).map(|i| (signal, (2 * i + 1) as f64 * half, half)));
         }
     }
@@ -120,45 +120,47 @@ fn lay(region: &Region, deepest: u8) -> Laid {
             terms.push((of.get(&range.signal).cloned(), 0));
         }
     }
-    Laid { nodes, terms }
+    NodeLayout { nodes, terms }
 }
 
-/// Bytes of columns and products of so many nodes.
+/// Memory of columns and products of this many nodes [bytes].
 fn bytes(nodes: usize, samples: usize) -> u64 {
-    8 * nodes as u64 * (PAIRS.len() * nodes + 2 * ALL * samples) as u64
+    8 * nodes as u64 * (DERIVATIVE_PAIRS.len() * nodes + 2 * EXPANSION_COLUMNS * samples) as u64
 }
 
-impl Tables {
-    /// As deep as the memory allows. Runs on the current thread pool.
+impl GramTables {
+    /// Build the tables to the deepest level that the memory allows. Runs on the current thread pool.
     ///
     /// # Errors
-    /// [`Error::Memory`], [`Error::Interrupted`], as [`Curve::new`].
+    /// [`Error::Memory`], [`Error::Interrupted`], and the errors of the regressor expansion.
     pub(super) fn new(records: &[Record], region: &Region, memory: u64, control: &Control) -> Result<Self> {
         let target: Vec<f64> = records.iter().flat_map(|r| r.signal(region.output)).copied().collect();
         let samples = target.len();
-        let fits = |deepest: u8| bytes(lay(region, deepest).nodes.len(), samples) <= memory;
-        let Some(tabled) = (2..=TABLED).rev().find(|d| fits(*d)) else {
-            let (bytes, limit) = (bytes(lay(region, 2).nodes.len(), samples).into(), memory.into());
+        let fits = |deepest: u8| bytes(lay_out_nodes(region, deepest).nodes.len(), samples) <= memory;
+        let Some(tabled) = (2..=MAX_TABLE_LEVEL).rev().find(|d| fits(*d)) else {
+            let (bytes, limit) = (bytes(lay_out_nodes(region, 2).nodes.len(), samples).into(), memory.into());
             return Err(Error::Memory { what: "the columns of a certificate and their products".into(), bytes, limit });
         };
-        let Laid { nodes, terms } = lay(region, tabled);
-        let curves: Vec<Result<Curve>> = parallel::map(
+        let NodeLayout { nodes, terms } = lay_out_nodes(region, tabled);
+        let curves: Vec<Result<RegressorExpansion>> = parallel::map(
             nodes.clone(),
             || (),
-            |(), (signal, middle, half)| Curve::new(records, signal, middle, half, &control.stop),
+            |(), (signal, middle, half)| RegressorExpansion::new(records, signal, middle, half, &control.stop),
         );
-        let curves = curves.into_iter().collect::<Result<Vec<Curve>>>()?;
+        let curves = curves.into_iter().collect::<Result<Vec<RegressorExpansion>>>()?;
         let size = target.iter().map(|v| v * v).sum::<f64>().sqrt();
         let count = nodes.len();
-        let all: [Vec<&[f64]>; ALL] = std::array::from_fn(|n| curves.iter().map(|c| &c.columns[n][..]).collect());
-        let batches: Vec<(usize, &[Curve])> =
-            (0..PAIRS.len()).flat_map(|pair| curves.chunks(BATCH).map(move |batch| (pair, batch))).collect();
+        let all: [Vec<&[f64]>; EXPANSION_COLUMNS] =
+            std::array::from_fn(|n| curves.iter().map(|c| &c.columns[n][..]).collect());
+        let batches: Vec<(usize, &[RegressorExpansion])> = (0..DERIVATIVE_PAIRS.len())
+            .flat_map(|pair| curves.chunks(COLUMNS_PER_TASK).map(move |batch| (pair, batch)))
+            .collect();
         let made = parallel::map(
             batches,
             || (),
             |(), (pair, batch)| {
-                let (n, m) = PAIRS[pair];
-                if control.stopped() {
+                let (n, m) = DERIVATIVE_PAIRS[pair];
+                if control.is_stopped() {
                     return (pair, Vec::new(), Vec::new());
                 }
                 let columns: Vec<&[f64]> = batch.iter().map(|c| &c.columns[m][..]).collect();
@@ -167,62 +169,63 @@ impl Tables {
             },
         );
         control.check_stop()?;
-        let (mut products, mut along): ([Vec<f64>; PAIRS.len()], [Vec<f64>; ALL]) = Default::default();
+        let (mut products, mut along): ([Vec<f64>; DERIVATIVE_PAIRS.len()], [Vec<f64>; EXPANSION_COLUMNS]) =
+            Default::default();
         for (pair, inner, target) in made {
             products[pair].extend(inner);
-            along[PAIRS[pair].1].extend(target.into_iter().map(|v| v / size));
+            along[DERIVATIVE_PAIRS[pair].1].extend(target.into_iter().map(|v| v / size));
         }
         Ok(Self {
             terms,
-            tabled,
+            table_level: tabled,
             bytes: bytes(count, samples),
             nodes: count,
             samples,
             products,
             target: along,
             sizes: curves.iter().map(|c| c.sizes).collect(),
-            rests: curves.iter().map(|c| c.rest).collect(),
+            rests: curves.iter().map(|c| c.remainder).collect(),
         })
     }
 
-    /// Whether a term's order of integration is known.
-    pub(super) fn known(&self, term: usize) -> bool {
+    /// Whether a term's order of integration is fixed.
+    pub(super) fn has_fixed_order(&self, term: usize) -> bool {
         self.terms[term].0.is_none()
     }
 
-    /// Orders of integration of a term in a cell.
-    pub(super) fn within(&self, region: &Region, cell: &Cell, term: usize) -> (f64, f64) {
-        if self.known(term) {
+    /// Interval of a term's order of integration in a cell.
+    pub(super) fn order_interval(&self, region: &Region, cell: &Cell, term: usize) -> (f64, f64) {
+        if self.has_fixed_order(term) {
             let (_, known) = region.integrations(term);
             return (known, known);
         }
-        let (width, at) = (width(cell.level[term]), f64::from(cell.at[term]));
+        let (width, at) = (cell_width(cell.level[term]), f64::from(cell.at[term]));
         (at * width, (at + 1.0) * width)
     }
 
-    /// Stretches of the largest size of a term.
-    pub(super) fn largest(&self, region: &Region, term: usize) -> (usize, usize) {
-        if self.known(term) {
+    /// Intervals of a term at the coarsest level: the first and their number.
+    pub(super) fn initial_intervals(&self, region: &Region, term: usize) -> (usize, usize) {
+        if self.has_fixed_order(term) {
             (0, 1)
         } else {
-            stretches(region.integrations(term), 0)
+            level_intervals(region.integrations(term), 0)
         }
     }
 
-    /// Where the middle of a cell is.
-    fn middle(&self, cell: &Cell) -> [Middle; MOST] {
-        let mut out = [Middle::default(); MOST];
+    /// Midpoint of a cell.
+    fn middle(&self, cell: &Cell) -> [Middle; MAX_TERMS] {
+        let mut out = [Middle::default(); MAX_TERMS];
         for (term, ((stretches, known), out)) in self.terms.iter().zip(&mut out).enumerate() {
             (out.node, out.off[0]) = (*known, 1.0);
             let Some(stretches) = stretches else { continue };
             let (level, at) = (cell.level[term], cell.at[term]);
-            let above = level.min(self.tabled);
+            let above = level.min(self.table_level);
             let whole = at >> (level - above);
             let (first, node) = stretches[usize::from(above)];
             out.node = node + whole as usize - first;
-            out.half = width(level) / 2.0;
-            let distance = f64::from(2 * at + 1) * out.half - f64::from(2 * whole + 1) * width(above) / 2.0;
-            for m in 1..ALL {
+            out.half = cell_width(level) / 2.0;
+            let distance = f64::from(2 * at + 1) * out.half - f64::from(2 * whole + 1) * cell_width(above) / 2.0;
+            for m in 1..EXPANSION_COLUMNS {
                 #[allow(clippy::cast_precision_loss)]
                 let next = out.off[m - 1] * distance / m as f64;
                 out.off[m] = next;
@@ -234,17 +237,17 @@ impl Tables {
     /// Product of the nth derivative of one column with the mth of another, at nodes.
     fn raw(&self, (i, n): (usize, usize), (j, m): (usize, usize)) -> f64 {
         if n <= m {
-            self.products[pair(n, m)][j * self.nodes + i]
+            self.products[pair_position(n, m)][j * self.nodes + i]
         } else {
-            self.products[pair(m, n)][i * self.nodes + j]
+            self.products[pair_position(m, n)][i * self.nodes + j]
         }
     }
 
-    /// The same at middles, where columns are cubic about nodes.
+    /// Same product at midpoints, from cubic expansions about the nodes.
     fn product(&self, a: &Middle, n: usize, b: &Middle, m: usize) -> f64 {
         let mut sum = 0.0;
-        for p in n..ALL {
-            for q in m..ALL {
+        for p in n..EXPANSION_COLUMNS {
+            for q in m..EXPANSION_COLUMNS {
                 let weight = a.off[p - n] * b.off[q - m];
                 if weight != 0.0 {
                     sum += weight * self.raw((a.node, p), (b.node, q));
@@ -254,25 +257,25 @@ impl Tables {
         sum
     }
 
-    /// Product of the mth derivative with the target, and the most that its size may be.
-    fn alone(&self, a: &Middle, m: usize) -> (f64, f64) {
-        let all = (m..ALL).map(|q| (a.off[q - m], q));
+    /// Product of the mth derivative with the target, and an upper bound of its norm.
+    fn target_product(&self, a: &Middle, m: usize) -> (f64, f64) {
+        let all = (m..EXPANSION_COLUMNS).map(|q| (a.off[q - m], q));
         all.fold((0.0, 0.0), |(sum, size), (weight, q)| {
             (sum + weight * self.target[q][a.node], size + weight.abs() * self.sizes[a.node][q])
         })
     }
 
-    /// What a cell is bounded from.
-    pub(super) fn local(&self, cell: &Cell) -> Local {
+    /// Inner products from which a cell is bounded.
+    pub(super) fn local(&self, cell: &Cell) -> CellProducts {
         let k = self.terms.len();
         let middles = self.middle(cell);
-        let mut local = Local::new(k, self.samples);
+        let mut local = CellProducts::new(k, self.samples);
         for (j, b) in middles.iter().enumerate().take(k) {
-            for m in 0..ALL {
+            for m in 0..EXPANSION_COLUMNS {
                 for (i, a) in middles.iter().enumerate().take(k) {
                     local.products[m][i][j] = self.product(a, 0, b, m);
                 }
-                (local.target[m][j], local.sizes[m][j]) = self.alone(b, m);
+                (local.target[m][j], local.sizes[m][j]) = self.target_product(b, m);
             }
             local.rests[j] = self.rests[b.node];
             local.halves[j] = b.half;
@@ -280,50 +283,50 @@ impl Tables {
         local
     }
 
-    /// The space that its columns and their first derivatives span.
-    pub(super) fn span(&self, cell: &Cell) -> Span {
+    /// Subspace spanned by a cell's columns and their first derivatives.
+    pub(super) fn span(&self, cell: &Cell) -> DerivativeSubspace {
         let middles = self.middle(cell);
-        let mut span = Span::new(self.samples);
+        let mut span = DerivativeSubspace::new(self.samples);
         for middle in middles.iter().take(self.terms.len()) {
-            let sizes = std::array::from_fn(|m| self.alone(middle, m).1);
+            let sizes = std::array::from_fn(|m| self.target_product(middle, m).1);
             span.add(middle.half, sizes, self.rests[middle.node]);
         }
         let product = |(i, n): (usize, usize), (j, m): (usize, usize)| self.product(&middles[i], n, &middles[j], m);
-        span.fill(product, |(j, m)| self.alone(&middles[j], m).0);
+        span.fill(product, |(j, m)| self.target_product(&middles[j], m).0);
         span
     }
 }
 
-/// What rounding may do to an order.
-const ROUNDED: f64 = 1e-9;
+/// Rounding tolerance of an order.
+const ORDER_TOLERANCE: f64 = 1e-9;
 
-/// Orders of one term.
+/// Interval of orders of one term.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {
-    /// Its signal.
+    /// Signal of the term.
     pub signal: usize,
-    /// Lowest and highest order; equal where it is known.
+    /// Lowest and highest order, equal for a fixed order.
     pub lowest: f64,
     /// See `lowest`.
     pub highest: f64,
 }
 
-/// All orders within some intervals of one equation.
+/// Orders of one equation within given intervals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Region {
-    /// The signal that the equation is of.
+    /// Output of the equation.
     pub output: usize,
-    /// Lowest and highest order of the equation itself.
+    /// Lowest and highest order of the equation.
     pub alpha: (f64, f64),
-    /// Orders of its terms, none above the equation's own.
+    /// Intervals of the terms' orders, none above the order of the equation.
     pub terms: Vec<Range>,
-    /// Orders of the output stay this far below the equation's own, and orders of one signal this far apart: where they
-    /// meet any equation is fulfilled, or its terms are one.
-    pub apart: f64,
+    /// Minimum distance of the output's orders from the equation's order, and of two orders of one signal. At distance
+    /// 0 every equation is satisfied, or two terms coincide.
+    pub min_separation: f64,
 }
 
 impl Region {
-    /// Refuses what is no region.
+    /// Raise an error if the intervals do not form a region.
     pub(super) fn check(&self) -> Result<()> {
         let range = |name: &str, value: f64, range: &str| Error::OutOfRange {
             name: name.into(),
@@ -335,8 +338,8 @@ impl Region {
         if !(0.0 < low && low <= high && high <= 10.0) {
             return Err(range("the interval of alpha", low, "0 < low <= high <= 10"));
         }
-        if !(self.apart > 0.0 && self.apart <= 1.0) {
-            return Err(range("apart", self.apart, "(0, 1]"));
+        if !(self.min_separation > 0.0 && self.min_separation <= 1.0) {
+            return Err(range("apart", self.min_separation, "(0, 1]"));
         }
         for term in &self.terms {
             if !(-3.0 <= term.lowest && term.lowest <= term.highest && term.highest <= 10.0) {
@@ -346,30 +349,30 @@ impl Region {
         Ok(())
     }
 
-    /// Whether a term is of the output itself.
+    /// Whether a term belongs to the output itself.
     fn own(&self, term: usize) -> bool {
         self.terms[term].signal == self.output
     }
 
-    /// Orders of integration of a term: lowest and highest.
+    /// Lowest and highest order of integration of a term.
     pub(super) fn integrations(&self, term: usize) -> (f64, f64) {
-        let least = if self.own(term) { self.apart } else { 0.0 };
+        let least = if self.own(term) { self.min_separation } else { 0.0 };
         ((self.alpha.0 - self.terms[term].highest).max(least), self.alpha.1 - self.terms[term].lowest)
     }
 
-    /// Whether two terms may change places.
-    fn alike(&self, a: usize, b: usize) -> bool {
+    /// Whether two terms may be interchanged.
+    fn are_interchangeable(&self, a: usize, b: usize) -> bool {
         self.terms[a] == self.terms[b] && self.terms[a].lowest < self.terms[a].highest
     }
 
-    /// The equation's own orders with which orders of integration between these, of the first terms, may be had; none
-    /// where there are none.
-    pub(super) fn alphas(&self, within: &[(f64, f64)]) -> Option<(f64, f64)> {
+    /// Interval of the equation's order for which the first terms have orders of integration within these intervals.
+    /// `None` if it is empty.
+    pub(super) fn alpha_interval(&self, within: &[(f64, f64)]) -> Option<(f64, f64)> {
         let (mut low, mut high) = self.alpha;
         for (term, &(a, b)) in within.iter().enumerate() {
             let (least, most) = self.integrations(term);
             let (a, b) = (a.max(least), b.min(most));
-            if a > b + ROUNDED {
+            if a > b + ORDER_TOLERANCE {
                 return None;
             }
             low = low.max(a + self.terms[term].lowest);
@@ -378,33 +381,33 @@ impl Region {
                 if self.terms[other].signal != self.terms[term].signal {
                     continue;
                 }
-                // Terms that may change places are told apart by their order.
-                let ways = [d - a, if self.alike(other, term) { f64::NEG_INFINITY } else { b - c }];
-                if ways[0].max(ways[1]) < self.apart - ROUNDED {
+                // Interchangeable terms are ordered by their orders.
+                let ways = [d - a, if self.are_interchangeable(other, term) { f64::NEG_INFINITY } else { b - c }];
+                if ways[0].max(ways[1]) < self.min_separation - ORDER_TOLERANCE {
                     return None;
                 }
             }
         }
-        (low <= high + ROUNDED).then_some((low, high))
+        (low <= high + ORDER_TOLERANCE).then_some((low, high))
     }
 
-    /// The orders of integration as those of an equation and its terms.
+    /// Orders of the equation and of its terms for these orders of integration.
     pub(super) fn orders(&self, etas: &[f64]) -> Option<(f64, Vec<f64>)> {
         let points: Vec<(f64, f64)> = etas.iter().map(|&eta| (eta, eta)).collect();
-        let (low, high) = self.alphas(&points)?;
+        let (low, high) = self.alpha_interval(&points)?;
         let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);
         Some((alpha, etas.iter().map(|eta| alpha - eta).collect()))
     }
 
-    /// Orders of integration near these that are of the region, where a cell holds some.
-    pub(super) fn near(&self, within: &[(f64, f64)]) -> Option<Vec<f64>> {
-        let (low, high) = self.alphas(within)?;
+    /// Orders of integration of the region near the midpoint of a cell. `None` if the cell contains none.
+    pub(super) fn midpoint_orders(&self, within: &[(f64, f64)]) -> Option<Vec<f64>> {
+        let (low, high) = self.alpha_interval(within)?;
         let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);
         let etas: Vec<f64> = within.iter().map(|(a, b)| (a + b) / 2.0).collect();
         self.of_orders(alpha, &etas.iter().map(|eta| alpha - eta).collect::<Vec<_>>())
     }
 
-    /// Orders of integration of an equation's order and those of its terms, each moved into its interval.
+    /// Orders of integration for an equation's order and its terms' orders, each clipped to its interval.
     pub(super) fn of_orders(&self, alpha: f64, orders: &[f64]) -> Option<Vec<f64>> {
         let alpha = alpha.clamp(self.alpha.0, self.alpha.1);
         let inside = |(term, order): (usize, &f64)| {

@@ -1,9 +1,9 @@
-//! What is proved of all orders, not of a lattice's alone: no orders in some intervals have a smaller equation error.
+//! Certificates over all real orders: a lower bound of the equation error within given intervals of orders.
 //!
-//! The regressor of a term is a smooth curve in its order (`regressor_expansion`). About the middle of a cell of orders
-//! the least squared equation error is bounded from below over the whole cell (`cell_bound`, `subspace_bound`), from
-//! inner products that are made once for middles of all sizes of cells (`gram_tables`); cells that are not far enough
-//! above the best are halved (`bisection`).
+//! The regressor of a term is a smooth function of its order (`regressor_expansion`). The least squared equation
+//! error is bounded from below over a whole cell of orders about its midpoint (`cell_bound`, `subspace_bound`). The
+//! inner products are computed once for the midpoints of cells of all sizes (`gram_tables`). Cells whose bound is too
+//! small are bisected (`bisection`).
 
 mod bisection;
 mod cell_bound;
@@ -11,6 +11,6 @@ mod gram_tables;
 mod regressor_expansion;
 mod subspace_bound;
 
-pub use bisection::{certify, Asked, Certificate};
+pub use bisection::{certify, Certificate, CertificateOptions};
 pub use cell_bound::cell_bounds;
 pub use gram_tables::{Range, Region};

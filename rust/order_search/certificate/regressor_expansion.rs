@@ -1,58 +1,58 @@
-//! The regressor I^η s of a signal near one order: its values, its derivatives in the order, and what they leave out.
+//! Taylor expansion of the regressor I^η s in its order η, with a bound of the remainder.
 //!
-//! v_n = Δ²n^{η+1} is differentiated term by term (`crate::fractional::kernels`). Columns may be scaled as one likes,
-//! also by e^{−λ(η−η₀)}: with λ the mean logarithmic slope of the column at η₀ what is left turns, but hardly grows.
-//! Beyond the third derivative the fourth is bounded: it is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two pulses, whose
-//! terms grow with η from t = 1 on.
+//! v_n = Δ²n^{η+1} is differentiated term by term. Columns may be scaled freely, also by e^{−λ(η−η₀)}. With λ the
+//! mean logarithmic slope of the column at η₀, the scaled column rotates but hardly changes its norm. The remainder
+//! after the third derivative follows from a bound of the fourth: it is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two
+//! pulses, whose terms increase with η from t = 1 on.
 
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 
-/// Most terms of an equation.
-pub(super) const MOST: usize = 6;
-/// Derivatives that are made.
-pub(super) const MADE: usize = 3;
-/// The value and these.
-pub(super) const ALL: usize = MADE + 1;
+/// Maximum number of terms of an equation.
+pub(super) const MAX_TERMS: usize = 6;
+/// Highest derivative of the expansion.
+pub(super) const EXPANSION_DEGREE: usize = 3;
+/// Number of columns of the expansion: the value and its derivatives.
+pub(super) const EXPANSION_COLUMNS: usize = EXPANSION_DEGREE + 1;
 
-/// Terms of the binomial sum below [`NEAR`] pulses' distance, where it converges slowly, and from there on: 4^−26 and
-/// 64^−10 are below the rounding error.
-const TERMS: [usize; 2] = [26, 10];
-const NEAR: usize = 8;
+/// Terms of the binomial sum at distances below [`NEAR_DISTANCE_PULSES`], where it converges slowly, and above. 4^−26
+/// and 64^−10 are below the rounding error.
+const BINOMIAL_TERMS: [usize; 2] = [26, 10];
+const NEAR_DISTANCE_PULSES: usize = 8;
 
-/// Factorials.
-const FACTORIAL: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
+/// Factorials of 0 to 4.
+const FACTORIAL_TABLE: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
 
-/// The columns of one signal about one order, records one after the other, the first of unit size.
-pub(super) struct Curve {
-    pub(super) columns: [Vec<f64>; ALL],
-    /// Their sizes.
-    pub(super) sizes: [f64; ALL],
-    /// Within the half width no column is farther than this from the series that the columns make.
-    pub(super) rest: f64,
+/// Expansion of one signal's regressor about one order. Records are concatenated, and the value has unit norm.
+pub(super) struct RegressorExpansion {
+    pub(super) columns: [Vec<f64>; EXPANSION_COLUMNS],
+    /// Norms of the columns.
+    pub(super) sizes: [f64; EXPANSION_COLUMNS],
+    /// Remainder: largest distance of a column within the half width from its Taylor series.
+    pub(super) remainder: f64,
 }
 
 /// Σ_k C(η+1, 2k) n^{−2k} and its derivatives over their factorials, and n^{η+1} and ln n, by distance n from 2 on.
-struct Sums {
+struct BinomialSums {
     eta: f64,
-    sums: Vec<[f64; ALL]>,
+    sums: Vec<[f64; EXPANSION_COLUMNS]>,
     powers: Vec<(f64, f64)>,
 }
 
-impl Sums {
+impl BinomialSums {
     #[allow(clippy::cast_precision_loss)]
     fn new(eta: f64, m: usize) -> Self {
-        // Derivatives of binomial coefficients, as truncated series in what is added to η.
-        let mut coefficients = [[0.0; ALL]; TERMS[0]];
-        let mut c = [0.0; ALL];
+        // Derivatives of binomial coefficients, as truncated series in the increment of η.
+        let mut coefficients = [[0.0; EXPANSION_COLUMNS]; BINOMIAL_TERMS[0]];
+        let mut c = [0.0; EXPANSION_COLUMNS];
         c[0] = 1.0;
         for (k, kept) in coefficients.iter_mut().enumerate() {
             for j in [2 * k, 2 * k + 1] {
                 let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
                 let divisor = (j + 1) as f64;
-                for i in (0..ALL).rev() {
+                for i in (0..EXPANSION_COLUMNS).rev() {
                     c[i] = (c[i] * factor + if i > 0 { c[i - 1] } else { 0.0 }) / divisor;
                 }
             }
@@ -61,8 +61,8 @@ impl Sums {
         let distances = 2..m.max(2);
         let sums = distances.clone().map(|n| {
             let shrink = 1.0 / (n * n) as f64;
-            let terms = TERMS[usize::from(n >= NEAR)];
-            let mut sum = [0.0; ALL];
+            let terms = BINOMIAL_TERMS[usize::from(n >= NEAR_DISTANCE_PULSES)];
+            let mut sum = [0.0; EXPANSION_COLUMNS];
             for c in coefficients[..terms].iter().rev() {
                 for (sum, c) in sum.iter_mut().zip(c) {
                     *sum = (*sum + c) * shrink;
@@ -85,18 +85,18 @@ impl Sums {
         let rest = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
             let (mut value, mut turn) = (0.0, 1.0);
             for i in 0..=j {
-                value += turn / FACTORIAL[i] * sums[j - i];
+                value += turn / FACTORIAL_TABLE[i] * sums[j - i];
                 turn *= logarithm - mu;
             }
-            2.0 * FACTORIAL[j] * lead * value
+            2.0 * FACTORIAL_TABLE[j] * lead * value
         });
         [power(-mu), second].into_iter().chain(rest).take(m).collect()
     }
 }
 
-/// Σ_n of what |(∂/∂η − μ)⁴ v_n| is at most, for all orders up to `highest`.
+/// Σ_n of the upper bounds of |(∂/∂η − μ)⁴ v_n|, for all orders up to `highest`.
 #[allow(clippy::cast_precision_loss)]
-fn fourth(highest: f64, mu: f64, m: usize) -> f64 {
+fn fourth_derivative_bound(highest: f64, mu: f64, m: usize) -> f64 {
     let b = highest;
     let far = |t: f64| (libm::log(t) - mu).abs();
     let mut sum = mu.powi(4);
@@ -118,21 +118,21 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-impl Curve {
-    /// About I^eta of a signal, for orders of integration within `half` of it.
+impl RegressorExpansion {
+    /// Expand I^eta of a signal, for orders of integration within `half` of eta.
     ///
     /// # Errors
-    /// [`Error::Structure`] where its size is no positive number, [`Error::Interrupted`].
+    /// [`Error::Structure`] if its norm is not a positive finite number, [`Error::Interrupted`].
     pub(super) fn new(records: &[Record], signal: usize, eta: f64, half: f64, stop: &Stop) -> Result<Self> {
-        let mut columns: [Vec<f64>; ALL] = Default::default();
-        let mut errors = [0.0; ALL];
+        let mut columns: [Vec<f64>; EXPANSION_COLUMNS] = Default::default();
+        let mut errors = [0.0; EXPANSION_COLUMNS];
         let mut made = Vec::with_capacity(records.len());
-        // The unit of time is the first record's pulse.
+        // The unit of time is the pulse length of the first record.
         let first = records.first().map_or(1.0, Record::step);
         for record in records {
             stop.check()?;
             let (m, pace) = (record.m(), record.step() / first);
-            let (sums, spectrum) = (Sums::new(eta, m), Kernel::new(record.signal(signal)));
+            let (sums, spectrum) = (BinomialSums::new(eta, m), Kernel::new(record.signal(signal)));
             let (scale, slope) = (libm::pow(pace, eta), libm::log(pace));
             made.push((sums, spectrum, scale, slope));
         }
@@ -158,11 +158,11 @@ impl Curve {
                     column.extend(product(&kernel, spectrum, *scale, &mut buffers));
                 }
                 let size = dot(record.signal(signal), record.signal(signal)).sqrt();
-                // Derivatives are sums of terms that the logarithms of all distances enter with either sign.
-                let lost = unit(m) * scale * size * sums.moduli(j, mu);
+                // The summands of a derivative have either sign, depending on the logarithm of the distance.
+                let lost = rounding_unit(m) * scale * size * sums.moduli(j, mu);
                 squares += lost * lost;
                 if j == 0 {
-                    let beyond = libm::exp(mu.abs() * half) * fourth(eta + half, mu, m) * scale * size;
+                    let beyond = libm::exp(mu.abs() * half) * fourth_derivative_bound(eta + half, mu, m) * scale * size;
                     rest += beyond * beyond;
                 }
             }
@@ -177,36 +177,36 @@ impl Curve {
         }
         let inverse = 1.0 / size;
         columns.iter_mut().flatten().for_each(|v| *v *= inverse);
-        let mut left_out = rest.sqrt() * half.powi(4) / FACTORIAL[4];
-        for j in 0..ALL {
-            left_out += errors[j] * half.powi(i32::try_from(j).unwrap_or(0)) / FACTORIAL[j];
+        let mut left_out = rest.sqrt() * half.powi(4) / FACTORIAL_TABLE[4];
+        for j in 0..EXPANSION_COLUMNS {
+            left_out += errors[j] * half.powi(i32::try_from(j).unwrap_or(0)) / FACTORIAL_TABLE[j];
         }
-        let hair = 1.0 + unit(columns[0].len());
+        let hair = 1.0 + rounding_unit(columns[0].len());
         let sizes = std::array::from_fn(|j| dot(&columns[j], &columns[j]).sqrt() * hair);
-        Ok(Self { columns, sizes, rest: left_out * inverse * hair })
+        Ok(Self { columns, sizes, remainder: left_out * inverse * hair })
     }
 }
 
-impl Sums {
-    /// Σ_n of the moduli of what [`Sums::derivative`] adds up.
+impl BinomialSums {
+    /// Σ_n of the moduli of the summands of the derivative.
     fn moduli(&self, j: usize, mu: f64) -> f64 {
         let power = |x: f64| x.abs().powi(i32::try_from(j).unwrap_or(0));
         let near = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
         let far = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
             let (mut value, mut turn) = (0.0, 1.0);
             for i in 0..=j {
-                value += turn / FACTORIAL[i] * sums[j - i].abs();
+                value += turn / FACTORIAL_TABLE[i] * sums[j - i].abs();
                 turn *= (logarithm - mu).abs();
             }
-            2.0 * FACTORIAL[j] * lead * value
+            2.0 * FACTORIAL_TABLE[j] * lead * value
         });
         near + far.sum::<f64>()
     }
 }
 
-/// What rounding may add to a sum of so many terms, per unit: a generous multiple.
+/// Relative rounding-error bound of a sum with this many terms, a generous multiple.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn unit(m: usize) -> f64 {
+pub(super) fn rounding_unit(m: usize) -> f64 {
     16.0 * f64::EPSILON * (m.max(64) as f64)
 }
 
@@ -217,11 +217,11 @@ fn product(kernel: &[f64], spectrum: &Kernel, scale: f64, buffers: &mut Buffers)
     out
 }
 
-/// Σ over the powers up to the third of `half`^j/j! times a number each.
-pub(super) fn series(half: f64, of: impl Fn(usize) -> f64) -> f64 {
+/// Taylor sum from the first to the third power: Σ `half`^j/j! times one value for each j.
+pub(super) fn taylor_sum(half: f64, of: impl Fn(usize) -> f64) -> f64 {
     let mut power = 1.0;
     let mut sum = 0.0;
-    for (j, factorial) in FACTORIAL.iter().enumerate().take(ALL).skip(1) {
+    for (j, factorial) in FACTORIAL_TABLE.iter().enumerate().take(EXPANSION_COLUMNS).skip(1) {
         power *= half;
         sum += power / factorial * of(j);
     }

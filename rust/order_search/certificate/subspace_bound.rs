@@ -1,64 +1,65 @@
-//! A lower bound over a cell from the space that its columns and their first two derivatives span.
+//! Lower bound over a cell from the subspace spanned by its columns and their first two derivatives.
 //!
-//! Near orders whose columns depend on one another coefficients are told by next to nothing, and what follows from them
-//! proves nothing. There the output's distance from that space still bounds the equation error, for coefficients whose
-//! terms are not beyond all measure: what the space leaves out of the columns is of third order.
+//! Near orders with nearly dependent columns the coefficients are poorly determined, and a bound based on them proves
+//! nothing. The distance of the output from this subspace still bounds the equation error for coefficients of limited
+//! size, since the subspace omits only terms of third order from the columns.
 
-use crate::order_search::certificate::regressor_expansion::{unit, ALL, MOST};
+use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPANSION_COLUMNS, MAX_TERMS};
 
-/// The value and the derivatives that are taken into the space.
-const SPANNED: usize = 3;
-const ROWS: usize = SPANNED * MOST;
-/// What is added to squares of coefficients, which may not be as large as they like: as a share of what is to be proved,
-/// all of them taken together, and so much at least that columns that depend on one another do no harm.
-const SHARE: f64 = 0.05;
-const RIDGE: f64 = 1e-11;
-/// A hair more, for the rounding of what is put together here.
-const HAIR: f64 = 1e-9;
+/// Number of spanning columns of a term: the value and its derivatives.
+const SPANNED_DERIVATIVES: usize = 3;
+const MAX_BASIS_ROWS: usize = SPANNED_DERIVATIVES * MAX_TERMS;
+/// Ridge on the squared coefficients, relative to the goal for all of them together, and its minimum. The ridge keeps
+/// nearly dependent columns harmless.
+const RIDGE_GOAL_SHARE: f64 = 0.05;
+const MIN_RIDGE: f64 = 1e-11;
+/// Relative margin for the rounding of the bound.
+const ROUNDING_MARGIN: f64 = 1e-9;
 
-/// Columns in units in which their coefficients are at most those of the values: x, ωx′, ω²x″/2.
-pub(super) struct Span {
-    /// Term, derivative and unit of each row.
-    rows: [((usize, usize), f64); ROWS],
+/// Subspace spanned by the scaled columns x, ωx′, ω²x″/2. In this scaling no derivative has larger coefficients than
+/// the value.
+pub(super) struct DerivativeSubspace {
+    /// Term, derivative and scale of each row.
+    rows: [((usize, usize), f64); MAX_BASIS_ROWS],
     count: usize,
     terms: usize,
-    matrix: [[f64; ROWS]; ROWS],
-    target: [f64; ROWS],
-    /// What is left out of a unit column at most, and the least size of one.
-    beyond: f64,
-    least: f64,
-    /// What rounding may add to a product of two unit columns.
+    matrix: [[f64; MAX_BASIS_ROWS]; MAX_BASIS_ROWS],
+    target: [f64; MAX_BASIS_ROWS],
+    /// Largest norm omitted from a unit column, and smallest norm of a unit column within the cell.
+    max_omitted_norm: f64,
+    min_column_norm: f64,
+    /// Rounding-error bound of a product of two unit columns.
     rounding: f64,
 }
 
-impl Span {
+impl DerivativeSubspace {
     pub(super) fn new(samples: usize) -> Self {
         Self {
-            rows: [((0, 0), 0.0); ROWS],
+            rows: [((0, 0), 0.0); MAX_BASIS_ROWS],
             count: 0,
             terms: 0,
-            matrix: [[0.0; ROWS]; ROWS],
-            target: [0.0; ROWS],
-            beyond: 0.0,
-            least: 1.0,
-            rounding: unit(samples) / 8.0,
+            matrix: [[0.0; MAX_BASIS_ROWS]; MAX_BASIS_ROWS],
+            target: [0.0; MAX_BASIS_ROWS],
+            max_omitted_norm: 0.0,
+            min_column_norm: 1.0,
+            rounding: rounding_unit(samples) / 8.0,
         }
     }
 
-    /// The next term: half its width, the sizes of its columns and what their series leaves out.
-    pub(super) fn add(&mut self, half: f64, sizes: [f64; ALL], rest: f64) {
+    /// Add a term: half its width, the norms of its columns and the remainder of its expansion.
+    pub(super) fn add(&mut self, half: f64, sizes: [f64; EXPANSION_COLUMNS], rest: f64) {
         let units = [1.0, half, half * half / 2.0, half * half * half / 6.0];
-        for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED } else { 1 }) {
+        for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED_DERIVATIVES } else { 1 }) {
             self.rows[self.count] = ((self.terms, derivative), unit);
             self.count += 1;
         }
         self.terms += 1;
-        let off = |from: usize| (from..ALL).map(|m| units[m] * sizes[m]).sum::<f64>() + rest;
-        self.beyond = self.beyond.max(off(SPANNED));
-        self.least = self.least.min(1.0 - off(1));
+        let off = |from: usize| (from..EXPANSION_COLUMNS).map(|m| units[m] * sizes[m]).sum::<f64>() + rest;
+        self.max_omitted_norm = self.max_omitted_norm.max(off(SPANNED_DERIVATIVES));
+        self.min_column_norm = self.min_column_norm.min(1.0 - off(1));
     }
 
-    /// Takes products of the columns of terms and derivatives, and with the target.
+    /// Fill in the products of the columns of terms and derivatives, and those with the target.
     pub(super) fn fill(
         &mut self,
         product: impl Fn((usize, usize), (usize, usize)) -> f64,
@@ -75,18 +76,18 @@ impl Span {
         }
     }
 
-    /// No orders of the cell, with coefficients whose terms have together at most `largest` times the size of the output,
-    /// leave a smaller share of its square; 0 where nothing is proved. To prove this goal is what is tried.
+    /// Lower bound of the relative squared residual over the cell, 0 if nothing is proved. It holds for coefficients
+    /// whose terms sum up to at most `largest` times the norm of the output. The ridge is tuned for `goal`.
     pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
-        if self.least.is_nan() || self.least <= 0.5 || goal.is_nan() {
+        if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || goal.is_nan() {
             return 0.0;
         }
-        let (n, all) = (self.count, largest / self.least);
-        let powers = f64::from(u8::try_from(SPANNED).unwrap_or(u8::MAX));
-        let added = (SHARE * goal / (powers * all * all)).clamp(RIDGE, 1.0);
-        let coefficients = self.minimum(added);
-        // The least of the form with the ridge is at least its value anywhere less |gradient|²/(4·ridge); so the form of the
-        // columns themselves is asked, which has no negative squares, not the rounded one.
+        let (n, all) = (self.count, largest / self.min_column_norm);
+        let powers = f64::from(u8::try_from(SPANNED_DERIVATIVES).unwrap_or(u8::MAX));
+        let added = (RIDGE_GOAL_SHARE * goal / (powers * all * all)).clamp(MIN_RIDGE, 1.0);
+        let coefficients = self.ridge_solution(added);
+        // The minimum of the form with the ridge is at least its value anywhere minus |gradient|²/(4·ridge). The bound
+        // uses the exact form of the columns, which is positive semidefinite, not the rounded one.
         let (mut value, mut gradient, mut sum) = (1.0, 0.0, 1.0);
         for i in 0..n {
             let row: f64 = (0..n).map(|j| self.matrix[i][j] * coefficients[j]).sum::<f64>() + added * coefficients[i];
@@ -99,10 +100,10 @@ impl Span {
         let (count, rounded) = (n as f64, self.rounding + 16.0 * f64::EPSILON * n as f64);
         let slope = gradient.sqrt() + 2.0 * rounded * sum * count.sqrt();
         let ridge = value - rounded * sum * sum - slope * slope / (4.0 * added);
-        // Coefficients of the values add up to `all` at most, those of each derivative too.
+        // The coefficients of the values, and those of each derivative, sum up to at most `all`.
         let square = ridge - added * powers * all * all;
-        let root = square.max(0.0).sqrt() - all * self.beyond;
-        let least = root * root * (1.0 - HAIR);
+        let root = square.max(0.0).sqrt() - all * self.max_omitted_norm;
+        let least = root * root * (1.0 - ROUNDING_MARGIN);
         if root > 0.0 && least.is_finite() {
             least
         } else {
@@ -110,8 +111,8 @@ impl Span {
         }
     }
 
-    /// Coefficients where the form with the ridge is about least.
-    fn minimum(&self, added: f64) -> [f64; ROWS] {
+    /// Approximate minimizer of the form with the ridge.
+    fn ridge_solution(&self, added: f64) -> [f64; MAX_BASIS_ROWS] {
         let n = self.count;
         let mut factor = self.matrix;
         let mut x = self.target;

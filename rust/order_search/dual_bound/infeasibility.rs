@@ -1,25 +1,24 @@
-//! Proofs that no coefficients whatever bring a candidate's error within reach, for those that are yet to be refined.
+//! Infeasibility proofs: no coefficients reduce a candidate's error to the threshold.
 //!
-//! With d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of at most L needs |⟨t, w⟩|² ≤ L²(|d|‖t‖ + S)² for every test vector
-//! t ([`crate::order_search::dual_bound::lower_bound`] says why), and
+//! They serve candidates whose coefficients are not refined yet. With d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of
+//! at most L requires |⟨t, w⟩|² ≤ L²(|d|‖t‖ + S)² for every test vector t, by the dual bound, and
 //!
-//!   (a + S)² ≤ (1+κ)a² + (1+1/κ)S², S² ≤ Σ c_i²ρ_i²/p_i for any κ, p_i > 0 with Σ p_i = 1,
+//!   (a + S)² ≤ (1+κ)a² + (1+1/κ)S², S² ≤ Σ c_i²ρ_i²/p_i for any κ, p_i > 0 with Σ p_i = 1.
 //!
-//! so each condition implies that a quadratic form in (c, 1) is not positive; where a weighted sum of these forms is
-//! positive definite, no coefficients meet them all.
+//! Each condition therefore implies that a quadratic form in (c, 1) is not positive. If a weighted sum of these forms
+//! is positive definite, no coefficients satisfy all conditions.
 
-use crate::linalg::small::packed;
-use crate::order_search::dual_bound::test_vectors::{Probes, Wide, NONE};
-use crate::simd::WIDTH;
+use crate::linalg::small::packed_index;
+use crate::order_search::dual_bound::test_vectors::{TestVectors, Wide, NO_INDEX};
+use crate::simd::LANE_COUNT;
 
-/// Steps in which weights of test vectors are sought that exclude a candidate; measured on Plant A's lattice, where three
-/// do on average.
-const SOUGHT: usize = 12;
-/// Share of a diagonal element that rounding may have added to it and its row: a generous multiple of k² ε.
-const DEFINITE: f64 = 1e-12;
+/// Maximum steps of the search for multipliers of the test vectors. On the grid of Plant A, three suffice on average.
+const MAX_MULTIPLIER_STEPS: usize = 12;
+/// Relative rounding margin of a diagonal element and its row, a generous multiple of k² ε.
+const DEFINITENESS_MARGIN: f64 = 1e-12;
 
-/// What one unknown contributes to a group of conditions: to ⟨t, w⟩ over the limit and to d‖t‖ (real and imaginary
-/// parts), and ρ.
+/// Contribution of one unknown to a group of conditions. It has a part in ⟨t, w⟩ over the limit, one in d‖t‖ (real and
+/// imaginary parts each), and ρ.
 #[derive(Debug, Clone, Copy)]
 struct Effect {
     error: [Wide; 2],
@@ -27,29 +26,30 @@ struct Effect {
     slack: Wide,
 }
 
-const NO_EFFECT: Effect = Effect { error: [[0.0; WIDTH]; 2], divisor: [[0.0; WIDTH]; 2], slack: [0.0; WIDTH] };
+const NO_EFFECT: Effect =
+    Effect { error: [[0.0; LANE_COUNT]; 2], divisor: [[0.0; LANE_COUNT]; 2], slack: [0.0; LANE_COUNT] };
 
-/// One search for such a proof, and its memory.
+/// State of one infeasibility proof, reused between candidates.
 #[derive(Default)]
-pub(crate) struct Reach {
-    /// Unknowns, the constant 1 the last.
+pub(crate) struct InfeasibilityProof {
+    /// Number of unknowns. The last one is the constant 1.
     unknowns: usize,
     /// Effect of unknown i on group g at g·unknowns + i.
     effects: Vec<Effect>,
     at: Vec<f64>,
     weights: Vec<Wide>,
-    /// Lower rows of the weighted form, of its part from ⟨t, w⟩ alone, and sizes of its diagonal.
+    /// Lower rows of the weighted form, of its part from ⟨t, w⟩ alone, and moduli of its diagonal.
     form: Vec<f64>,
     errors: Vec<f64>,
     sizes: Vec<f64>,
     factor: Vec<f64>,
 }
 
-impl Reach {
+impl InfeasibilityProof {
     #[inline(always)]
-    pub(super) fn lay_out(
+    pub(super) fn set_conditions(
         &mut self,
-        probes: &[Probes],
+        probes: &[TestVectors],
         limit: f64,
         terms: &[usize],
         fixed: &[Option<f64>],
@@ -61,7 +61,7 @@ impl Reach {
         self.unknowns = last + 1;
         self.effects.clear();
         for (r, probes) in probes.iter().enumerate() {
-            // A hair more, for the rounding of the divisor and of the score itself.
+            // Margin for the rounding of the divisor and of the score.
             let scale = 1.0 / (limit * (1.0 + probes.unit));
             for group in 0..probes.groups {
                 let first = self.effects.len();
@@ -70,15 +70,15 @@ impl Reach {
                 let column = |p: usize, c: f64| -> Effect {
                     let [re, im] = &probes.products[p * probes.groups + group];
                     let mut effect = NO_EFFECT;
-                    for n in 0..WIDTH {
+                    for n in 0..LANE_COUNT {
                         effect.error[0][n] = -c * re[n] * scale;
                         effect.error[1][n] = -c * im[n] * scale;
                         effect.slack[n] = c.abs() * probes.rounding[p] * scale;
                     }
                     let row = probes.rows[p];
-                    if row != NONE {
+                    if row != NO_INDEX {
                         let [re, im, rest, _] = &probes.effects[row * probes.groups + group];
-                        for n in 0..WIDTH {
+                        for n in 0..LANE_COUNT {
                             effect.divisor[0][n] = -c * re[n];
                             effect.divisor[1][n] = -c * im[n];
                             effect.slack[n] += c.abs() * rest[n];
@@ -87,7 +87,7 @@ impl Reach {
                     effect
                 };
                 let mut constant = NO_EFFECT;
-                for n in 0..WIDTH {
+                for n in 0..LANE_COUNT {
                     constant.error[0][n] = probes.target[group][0][n] * scale;
                     constant.error[1][n] = probes.target[group][1][n] * scale;
                     constant.divisor[0][n] = probes.size[group][n];
@@ -99,12 +99,12 @@ impl Reach {
                         Some(c) => {
                             let effect = column(p, c);
                             for half in 0..2 {
-                                for n in 0..WIDTH {
+                                for n in 0..LANE_COUNT {
                                     constant.error[half][n] += effect.error[half][n];
                                     constant.divisor[half][n] += effect.divisor[half][n];
                                 }
                             }
-                            for n in 0..WIDTH {
+                            for n in 0..LANE_COUNT {
                                 constant.slack[n] += effect.slack[n];
                             }
                         }
@@ -126,14 +126,14 @@ impl Reach {
         self.at.push(1.0);
     }
 
-    /// Seeks weights whose form is positive definite: each step goes where the last form was least, and gives more
-    /// weight to the conditions that fail there. Ends where none fails.
+    /// Search multipliers whose quadratic form is positive definite. Each step moves to the minimizer of the last form
+    /// and raises the multipliers of the conditions violated there. Return `false` once no condition is violated.
     #[inline(always)]
-    pub(super) fn search(&mut self) -> bool {
+    pub(super) fn find_multipliers(&mut self) -> bool {
         let k = self.unknowns;
         let groups = self.effects.len() / k;
         self.weights.clear();
-        for step in 0..SOUGHT {
+        for step in 0..MAX_MULTIPLIER_STEPS {
             let smallest = 1e-6 * self.at.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
             if !smallest.is_finite() {
                 return false;
@@ -148,14 +148,14 @@ impl Reach {
                     worst = worst.max(q);
                 }
             }
-            // Not even here do the conditions fail.
+            // No condition is violated at this point.
             if worst <= 1.0 || worst.is_infinite() {
                 return false;
             }
             if step == 0 {
                 self.weights.extend(states.iter().map(|[_, size, slack]| {
-                    let mut weight = [0.0; WIDTH];
-                    for n in 0..WIDTH {
+                    let mut weight = [0.0; LANE_COUNT];
+                    for n in 0..LANE_COUNT {
                         let all = size[n] + slack[n];
                         weight[n] = 1.0 / (all * all);
                     }
@@ -163,7 +163,7 @@ impl Reach {
                 }));
             }
             for (weight, [ratios, _, _]) in self.weights.iter_mut().zip(&states) {
-                for n in 0..WIDTH {
+                for n in 0..LANE_COUNT {
                     weight[n] *= (ratios[n] / worst + 1e-3).sqrt();
                 }
             }
@@ -178,12 +178,12 @@ impl Reach {
             if convex < k - 1 && factorise(&self.errors, k, &mut self.factor) < k - 1 {
                 return false;
             }
-            // The least point of the form, its last coordinate 1.
+            // Minimizer of the form, with last coordinate 1.
             self.at[k - 1] = 1.0;
             for i in (0..k - 1).rev() {
-                let mut value = -self.factor[packed(k - 1, i)];
+                let mut value = -self.factor[packed_index(k - 1, i)];
                 for j in i + 1..k - 1 {
-                    value -= self.factor[packed(j, i)] * self.at[j];
+                    value -= self.factor[packed_index(j, i)] * self.at[j];
                 }
                 self.at[i] = value;
             }
@@ -191,13 +191,13 @@ impl Reach {
         false
     }
 
-    /// Of one group of conditions at the present point: how far beyond what is allowed, |d|‖t‖ and S.
+    /// Violation ratio, |d|‖t‖ and S of one group of conditions at the current point.
     #[inline(always)]
     fn state(&self, group: usize) -> [Wide; 3] {
-        let zero = [0.0; WIDTH];
+        let zero = [0.0; LANE_COUNT];
         let (mut error, mut divisor, mut slack) = ([zero; 2], [zero; 2], zero);
         for (effect, &x) in self.effects[group * self.unknowns..(group + 1) * self.unknowns].iter().zip(&self.at) {
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 error[0][n] += x * effect.error[0][n];
                 error[1][n] += x * effect.error[1][n];
                 divisor[0][n] += x * effect.divisor[0][n];
@@ -206,7 +206,7 @@ impl Reach {
             }
         }
         let (mut ratios, mut size) = (zero, zero);
-        for n in 0..WIDTH {
+        for n in 0..LANE_COUNT {
             size[n] = (divisor[0][n] * divisor[0][n] + divisor[1][n] * divisor[1][n]).sqrt();
             let allowed = size[n] + slack[n];
             ratios[n] = (error[0][n] * error[0][n] + error[1][n] * error[1][n]) / (allowed * allowed);
@@ -214,84 +214,84 @@ impl Reach {
         [ratios, size, slack]
     }
 
-    /// The weighted form; its inequalities are tight at the present point.
+    /// Assemble the weighted form. Its inequalities are tight at the current point.
     #[inline(always)]
     fn assemble(&mut self, states: &[[Wide; 3]], smallest: f64) {
         let k = self.unknowns;
         self.form.clear();
-        self.form.resize(packed(k, 0), 0.0);
+        self.form.resize(packed_index(k, 0), 0.0);
         self.errors.clear();
-        self.errors.resize(packed(k, 0), 0.0);
+        self.errors.resize(packed_index(k, 0), 0.0);
         self.sizes.clear();
         self.sizes.resize(k, 0.0);
         for (g, (weight, [_, size, slack])) in self.weights.iter().zip(states).enumerate() {
             let effects = &self.effects[g * k..(g + 1) * k];
-            let (mut own, mut rest, mut total) = ([0.0; WIDTH], [0.0; WIDTH], [0.0; WIDTH]);
+            let (mut own, mut rest, mut total) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT], [0.0; LANE_COUNT]);
             for (effect, x) in effects.iter().zip(&self.at) {
                 for (sum, slack) in total.iter_mut().zip(&effect.slack) {
                     *sum += slack * x.abs().max(smallest);
                 }
             }
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 let kappa = (slack[n] / size[n]).clamp(1e-6, 1e6);
                 own[n] = weight[n] * (1.0 + kappa);
                 rest[n] = weight[n] * (1.0 + 1.0 / kappa) * total[n];
             }
             for (i, a) in effects.iter().enumerate() {
-                let (mut left, mut right) = ([[0.0; WIDTH]; 2], [[0.0; WIDTH]; 2]);
+                let (mut left, mut right) = ([[0.0; LANE_COUNT]; 2], [[0.0; LANE_COUNT]; 2]);
                 for half in 0..2 {
-                    for n in 0..WIDTH {
+                    for n in 0..LANE_COUNT {
                         left[half][n] = weight[n] * a.error[half][n];
                         right[half][n] = own[n] * a.divisor[half][n];
                     }
                 }
                 for (j, b) in effects[..=i].iter().enumerate() {
-                    let (mut errors, mut divisors) = ([0.0; WIDTH], [0.0; WIDTH]);
-                    for n in 0..WIDTH {
+                    let (mut errors, mut divisors) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
+                    for n in 0..LANE_COUNT {
                         errors[n] = left[0][n] * b.error[0][n] + left[1][n] * b.error[1][n];
                         divisors[n] = right[0][n] * b.divisor[0][n] + right[1][n] * b.divisor[1][n];
                     }
                     let (errors, divisors) = (errors.iter().sum::<f64>(), divisors.iter().sum::<f64>());
-                    self.errors[packed(i, j)] += errors;
-                    self.form[packed(i, j)] += errors - divisors;
+                    self.errors[packed_index(i, j)] += errors;
+                    self.form[packed_index(i, j)] += errors - divisors;
                     if i == j {
                         self.sizes[i] += errors + divisors;
                     }
                 }
                 let slacks = rest.iter().zip(&a.slack).map(|(r, s)| r * s).sum::<f64>();
                 let slacks = slacks / self.at[i].abs().max(smallest);
-                self.form[packed(i, i)] -= slacks;
+                self.form[packed_index(i, i)] -= slacks;
                 self.sizes[i] += slacks;
             }
         }
         for i in 0..k {
-            self.form[packed(i, i)] -= DEFINITE * self.sizes[i];
-            self.errors[packed(i, i)] += DEFINITE * self.sizes[i];
+            self.form[packed_index(i, i)] -= DEFINITENESS_MARGIN * self.sizes[i];
+            self.errors[packed_index(i, i)] += DEFINITENESS_MARGIN * self.sizes[i];
         }
     }
 }
 
-/// Factors a symmetric matrix by its lower rows into L D Lᵀ, as far as its pivots are positive: how many are. The rows
-/// of L are made up to the first that is not, that row included.
+/// Factor a symmetric matrix, given by lower rows, into L D Lᵀ. Return the number of leading positive pivots. The rows
+/// of L are valid up to and including the first nonpositive pivot.
 #[inline(always)]
 fn factorise(matrix: &[f64], k: usize, factor: &mut Vec<f64>) -> usize {
     factor.clear();
     factor.extend_from_slice(matrix);
     for i in 0..k {
-        let mut pivot = factor[packed(i, i)];
+        let mut pivot = factor[packed_index(i, i)];
         for j in 0..i {
-            let mut sum = factor[packed(i, j)];
+            let mut sum = factor[packed_index(i, j)];
             for l in 0..j {
-                sum -= factor[packed(i, l)] * factor[packed(j, l)] * factor[packed(l, l)];
+                sum -= factor[packed_index(i, l)] * factor[packed_index(j, l)] * factor[packed_index(l, l)];
             }
-            factor[packed(i, j)] = sum / factor[packed(j, j)];
-            pivot -= sum * factor[packed(i, j)];
+            factor[packed_index(i, j)] = sum / factor[packed_index(j, j)];
+            pivot -= sum * factor[packed_index(i, j)];
         }
-        // Written so that a pivot that is not a number is none.
+        // This form of the condition rejects a NaN pivot.
         if !(pivot > 0.0 && pivot.is_finite()) {
             return i;
         }
-        factor[packed(i, i)] = pivot;
+        factor[packed_index(i, i)] = pivot;
     }
     k
 }

@@ -1,31 +1,31 @@
-//! Test vectors that follow the coefficients: each made for one candidate, corrected for others of the same own orders.
+//! Test vectors linearized in the coefficients: built for one candidate, corrected to first order for others.
 //!
-//! With divisor D₀ and output error e₀ of the candidate that it is made for, t₀ = D₀⁻ᵀ sign(e₀). A candidate of the same
-//! own orders has D = D₀ − Σ x_m G_m, with G_m combinations of its F_i, and one step of Newton's method for D⁻ᵀ sign(e₀)
-//! is t = t₀ + Σ x_m v_m, v_m = D₀⁻ᵀ G_mᵀ t₀. Then Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m but for rounding: what is lost is of
-//! second order, and all of it is known from a few numbers that are made once.
+//! For the candidate with divisor D₀ and output error e₀, t₀ = D₀⁻ᵀ sign(e₀). A candidate with the same own orders
+//! has D = D₀ − Σ x_m G_m, where the G_m are combinations of its F_i. One Newton step for D⁻ᵀ sign(e₀) gives t = t₀ +
+//! Σ x_m v_m with v_m = D₀⁻ᵀ G_mᵀ t₀. Then Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m up to rounding. The loss is of second
+//! order and is bounded by a few precomputed norms.
 
 use std::collections::BTreeMap;
 
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
-use crate::order_search::dual_bound::tailored_vectors::{modulus, Losses};
-use crate::order_search::dual_bound::test_vectors::NONE;
+use crate::order_search::dual_bound::tailored_vectors::{sum_of_moduli, RoundingBounds};
+use crate::order_search::dual_bound::test_vectors::NO_INDEX;
 use crate::order_search::options::Norm;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::series::{divide, reciprocal, Buffers, Kernel, SumOfProducts};
 use crate::simd;
 
-/// Most own terms of a candidate.
-pub(crate) const MOST_OWN: usize = 4;
-/// A candidate whose error is this many times the limit has neighbours that are as far beyond it; what is made for it
-/// reaches none of those that are not.
-const BEYOND: f64 = 4.0;
-/// Products of numbers below this do not overflow.
-const HUGE: f64 = 1e100;
+/// Maximum own terms of a candidate.
+pub(crate) const MAX_OWN_TERMS: usize = 4;
+/// Largest ratio of error to limit for which a vector is built. Candidates near one with a larger error are excluded by
+/// other bounds.
+const MAX_ERROR_LIMIT_RATIO: f64 = 4.0;
+/// Magnitude below which products stay finite.
+const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
-/// Whether the test vector made for one equation, corrected for another with the same orders of its output, proves that
-/// the other's output error at rest exceeds `limit`: Σ|y − ŷ| or Σ(y − ŷ)².
+/// Whether a linearized test vector proves that an equation's output error exceeds `limit`. The vector is built for
+/// `made_for` and corrected for an equation with the same orders of the output. The error is Σ|y − ŷ| or Σ(y − ŷ)².
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term, other orders of the output.
@@ -42,11 +42,12 @@ const HUGE: f64 = 1e100;
 /// let structure = Structure { output: 0, order: 0.8, terms };
 /// let equation = |a: f64, b: f64| Equation { structure: structure.clone(), coefficients: vec![a, b] };
 /// // y is the integral of order 0.8 of u: D^0.8 y = u.
-/// let proved = |limit: f64| excluded_along(&record, &equation(-0.5, 2.0), &equation(-0.4, 2.1), Norm::L1, limit);
+/// let (made_for, other) = (equation(-0.5, 2.0), equation(-0.4, 2.1));
+/// let proved = |limit: f64| excluded_by_linearized_vector(&record, &made_for, &other, Norm::L1, limit);
 /// assert!(proved(1.0)? && !proved(1e3)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn excluded_along(
+pub fn excluded_by_linearized_vector(
     record: &Record,
     made_for: &Equation,
     equation: &Equation,
@@ -64,113 +65,119 @@ pub fn excluded_along(
     }
     let bank = Bank::new(&index, record, equation.structure.output)?;
     let (banks, targets) = ([bank], [record.signal(equation.structure.output).to_vec()]);
-    let mut tangents = Tangents::new(&banks, &targets, norm);
-    let own = tangents.own(&positions[0]);
-    if own != tangents.own(&positions[1]) || own.is_empty() || own.len() > MOST_OWN {
+    let mut tangents = LinearizedVectors::new(&banks, &targets, norm);
+    let own = tangents.own_columns(&positions[0]);
+    if own != tangents.own_columns(&positions[1]) || own.is_empty() || own.len() > MAX_OWN_TERMS {
         return Err(Error::OutOfRange {
             name: "own terms".into(),
             value: 0.0,
-            range: format!("1 to {MOST_OWN} terms of the output, of the same orders in both equations"),
+            range: format!("1 to {MAX_OWN_TERMS} terms of the output, of the same orders in both equations"),
             remedy: "give both equations these".into(),
         });
     }
     let made = tangents.fit((&banks, &targets), &positions[0], &made_for.coefficients, f64::INFINITY);
     tangents.add(own, made.into_iter().collect());
-    Ok(tangents.exclude(&positions[1], &equation.coefficients, limit, &mut Held::default()))
+    Ok(tangents.excludes_candidate(&positions[1], &equation.coefficients, limit, &mut VectorLookup::default()))
 }
 
-/// One test vector and its corrections, over all records.
-pub(crate) struct Tangent {
-    /// Coefficients of the own terms of the candidate that it was made for.
-    centre: Vec<f64>,
+/// Test vector and its first-order corrections, over all records.
+pub(crate) struct LinearizedVector {
+    /// Own coefficients of the candidate that the vector is built for.
+    center: Vec<f64>,
     /// F_i = G_i + Σ_{j<i} mix[i·k + j] G_j.
     mix: Vec<f64>,
-    /// Of each v_m: its largest value, and ‖D₀ᵀv_m − G_mᵀt₀‖.
-    sizes: Vec<f64>,
-    rests: Vec<f64>,
-    /// At least Σ|g_m| of the series of G_m, and of all that it is made of, times the largest norm.
-    lengths: Vec<f64>,
+    /// Largest value of each v_m, and ‖D₀ᵀv_m − G_mᵀt₀‖.
+    peak_values: Vec<f64>,
+    solution_residuals: Vec<f64>,
+    /// Upper bound of Σ|g_m| of the series of G_m and of its components, times the largest norm.
+    series_norms: Vec<f64>,
     /// ‖G_nᵀv_m + G_mᵀv_n‖ for n < m and ‖G_mᵀv_m‖, packed by rows.
-    bends: Vec<f64>,
+    second_order_norms: Vec<f64>,
     /// ‖D₀ᵀt₀‖, and (1 + Σ|c|Σ|f|) of D₀, times the largest norm.
     norm: f64,
-    around: f64,
-    /// ⟨t₀, ·⟩, ⟨v_m, ·⟩ of the target, the own columns and all driven ones, k + 1 by k + 1 + all.
+    center_norm: f64,
+    /// ⟨t₀, ·⟩, ⟨v_m, ·⟩ with the target, the own columns and all input columns, k + 1 by k + 1 + all.
     products: Vec<f64>,
 }
 
-/// Those of a search, by the own columns of the candidates that they serve.
-pub(crate) struct Tangents {
-    losses: Losses,
-    /// Number among the driven columns; [`NONE`] of an own one.
-    driven: Vec<usize>,
+/// Set of linearized test vectors of a search, by the own columns of their candidates.
+pub(crate) struct LinearizedVectors {
+    rounding_bounds: RoundingBounds,
+    /// Index among the input columns, [`NO_INDEX`] for an own column.
+    input_index: Vec<usize>,
     width: usize,
-    of: BTreeMap<Vec<usize>, (usize, usize)>,
-    each: Vec<Tangent>,
+    ranges: BTreeMap<Vec<usize>, (usize, usize)>,
+    vectors: Vec<LinearizedVector>,
 }
 
-/// What a thread remembers from one candidate to the next.
+/// Lookup state of one thread, kept from one candidate to the next.
 #[derive(Default)]
-pub(crate) struct Held {
+pub(crate) struct VectorLookup {
     own: Vec<usize>,
-    next: Vec<usize>,
+    next_own: Vec<usize>,
     range: (usize, usize),
-    last: usize,
+    last_vector: usize,
 }
 
-impl Tangents {
-    /// None yet.
+impl LinearizedVectors {
+    /// Return an empty set.
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
-        let mut driven = Vec::new();
+        let mut input_index = Vec::new();
         let mut width = 0;
         if let Some(bank) = banks.first() {
             for p in 0..bank.len() {
-                driven.push(if bank.kernel(p).is_empty() { width } else { NONE });
+                input_index.push(if bank.kernel(p).is_empty() { width } else { NO_INDEX });
                 width += usize::from(bank.kernel(p).is_empty());
             }
         }
-        Self { losses: Losses::new(banks, targets, norm), driven, width, of: BTreeMap::new(), each: Vec::new() }
+        Self {
+            rounding_bounds: RoundingBounds::new(banks, targets, norm),
+            input_index,
+            width,
+            ranges: BTreeMap::new(),
+            vectors: Vec::new(),
+        }
     }
 
-    /// Bytes of one for candidates of so many own terms.
+    /// Memory of one vector for candidates with this many own terms [bytes].
     pub(crate) fn bytes(&self, own: usize) -> u64 {
         8 * ((own + 1) * (own + 1 + self.width) + own * (2 * own + 4) + 8) as u64
     }
 
-    /// Those of a candidate's columns that are integrals of the output.
-    pub(crate) fn own(&self, terms: &[usize]) -> Vec<usize> {
-        terms.iter().copied().filter(|&p| self.driven[p] == NONE).collect()
+    /// Columns of a candidate that are integrals of the output.
+    pub(crate) fn own_columns(&self, terms: &[usize]) -> Vec<usize> {
+        terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX).collect()
     }
 
-    /// Takes what was made for candidates with these own columns.
-    pub(crate) fn add(&mut self, own: Vec<usize>, made: Vec<Tangent>) {
-        let from = self.each.len();
-        self.each.extend(made);
-        self.of.insert(own, (from, self.each.len()));
+    /// Store the vectors built for candidates with these own columns.
+    pub(crate) fn add(&mut self, own: Vec<usize>, made: Vec<LinearizedVector>) {
+        let from = self.vectors.len();
+        self.vectors.extend(made);
+        self.ranges.insert(own, (from, self.vectors.len()));
     }
 
     pub(crate) fn len(&self) -> usize {
-        self.each.len()
+        self.vectors.len()
     }
 
-    /// Bytes of all.
-    pub(crate) fn held(&self) -> u64 {
-        self.of.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
+    /// Memory of all vectors [bytes].
+    pub(crate) fn memory_bytes(&self) -> u64 {
+        self.ranges.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
     }
 
-    /// The one of the candidate with these columns and coefficients; none where it is far beyond the limit, or where
-    /// something leaves the range of floating point.
+    /// Build the vector of the candidate with these columns and coefficients. `None` if its error far exceeds the
+    /// limit, or on overflow.
     pub(crate) fn fit(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
         terms: &[usize],
         c: &[f64],
         limit: f64,
-    ) -> Option<Tangent> {
+    ) -> Option<LinearizedVector> {
         let own: Vec<(usize, f64)> =
-            terms.iter().zip(c).map(|(&p, &c)| (p, c)).filter(|(p, _)| self.driven[*p] == NONE).collect();
+            terms.iter().zip(c).map(|(&p, &c)| (p, c)).filter(|(p, _)| self.input_index[*p] == NO_INDEX).collect();
         let k = own.len();
-        let mut parts: Vec<Part> = Vec::new();
+        let mut parts: Vec<RecordVectors> = Vec::new();
         let mut raw = 0.0;
         for (bank, target) in banks.iter().zip(targets) {
             let (mut divisor, mut driven) = (vec![0.0; target.len()], vec![0.0; target.len()]);
@@ -183,24 +190,29 @@ impl Tangents {
                 sum.iter_mut().zip(values).for_each(|(sum, x)| *sum += c * x);
             }
             let error: Vec<f64> = divide(&driven, &divisor).ok()?.iter().zip(target).map(|(v, y)| y - v).collect();
-            let wanted: Vec<f64> = match self.losses.norm {
+            let wanted: Vec<f64> = match self.rounding_bounds.norm {
                 Norm::L1 => error.iter().map(|e| if *e < 0.0 { -1.0 } else { 1.0 }).collect(),
                 Norm::L2 => error.clone(),
             };
-            raw += match self.losses.norm {
-                Norm::L1 => modulus(&error),
+            raw += match self.rounding_bounds.norm {
+                Norm::L1 => sum_of_moduli(&error),
                 Norm::L2 => error.iter().map(|e| e * e).sum(),
             };
-            // Written so that what is not a number ends here too.
-            if !(raw <= BEYOND * limit && raw < f64::MAX) {
+            // This form of the condition also rejects NaN.
+            if !(raw <= MAX_ERROR_LIMIT_RATIO * limit && raw < f64::MAX) {
                 return None;
             }
-            // Vectors are kept read backwards, where transposed operators are the operators themselves.
+            // In reversed time, transposed operators become the operators themselves.
             let vector = divide(&backwards(&wanted), &divisor).ok()?;
-            parts.push(Part { divisor, vectors: vec![vector], steps: Vec::new(), series: Vec::new() });
+            parts.push(RecordVectors {
+                divisor,
+                vectors: vec![vector],
+                first_order_terms: Vec::new(),
+                series: Vec::new(),
+            });
         }
         let top = largest(parts.iter().flat_map(|part| &part.vectors[0]));
-        if !(f64::MIN_POSITIVE..HUGE).contains(&top) {
+        if !(f64::MIN_POSITIVE..MAX_SAFE_MAGNITUDE).contains(&top) {
             return None;
         }
         parts.iter_mut().flat_map(|part| &mut part.vectors[0]).for_each(|v| *v /= top);
@@ -211,83 +223,99 @@ impl Tangents {
             for &(p, _) in &own {
                 let mut step = vec![0.0; part.divisor.len()];
                 Kernel::new(bank.kernel(p)).times(&vector, &mut step, &mut buffers);
-                part.steps.push(step);
+                part.first_order_terms.push(step);
                 part.series.push(bank.kernel(p).to_vec());
             }
         }
-        // The steps are made orthogonal, for they are nearly the same and coefficients of opposite sign.
+        // Orthogonalize the terms. They are nearly collinear, with coefficients of opposite sign.
         for i in 0..k {
             for j in 0..i {
                 let inner = |a: usize, b: usize| -> f64 {
-                    parts.iter().map(|part| simd::dot(&part.steps[a], &part.steps[b])).sum()
+                    parts.iter().map(|part| simd::dot(&part.first_order_terms[a], &part.first_order_terms[b])).sum()
                 };
                 let square = inner(j, j);
                 let share = if square > 0.0 { inner(i, j) / square } else { 0.0 };
                 mix[i * k + j] = share;
                 for part in &mut parts {
-                    for rows in [&mut part.steps, &mut part.series] {
+                    for rows in [&mut part.first_order_terms, &mut part.series] {
                         let (before, after) = rows.split_at_mut(i);
                         after[0].iter_mut().zip(&before[j]).for_each(|(x, y)| *x -= share * y);
                     }
                 }
             }
         }
-        let mut made = Sized::new(self.losses.norm, k);
+        let mut made = NormAccumulator::new(self.rounding_bounds.norm, k);
         for part in &mut parts {
-            part.correct(&mut made, &mut buffers);
+            part.add_corrections(&mut made, &mut buffers);
         }
         let mut lengths: Vec<f64> = Vec::new();
         for (i, &(p, _)) in own.iter().enumerate() {
             let mixed: f64 = (0..i).map(|j| mix[i * k + j].abs() * lengths[j]).sum();
-            lengths.push(self.losses.lengths[p] + mixed);
+            lengths.push(self.rounding_bounds.kernel_norms[p] + mixed);
         }
         let sizes: Vec<f64> = (1..=k).map(|m| largest(parts.iter().flat_map(|part| &part.vectors[m]))).collect();
         let products = self.products(&parts, banks, targets, &own);
-        let around = self.losses.size + own.iter().map(|&(p, c)| c.abs() * self.losses.lengths[p]).sum::<f64>();
-        let Sized { norm, rests, bends, .. } = made.done();
-        let sound = [&lengths, &sizes, &products, &rests, &bends, &mix].into_iter().flatten().all(|v| v.abs() < HUGE);
+        let around = self.rounding_bounds.max_dual_norm
+            + own.iter().map(|&(p, c)| c.abs() * self.rounding_bounds.kernel_norms[p]).sum::<f64>();
+        let NormAccumulator { norm, solution_residuals: rests, second_order_norms: bends, .. } = made.final_norms();
+        let sound = [&lengths, &sizes, &products, &rests, &bends, &mix]
+            .into_iter()
+            .flatten()
+            .all(|v| v.abs() < MAX_SAFE_MAGNITUDE);
         let centre = own.iter().map(|(_, c)| *c).collect();
-        (sound && norm < HUGE && around < HUGE).then_some(Tangent {
-            centre,
+        (sound && norm < MAX_SAFE_MAGNITUDE && around < MAX_SAFE_MAGNITUDE).then_some(LinearizedVector {
+            center: centre,
             mix,
-            sizes,
-            rests,
-            lengths,
-            bends,
+            peak_values: sizes,
+            solution_residuals: rests,
+            series_norms: lengths,
+            second_order_norms: bends,
             norm,
-            around,
+            center_norm: around,
             products,
         })
     }
 
     /// ⟨t₀, ·⟩ and ⟨v_m, ·⟩.
-    fn products(&self, parts: &[Part], banks: &[Bank], targets: &[Vec<f64>], own: &[(usize, f64)]) -> Vec<f64> {
+    fn products(
+        &self,
+        parts: &[RecordVectors],
+        banks: &[Bank],
+        targets: &[Vec<f64>],
+        own: &[(usize, f64)],
+    ) -> Vec<f64> {
         let row = own.len() + 1 + self.width;
         let mut products = vec![0.0; (own.len() + 1) * row];
         for ((part, bank), target) in parts.iter().zip(banks).zip(targets) {
             let vectors: Vec<Vec<f64>> = part.vectors.iter().map(|v| backwards(v)).collect();
-            let driven = (0..bank.len()).filter(|&p| self.driven[p] != NONE);
+            let driven = (0..bank.len()).filter(|&p| self.input_index[p] != NO_INDEX);
             let columns = std::iter::once(&target[..]).chain(own.iter().map(|&(p, _)| bank.column(p)));
             let columns: Vec<&[f64]> = columns.chain(driven.map(|p| bank.column(p))).collect();
-            simd::widest(Products { vectors: &vectors, columns: &columns, out: &mut products });
+            simd::dispatch_simd(Products { vectors: &vectors, columns: &columns, out: &mut products });
         }
         products
     }
 
     /// Whether some vector proves that a candidate's raw score exceeds the limit.
     #[inline(always)]
-    pub(crate) fn exclude(&self, terms: &[usize], coefficients: &[f64], limit: f64, held: &mut Held) -> bool {
-        let Held { own, next, range, last } = held;
+    pub(crate) fn excludes_candidate(
+        &self,
+        terms: &[usize],
+        coefficients: &[f64],
+        limit: f64,
+        held: &mut VectorLookup,
+    ) -> bool {
+        let VectorLookup { own, next_own: next, range, last_vector: last } = held;
         next.clear();
-        next.extend(terms.iter().copied().filter(|&p| self.driven[p] == NONE));
+        next.extend(terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX));
         if next != own {
             std::mem::swap(next, own);
-            *range = self.of.get(&own[..]).copied().unwrap_or((0, 0));
+            *range = self.ranges.get(&own[..]).copied().unwrap_or((0, 0));
         }
         let count = range.1 - range.0;
         for turn in 0..count {
             let which = (*last + turn) % count;
-            if self.excludes(&self.each[range.0 + which], terms, coefficients, limit) {
+            if self.vector_excludes(&self.vectors[range.0 + which], terms, coefficients, limit) {
                 *last = which;
                 return true;
             }
@@ -295,39 +323,45 @@ impl Tangents {
         false
     }
 
-    /// Whether this one does, of a candidate with its own columns.
+    /// Whether this vector proves it, for a candidate with the same own columns.
     #[inline(always)]
-    pub(crate) fn excludes(&self, made: &Tangent, terms: &[usize], coefficients: &[f64], limit: f64) -> bool {
-        let (losses, k) = (&self.losses, made.centre.len());
-        let limit = losses.limit(limit);
+    pub(crate) fn vector_excludes(
+        &self,
+        made: &LinearizedVector,
+        terms: &[usize],
+        coefficients: &[f64],
+        limit: f64,
+    ) -> bool {
+        let (losses, k) = (&self.rounding_bounds, made.center.len());
+        let limit = losses.norm_threshold(limit);
         let (mut rounding, mut length) = (losses.target_rounding, 0.0);
-        let (mut mine, mut filled) = ([0.0; MOST_OWN], 0);
+        let (mut mine, mut filled) = ([0.0; MAX_OWN_TERMS], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
             rounding += c.abs() * losses.rounding[p];
-            length += c.abs() * losses.lengths[p];
-            if self.driven[p] == NONE {
+            length += c.abs() * losses.kernel_norms[p];
+            if self.input_index[p] == NO_INDEX {
                 mine[filled] = c;
                 filled += 1;
             }
         }
-        // Along the G_m.
-        let mut x = [0.0; MOST_OWN];
+        // Coordinates with respect to the G_m.
+        let mut x = [0.0; MAX_OWN_TERMS];
         for i in 0..k {
-            let off = mine[i] - made.centre[i];
+            let off = mine[i] - made.center[i];
             x[i] += off;
             x.iter_mut().zip(&made.mix[i * k..i * k + i]).for_each(|(x, share)| *x += share * off);
         }
         let (mut size, mut norm, mut steps, mut at) = (1.0, made.norm, 0.0, 0);
         for m in 0..k {
-            size += x[m].abs() * made.sizes[m];
-            norm += x[m].abs() * made.rests[m];
-            steps += x[m].abs() * made.lengths[m];
+            size += x[m].abs() * made.peak_values[m];
+            norm += x[m].abs() * made.solution_residuals[m];
+            steps += x[m].abs() * made.series_norms[m];
             for n in 0..=m {
-                norm += (x[m] * x[n]).abs() * made.bends[at];
+                norm += (x[m] * x[n]).abs() * made.second_order_norms[at];
                 at += 1;
             }
         }
-        norm += losses.unit * size * (made.around + length + steps);
+        norm += losses.unit * size * (made.center_norm + length + steps);
         let (mut seen, row) = (0.0, k + 1 + self.width);
         for m in 0..=k {
             let products = &made.products[m * row..(m + 1) * row];
@@ -336,8 +370,8 @@ impl Tangents {
                 along -= mine[i] * products[1 + i];
             }
             for (&p, &c) in terms.iter().zip(coefficients) {
-                if self.driven[p] != NONE {
-                    along -= c * products[1 + k + self.driven[p]];
+                if self.input_index[p] != NO_INDEX {
+                    along -= c * products[1 + k + self.input_index[p]];
                 }
             }
             seen += if m == 0 { along } else { x[m - 1] * along };
@@ -347,34 +381,34 @@ impl Tangents {
     }
 }
 
-/// What is made on one record, vectors read backwards.
-struct Part {
+/// Intermediate vectors on one record, stored in reversed time.
+struct RecordVectors {
     divisor: Vec<f64>,
     /// t₀, then the v_m.
     vectors: Vec<Vec<f64>>,
     /// G_mᵀt₀.
-    steps: Vec<Vec<f64>>,
+    first_order_terms: Vec<Vec<f64>>,
     /// Series of G_m.
     series: Vec<Vec<f64>>,
 }
 
-impl Part {
-    /// Makes the v_m, and adds up the norms that a candidate's proof asks for.
-    fn correct(&mut self, made: &mut Sized, buffers: &mut Buffers) {
-        let (m, k) = (self.divisor.len(), self.steps.len());
+impl RecordVectors {
+    /// Compute the v_m, and accumulate the norms that the bound needs.
+    fn add_corrections(&mut self, made: &mut NormAccumulator, buffers: &mut Buffers) {
+        let (m, k) = (self.divisor.len(), self.first_order_terms.len());
         let (divisor, inverse) = (Kernel::new(&self.divisor), Kernel::new(&reciprocal(&self.divisor)));
         let series: Vec<Kernel> = self.series.iter().map(|x| Kernel::new(x)).collect();
         let mut out = vec![0.0; m];
         divisor.times(&Kernel::new(&self.vectors[0]), &mut out, buffers);
-        made.norm = made.more(made.norm, &out);
+        made.norm = made.accumulate(made.norm, &out);
         let mut corrections: Vec<Kernel> = Vec::new();
-        for (i, step) in self.steps.iter().enumerate() {
+        for (i, step) in self.first_order_terms.iter().enumerate() {
             let mut vector = vec![0.0; m];
             inverse.times(&Kernel::new(step), &mut vector, buffers);
             let spectrum = Kernel::new(&vector);
             divisor.times(&spectrum, &mut out, buffers);
             out.iter_mut().zip(step).for_each(|(x, y)| *x -= y);
-            made.rests[i] = made.more(made.rests[i], &out);
+            made.solution_residuals[i] = made.accumulate(made.solution_residuals[i], &out);
             corrections.push(spectrum);
             self.vectors.push(vector);
         }
@@ -386,28 +420,28 @@ impl Part {
                     sum.add(1.0, &series[j], &corrections[i]);
                 }
                 sum.take(&mut out, buffers);
-                made.bends[at] = made.more(made.bends[at], &out);
+                made.second_order_norms[at] = made.accumulate(made.second_order_norms[at], &out);
                 at += 1;
             }
         }
     }
 }
 
-/// Norms over all records: the largest modulus, or sums of squares until they are done.
-struct Sized {
+/// Norms over all records: the largest modulus, or sums of squares until the root is taken.
+struct NormAccumulator {
     of: Norm,
     norm: f64,
-    rests: Vec<f64>,
-    bends: Vec<f64>,
+    solution_residuals: Vec<f64>,
+    second_order_norms: Vec<f64>,
 }
 
-impl Sized {
+impl NormAccumulator {
     fn new(of: Norm, k: usize) -> Self {
-        Self { of, norm: 0.0, rests: vec![0.0; k], bends: vec![0.0; k * (k + 1) / 2] }
+        Self { of, norm: 0.0, solution_residuals: vec![0.0; k], second_order_norms: vec![0.0; k * (k + 1) / 2] }
     }
 
-    fn more(&self, so_far: f64, values: &[f64]) -> f64 {
-        // What is not a number must not be lost.
+    fn accumulate(&self, so_far: f64, values: &[f64]) -> f64 {
+        // NaN must propagate.
         match self.of {
             Norm::L1 if values.iter().all(|v| v.is_finite()) => so_far.max(largest(values)),
             Norm::L1 => f64::INFINITY,
@@ -415,16 +449,20 @@ impl Sized {
         }
     }
 
-    fn done(mut self) -> Self {
+    fn final_norms(mut self) -> Self {
         if self.of == Norm::L2 {
-            let all = self.rests.iter_mut().chain(&mut self.bends).chain(std::iter::once(&mut self.norm));
+            let all = self
+                .solution_residuals
+                .iter_mut()
+                .chain(&mut self.second_order_norms)
+                .chain(std::iter::once(&mut self.norm));
             all.for_each(|v| *v = v.sqrt());
         }
         self
     }
 }
 
-/// Inner products of some vectors with columns, added to what is there, as a kernel: vectors by columns.
+/// Kernel that adds inner products of vectors with columns to `out`, vectors by columns.
 struct Products<'a> {
     vectors: &'a [Vec<f64>],
     columns: &'a [&'a [f64]],

@@ -1,24 +1,25 @@
-//! A lower bound of a candidate's output error from a few inner products, without running the candidate.
+//! Dual lower bound of a candidate's output error from a few inner products.
 //!
-//! With D = 1 − Σ c_i F_i over the own-output terms and w = y − Σ c x the equation error, the output error obeys
-//! D e = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
+//! With D = 1 − Σ c_i F_i over the own-output terms and w = y − Σ c x the equation error, the output error obeys D e
+//! = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
 //!
 //!   ‖e‖ ≥ |⟨t, w⟩| / ‖Dᵀt‖ in the dual norm, and ‖Dᵀt‖ ≤ |1 − Σ c_i g_i|·‖t‖ + Σ |c_i|·‖F_iᵀt − g_i t‖
 //!
-//! for any numbers g_i. All inner products and norms are made once; a candidate costs about thirty operations a vector.
+//! for any numbers g_i. All inner products and norms are computed once. A candidate then costs about thirty
+//! operations per test vector.
 
 use crate::equation::{Equation, Structure};
 use crate::error::{check_length, Result};
-use crate::order_search::dual_bound::infeasibility::Reach;
-use crate::order_search::dual_bound::tailored_vectors::{Adapted, Memory};
-use crate::order_search::dual_bound::test_vectors::{Probes, POOL};
+use crate::order_search::dual_bound::infeasibility::InfeasibilityProof;
+use crate::order_search::dual_bound::tailored_vectors::{NormCache, TailoredVectors};
+use crate::order_search::dual_bound::test_vectors::{TestVectors, MAX_TEST_VECTORS};
 use crate::order_search::options::Norm;
 use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::simd::WIDTH;
+use crate::simd::LANE_COUNT;
 
-/// What each test vector of the pool proves of an equation's output error at rest: lower bounds of Σ|y − ŷ| or
-/// Σ(y − ŷ)².
+/// Lower bound of an equation's output error from each fixed test vector, with zero initial conditions. The error is
+/// Σ|y − ŷ| or Σ(y − ŷ)².
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -42,15 +43,15 @@ use crate::simd::WIDTH;
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<Vec<f64>> {
-    let (bound, positions) = pooled(record, &equation.structure, norm)?;
+    let (bound, positions) = build_pool_bound(record, &equation.structure, norm)?;
     check_length("coefficients", positions.len(), equation.coefficients.len())?;
     let mut each = vec![0.0; bound.len()];
-    bound.each(|_| (&positions[..], &equation.coefficients[..], &[][..], &[][..]), &mut each);
+    bound.bound_per_vector(|_| (&positions[..], &equation.coefficients[..], &[][..], &[][..]), &mut each);
     Ok(each)
 }
 
-/// Whether the pool of test vectors proves that no coefficients of this structure, but for the fixed ones, give an output
-/// error at rest of at most `limit`: Σ|y − ŷ| or Σ(y − ŷ)². The proof is sought from `start`.
+/// Whether no coefficients of this structure give an output error of at most `limit`. The error is Σ|y − ŷ| or Σ(y −
+/// ŷ)² with zero initial conditions. Fixed coefficients keep their values. The proof starts at `start`.
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -64,12 +65,12 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// // y is the integral of order 0.8 of u: free coefficients reach it, a known one twice as large does not.
-/// assert!(!out_of_reach(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
-/// assert!(out_of_reach(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
+/// // y is the integral of order 0.8 of u: free coefficients fit it, a fixed one twice as large does not.
+/// assert!(!is_infeasible(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
+/// assert!(is_infeasible(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn out_of_reach(
+pub fn is_infeasible(
     record: &Record,
     structure: &Structure,
     fixed: &[Option<f64>],
@@ -77,21 +78,21 @@ pub fn out_of_reach(
     norm: Norm,
     limit: f64,
 ) -> Result<bool> {
-    let (bound, positions) = pooled(record, structure, norm)?;
+    let (bound, positions) = build_pool_bound(record, structure, norm)?;
     check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
     check_length("coefficients", structure.terms.len(), start.len())?;
-    Ok(bound.excludes(limit, &positions, fixed, &[], start, &mut Reach::default()))
+    Ok(bound.proves_infeasible(limit, &positions, fixed, &[], start, &mut InfeasibilityProof::default()))
 }
 
-/// Whether the test vector made for one equation proves that another's output error at rest exceeds `limit`: Σ|y − ŷ| or
-/// Σ(y − ŷ)².
+/// Whether the test vector tailored to one equation proves that another equation's output error exceeds `limit`. The
+/// error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions.
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients that are not one a term.
+/// Orders or signals that do not form an equation, or a number of coefficients unlike the number of terms.
 ///
 /// ```
 /// # use ftlm::equation::{Equation, Structure, Term};
-/// # use ftlm::order_search::dual_bound::excluded_by;
+/// # use ftlm::order_search::{bound::lower_bounds, options::Norm};
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
@@ -109,8 +110,8 @@ pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, no
     Ok(excluded_in_turn(record, made_for, std::slice::from_ref(equation), norm, limit)? == [true])
 }
 
-/// [`excluded_by`] of several equations of the same output, one after the other as a search asks them: what the
-/// vector came to for one is remembered for the next.
+/// Apply [`excluded_by`] to several equations of the same output in sequence, as a search does. Norms of the vector are
+/// cached from one equation to the next.
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -132,15 +133,15 @@ pub fn excluded_in_turn(
     }
     let bank = Bank::new(&index, record, made_for.structure.output)?;
     let (banks, targets) = ([bank], [record.signal(made_for.structure.output).to_vec()]);
-    let mut adapted = Adapted::new(&banks, &targets, norm);
-    adapted.each.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
-    let mut memory = Memory::of_neighbours();
+    let mut adapted = TailoredVectors::new(&banks, &targets, norm);
+    adapted.vectors.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
+    let mut memory = NormCache::for_adjacent_candidates();
     let asked = positions[1..].iter().zip(equations);
-    Ok(asked.map(|(terms, asked)| adapted.exclude(terms, &asked.coefficients, limit, &mut memory)).collect())
+    Ok(asked.map(|(terms, asked)| adapted.excludes_candidate(terms, &asked.coefficients, limit, &mut memory)).collect())
 }
 
-/// The whole pool on one record, and the columns of a structure's terms.
-fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
+/// Return the bound with all fixed test vectors on one record, and the columns of a structure's terms.
+fn build_pool_bound(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
     structure.check(record.len(), |_| true)?;
     let mut index = Index::default();
     let positions: Vec<usize> = (0..structure.terms.len())
@@ -148,23 +149,23 @@ fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, 
         .collect();
     let bank = Bank::new(&index, record, structure.output)?;
     let target = record.signal(structure.output).to_vec();
-    Ok((Bound::new((&[bank], &[target]), norm, true, POOL, &Stop::default()), positions))
+    Ok((Bound::new((&[bank], &[target]), norm, true, MAX_TEST_VECTORS, &Stop::default()), positions))
 }
 
-/// The test vectors of a search, on every record.
+/// Dual bound from the fixed test vectors of a search, on every record.
 pub(crate) struct Bound {
     norm: Norm,
-    probes: Vec<Probes>,
+    test_vectors: Vec<TestVectors>,
 }
 
 impl Bound {
-    /// Most test vectors.
-    pub(crate) const POOL: usize = POOL;
+    /// Maximum number of test vectors.
+    pub(crate) const MAX_TEST_VECTORS: usize = MAX_TEST_VECTORS;
 
-    /// Makes `count` test vectors (a multiple of [`WIDTH`], at most [`POOL`]) for these records.
+    /// Build `count` test vectors for these records, a multiple of [`WIDTH`] and at most [`MAX_TEST_VECTORS`].
     ///
-    /// `output_error` tells whether own-output columns act on the divisor; in the equation error D = 1. Runs on the
-    /// current thread pool; what it comes to once it was told to stop is of no use.
+    /// `output_error` selects whether own-output columns enter the divisor. For the equation error D = 1. Runs on the
+    /// current thread pool. The result is unusable after a stop request.
     pub(crate) fn new(
         (banks, targets): (&[Bank], &[Vec<f64>]),
         norm: Norm,
@@ -172,29 +173,29 @@ impl Bound {
         count: usize,
         stop: &Stop,
     ) -> Self {
-        let probes =
-            banks.iter().zip(targets).map(|(b, y)| Probes::new(b, y, norm, (output_error, count), stop)).collect();
-        Self { norm, probes }
+        let test_vectors =
+            banks.iter().zip(targets).map(|(b, y)| TestVectors::new(b, y, norm, (output_error, count), stop)).collect();
+        Self { norm, test_vectors }
     }
 
-    /// The test vectors on every record.
-    pub(crate) fn probes(&self) -> &[Probes] {
-        &self.probes
+    /// Test vectors on every record.
+    pub(crate) fn test_vectors(&self) -> &[TestVectors] {
+        &self.test_vectors
     }
 
     /// Number of test vectors.
     pub(crate) fn len(&self) -> usize {
-        self.probes.first().map_or(0, |p| p.groups * WIDTH)
+        self.test_vectors.first().map_or(0, |p| p.groups * LANE_COUNT)
     }
 
-    /// Only these test vectors (a multiple of [`WIDTH`] of them), in this order.
-    pub(crate) fn chosen(&self, which: &[usize]) -> Self {
-        Self { norm: self.norm, probes: self.probes.iter().map(|p| p.chosen(which)).collect() }
+    /// Return the bound with these test vectors only, in this order. Their number is a multiple of [`WIDTH`].
+    pub(crate) fn select_vectors(&self, which: &[usize]) -> Self {
+        Self { norm: self.norm, test_vectors: self.test_vectors.iter().map(|p| p.select_vectors(which)).collect() }
     }
 
-    /// Lower bound of the raw score (Σ|e| or Σe²) of a candidate, and a guess at it by which to order visits.
+    /// Lower bound of a candidate's raw score (Σ|e| or Σe²), and an estimate of it that orders the evaluation.
     ///
-    /// `columns(r)` gives positions and coefficients on record r. Ends as soon as the bound exceeds the limit.
+    /// `columns(r)` returns positions and coefficients on record r. The sum stops once the bound exceeds the limit.
     #[inline(always)]
     pub(crate) fn evaluate<'a>(
         &self,
@@ -202,13 +203,13 @@ impl Bound {
         columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
     ) -> (f64, f64) {
         let (mut bound, mut guess) = (0.0, 0.0);
-        for (r, probes) in self.probes.iter().enumerate() {
+        for (r, probes) in self.test_vectors.iter().enumerate() {
             let (terms, coefficients, initial, weights) = columns(r);
-            let rounding = probes.allowance(terms, coefficients, initial, weights);
+            let rounding = probes.rounding_bound(terms, coefficients, initial, weights);
             let (mut largest, mut farthest) = (0.0, 0.0);
             for group in 0..probes.groups {
-                let (bounds, guesses) = probes.group(group, terms, coefficients, initial, weights, rounding);
-                for n in 0..WIDTH {
+                let (bounds, guesses) = probes.group_bounds(group, terms, coefficients, initial, weights, rounding);
+                for n in 0..LANE_COUNT {
                     // Neither NaN nor an overflow proves anything.
                     if bounds[n] > largest && bounds[n] < f64::MAX {
                         largest = bounds[n];
@@ -227,40 +228,40 @@ impl Bound {
         (bound, guess)
     }
 
-    /// Whether no coefficients whatever of these columns give a raw score of at most `limit`.
+    /// Whether no coefficients of these columns give a raw score of at most `limit`.
     ///
-    /// `fixed` are known coefficients of terms; all others, and those of the initial terms, are free. `start` says where
-    /// to begin: coefficients of the terms, then of the initial terms by record.
+    /// The slice `fixed` holds the fixed coefficients of the terms. All others, and those of the initial terms, are
+    /// free. `start` is the initial guess: coefficients of the terms, then of the initial terms by record.
     #[inline(always)]
-    pub(crate) fn excludes(
+    pub(crate) fn proves_infeasible(
         &self,
         limit: f64,
         terms: &[usize],
         fixed: &[Option<f64>],
         initial: &[usize],
         start: &[f64],
-        scratch: &mut Reach,
+        scratch: &mut InfeasibilityProof,
     ) -> bool {
         let largest = match self.norm {
             Norm::L1 => limit,
             Norm::L2 => limit.sqrt(),
         };
-        scratch.lay_out(&self.probes, largest, terms, fixed, initial, start);
-        scratch.search()
+        scratch.set_conditions(&self.test_vectors, largest, terms, fixed, initial, start);
+        scratch.find_multipliers()
     }
 
-    /// The bound of each test vector alone, summed over records.
-    pub(crate) fn each<'a>(
+    /// Bound of each test vector separately, summed over records.
+    pub(crate) fn bound_per_vector<'a>(
         &self,
         columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
         out: &mut [f64],
     ) {
         out.fill(0.0);
-        for (r, probes) in self.probes.iter().enumerate() {
+        for (r, probes) in self.test_vectors.iter().enumerate() {
             let (terms, coefficients, initial, weights) = columns(r);
-            let rounding = probes.allowance(terms, coefficients, initial, weights);
-            for (group, out) in out.chunks_exact_mut(WIDTH).enumerate().take(probes.groups) {
-                let (bounds, _) = probes.group(group, terms, coefficients, initial, weights, rounding);
+            let rounding = probes.rounding_bound(terms, coefficients, initial, weights);
+            for (group, out) in out.chunks_exact_mut(LANE_COUNT).enumerate().take(probes.groups) {
+                let (bounds, _) = probes.group_bounds(group, terms, coefficients, initial, weights, rounding);
                 for (sum, bound) in out.iter_mut().zip(bounds) {
                     if bound > 0.0 && bound < f64::MAX {
                         *sum += self.raw(bound);

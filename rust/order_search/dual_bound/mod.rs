@@ -1,4 +1,4 @@
-//! What is proved of a candidate's output error from a few inner products with test vectors, without running it.
+//! Lower bounds of a candidate's output error from few inner products with test vectors, without simulation.
 
 pub(crate) mod infeasibility;
 pub(crate) mod linearized_vectors;
@@ -7,6 +7,6 @@ pub(crate) mod tailored_vectors;
 pub(crate) mod test_vectors;
 pub(crate) mod unstable_zeros;
 
-pub use linearized_vectors::excluded_along;
-pub use lower_bound::{excluded_by, excluded_in_turn, lower_bounds, out_of_reach};
-pub use unstable_zeros::explodes;
+pub use linearized_vectors::excluded_by_linearized_vector;
+pub use lower_bound::{excluded_by, excluded_in_turn, is_infeasible, lower_bounds};
+pub use unstable_zeros::has_unstable_zeros;

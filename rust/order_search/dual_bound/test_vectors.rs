@@ -1,8 +1,6 @@
-//! Test vectors, and what integrals of the output make of them.
+//! Set of fixed test vectors, and their inner products with the regressors.
 //!
-//! They are complex exponentials under windows that end gently: there F_iᵀt is nearly a multiple of t.
-//!
-//! The test vectors on one record: what each says of a candidate's error there.
+//! The vectors are complex exponentials under windows that end smoothly, for which F_iᵀt is nearly a multiple of t.
 
 use rayon::prelude::*;
 
@@ -11,24 +9,24 @@ use crate::order_search::options::Norm;
 use crate::parallel::{self, Stop};
 use crate::regressors::Bank;
 use crate::series::{Buffers, Kernel};
-use crate::simd::WIDTH;
+use crate::simd::LANE_COUNT;
 
 /// One value for each of [`WIDTH`] test vectors.
-pub(super) type Wide = [f64; WIDTH];
+pub(super) type Wide = [f64; LANE_COUNT];
 
-/// Lowest frequency of a test vector, in cycles a record.
-const LOWEST: f64 = 0.3;
+/// Lowest frequency of a test vector [cycles per record].
+const MIN_CYCLES_PER_RECORD: f64 = 0.3;
 
-/// Spectra of test vectors, and of columns, held at a time, in bytes.
-const SPECTRA: usize = 64 << 20;
-const COLUMNS: usize = 192 << 20;
+/// Memory of the spectra of test vectors, and of columns, per batch [bytes].
+const VECTOR_SPECTRA_BYTES: usize = 64 << 20;
+const COLUMN_SPECTRA_BYTES: usize = 192 << 20;
 
-/// How a test vector fades; it must not stop dead, which its integrals would all feel.
+/// Window of a test vector. An abrupt end would disturb all its integrals.
 #[derive(Debug, Clone, Copy)]
 enum Window {
-    /// One up to this share of the record, then half a cosine down to zero.
+    /// 1 up to this fraction of the record, then half a cosine down to 0.
     Taper(f64),
-    /// Down to e to the minus this.
+    /// Exponential decay to e^{−rate} at the end of the record.
     Decay(f64),
 }
 
@@ -42,37 +40,38 @@ impl Window {
     }
 }
 
-/// Windows and how many frequencies each gets; measured on Plant A's lattice at three levels of noise, where the late
-/// taper removes most and the decays see the candidates whose error is early.
-const WINDOWS: [(Window, usize); 3] = [(Window::Taper(0.5), 24), (Window::Taper(0.0), 12), (Window::Decay(5.0), 12)];
+/// Windows and their number of frequencies. They were tuned on the grid of Plant A at three noise levels: the late
+/// taper excludes most candidates, the decays exclude those with an early error.
+const WINDOW_FREQUENCY_COUNTS: [(Window, usize); 3] =
+    [(Window::Taper(0.5), 24), (Window::Taper(0.0), 12), (Window::Decay(5.0), 12)];
 
-/// Number of test vectors to choose from.
-pub(super) const POOL: usize = 48;
+/// Number of test vectors to select from.
+pub(super) const MAX_TEST_VECTORS: usize = 48;
 
-/// A window and how often the vector turns in a record.
+/// Window and number of cycles per record.
 type Shape = (Window, f64);
 
-/// The first `count` test vectors; every window's frequencies span the whole range.
+/// Shapes of the first `count` test vectors. The frequencies of every window span the whole range.
 #[allow(clippy::cast_precision_loss)]
-fn shapes(count: usize, m: usize) -> Vec<Shape> {
+fn vector_shapes(count: usize, m: usize) -> Vec<Shape> {
     let highest = (m as f64 / 32.0).max(4.0);
-    // Where fewer are asked for, every window gives its share.
-    WINDOWS
+    // For a smaller count, every window contributes proportionally.
+    WINDOW_FREQUENCY_COUNTS
         .iter()
         .flat_map(|&(window, full)| {
-            let n = (full * count).div_ceil(POOL);
+            let n = (full * count).div_ceil(MAX_TEST_VECTORS);
             (0..n).map(move |i| {
                 let share = if n > 1 { i as f64 / (n - 1) as f64 } else { 0.5 };
-                (window, LOWEST * libm::pow(highest / LOWEST, share))
+                (window, MIN_CYCLES_PER_RECORD * libm::pow(highest / MIN_CYCLES_PER_RECORD, share))
             })
         })
         .take(count)
         .collect()
 }
 
-/// Writes a test vector's real and imaginary parts.
+/// Write a test vector's real and imaginary parts.
 #[allow(clippy::cast_precision_loss)]
-fn draw((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
+fn write_vector((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
     let m = halves[0].len();
     let [re, im] = halves;
     for (k, (re, im)) in re.iter_mut().zip(im).enumerate() {
@@ -83,68 +82,69 @@ fn draw((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
     }
 }
 
-/// The first `count` test vectors, real and imaginary parts. What it comes to once it was told to stop is of no use.
-pub(super) fn vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64>; 2]> {
-    shapes(count, m)
+/// The first `count` test vectors, real and imaginary parts. The result is unusable after a stop request.
+pub(super) fn build_vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64>; 2]> {
+    vector_shapes(count, m)
         .par_iter()
         .map(|&shape| {
             let mut halves = [0, 1].map(|_| vec![0.0; m]);
             if !stop.is_set() {
-                draw(shape, &mut halves);
+                write_vector(shape, &mut halves);
             }
             halves
         })
         .collect()
 }
 
-/// A test vector that is held against one own column after another.
+/// Workspace of one test vector that is applied to own columns in sequence.
 struct Vector {
     halves: [Vec<f64>; 2],
-    /// Its number among all.
-    which: usize,
+    /// Index among all test vectors.
+    number: usize,
     size: f64,
-    /// Spectra of its halves read backwards: Fᵀt is F applied to t read backwards, read backwards.
+    /// Spectra of the time-reversed halves. Fᵀt is the time reversal of F applied to the time-reversed t.
     spectra: [Kernel; 2],
-    /// Fᵀt of the last column and of the one before it, backwards.
+    /// Fᵀt of the current column and of the previous one, in reversed time.
     here: [Vec<f64>; 2],
     before: [Vec<f64>; 2],
-    /// g and what rounding may do, of the last column.
+    /// g and rounding-error bound of the current column.
     last: Option<[f64; 3]>,
 }
 
 impl Vector {
-    /// None yet: memory for one of so many samples.
-    fn none(m: usize) -> Self {
+    /// Return a workspace for this many samples.
+    fn with_samples(m: usize) -> Self {
         let none = || [0, 1].map(|_| vec![0.0; m]);
         let spectra = [0, 1].map(|_| Kernel::noughts(m));
-        Self { halves: none(), which: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
+        Self { halves: none(), number: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
     }
 
-    /// Turns to the test vector in its halves.
-    fn turn(&mut self, which: usize, size: f64, buffers: &mut Buffers) {
+    /// Load the test vector stored in the halves.
+    fn load_spectra(&mut self, which: usize, size: f64, buffers: &mut Buffers) {
         for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
             spectrum.read(half.iter().rev().copied(), buffers);
         }
-        (self.which, self.size, self.last) = (which, size, None);
+        (self.number, self.size, self.last) = (which, size, None);
     }
 
-    /// Of the next own column, whose moduli add up to `length`, what [`effects`] gives, but the step in place of the way.
-    fn on(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
+    /// Return the entries of [`divisor_effects`] for the next own column, with the step in place of the path length.
+    /// `length` is the sum of the column's moduli.
+    fn apply_column(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
         std::mem::swap(&mut self.here, &mut self.before);
         for (spectrum, here) in self.spectra.iter().zip(&mut self.here) {
             column.times(spectrum, here, buffers);
         }
         let before = self.last.map(|last| (&self.before, last));
-        let [g, h, rest, lost, step] = effect(&self.halves, &self.here, before, norm, unit * length);
+        let [g, h, rest, lost, step] = column_effect(&self.halves, &self.here, before, norm, unit * length);
         self.last = Some([g, h, lost]);
         let beyond = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
         [g * self.size, h * self.size, rest + beyond, step]
     }
 }
 
-/// g·‖t‖, ‖Fᵀt − g t‖, and how far this last vector has come since the first own column, of every own column and test
-/// vector, columns first. What it comes to once it was told to stop is of no use.
-pub(super) fn effects(
+/// g·‖t‖, ‖Fᵀt − g t‖ and path length of Fᵀt − g t since the first own column. One entry for every own column and test
+/// vector, columns first. The result is unusable after a stop request.
+pub(super) fn divisor_effects(
     bank: &Bank,
     own: &[usize],
     vectors: Vec<[Vec<f64>; 2]>,
@@ -153,13 +153,14 @@ pub(super) fn effects(
     stop: &Stop,
 ) -> Vec<[Wide; 4]> {
     let (m, count) = (vectors.first().map_or(0, |v| v[0].len()), vectors.len());
-    let groups = count / WIDTH;
-    let mut out = vec![[[0.0; WIDTH]; 4]; own.len() * groups];
-    // Every thread has a vector of its own; two spectra of as many bins as there are samples.
+    let groups = count / LANE_COUNT;
+    let mut out = vec![[[0.0; LANE_COUNT]; 4]; own.len() * groups];
+    // Each thread needs its own vector, with two spectra of as many bins as samples.
     let threads = rayon::current_num_threads();
-    let batch = (SPECTRA / (32 * m.max(1))).max(threads).min(count.max(1));
-    // As many blocks of columns as must be, of one size as nearly as can be.
-    let block = own.len().div_ceil(own.len().div_ceil((COLUMNS / (16 * m.max(1))).max(threads)).max(1)).max(1);
+    let batch = (VECTOR_SPECTRA_BYTES / (32 * m.max(1))).max(threads).min(count.max(1));
+    // As few blocks of columns as possible, of nearly equal size.
+    let block =
+        own.len().div_ceil(own.len().div_ceil((COLUMN_SPECTRA_BYTES / (16 * m.max(1))).max(threads)).max(1)).max(1);
     let kernels = |columns: &[usize]| -> Vec<(Kernel, f64)> {
         let kernel = |buffers: &mut Buffers, &column: &usize| {
             let length = bank.kernel(column).iter().map(|v| v.abs()).sum();
@@ -167,10 +168,10 @@ pub(super) fn effects(
         };
         columns.par_iter().with_max_len(1).map_init(Buffers::default, kernel).collect()
     };
-    // Of a long record the vectors take more than all else here: drawn again a few at a time they take nothing.
+    // For a long record the vectors need most of the memory, so they are recomputed batch by batch.
     let mut all = Some(vectors).filter(|_| batch == count);
-    let shapes = shapes(count, m);
-    let mut held: Vec<Vector> = (0..batch).map(|_| Vector::none(m)).collect();
+    let shapes = vector_shapes(count, m);
+    let mut held: Vec<Vector> = (0..batch).map(|_| Vector::with_samples(m)).collect();
     let mut spectra = Vec::new();
     for start in (0..count).step_by(batch) {
         held.truncate(count - start);
@@ -181,9 +182,9 @@ pub(super) fn effects(
             }
             match &drawn {
                 Some(all) => vector.halves.clone_from(&all[i]),
-                None => draw(shapes[start + i], &mut vector.halves),
+                None => write_vector(shapes[start + i], &mut vector.halves),
             }
-            vector.turn(start + i, sizes[start + i], buffers);
+            vector.load_spectra(start + i, sizes[start + i], buffers);
         });
         for (first, columns) in own.chunks(block).enumerate().map(|(i, columns)| (i * block, columns)) {
             if stop.is_set() {
@@ -198,21 +199,22 @@ pub(super) fn effects(
                 .with_max_len(1)
                 .map_init(Buffers::default, |buffers, vector| {
                     let columns = spectra.iter().take_while(|_| !stop.is_set());
-                    let rows = columns.map(|(column, length)| vector.on(column, *length, norm, unit, buffers));
+                    let rows =
+                        columns.map(|(column, length)| vector.apply_column(column, *length, norm, unit, buffers));
                     let rows = rows.collect();
-                    (vector.which, rows)
+                    (vector.number, rows)
                 })
                 .collect();
             for (which, rows) in found {
                 for (row, values) in (first..).zip(rows) {
                     for (half, value) in values.into_iter().enumerate() {
-                        out[row * groups + which / WIDTH][half][which % WIDTH] = value;
+                        out[row * groups + which / LANE_COUNT][half][which % LANE_COUNT] = value;
                     }
                 }
             }
         }
     }
-    // Steps add up to ways.
+    // Accumulate the steps to path lengths.
     for place in groups..out.len() {
         let before = out[place - groups][3];
         out[place][3].iter_mut().zip(before).for_each(|(way, before)| *way += before);
@@ -220,10 +222,10 @@ pub(super) fn effects(
     out
 }
 
-/// g, ‖u − g t‖, what rounding may do to that vector, and its distance from the one before; of u given backwards, and of
-/// the u before it with its g and what rounding may do. g is the projection of u on t, best for the norm of squares.
+/// g, ‖u − g t‖, rounding-error bound and distance from the previous vector. u is given in reversed time, as is the
+/// previous u with its g and bound. g is the projection of u on t, which is optimal for the L2 norm.
 #[allow(clippy::cast_precision_loss)]
-fn effect(
+fn column_effect(
     [a, b]: &[Vec<f64>; 2],
     [re, im]: &[Vec<f64>; 2],
     before: Option<(&[Vec<f64>; 2], [f64; 3])>,
@@ -244,7 +246,7 @@ fn effect(
         p * p + q * q
     };
     let count = (a.len() as f64).sqrt();
-    // Both in one reading: a long record is not in any cache.
+    // One pass for both, since a long record does not fit into any cache.
     let add = |sum: f64, x: f64| match norm {
         Norm::L1 => sum.max(x),
         Norm::L2 => sum + x,
@@ -267,35 +269,35 @@ fn effect(
     [g, h, f64::sqrt(rest) + lost, lost, step]
 }
 
-/// A column without an effect on the divisor.
-pub(crate) const NONE: usize = usize::MAX;
+/// Index of a column that does not enter the divisor.
+pub(crate) const NO_INDEX: usize = usize::MAX;
 
-/// The test vectors on one record: what they make of each column.
-pub(crate) struct Probes {
+/// Set of fixed test vectors on one record: products with every column and norms.
+pub(crate) struct TestVectors {
     /// Number of [`Wide`] groups of test vectors.
     pub(crate) groups: usize,
     /// ⟨t, x⟩ of column p and group g at p·groups + g, real and imaginary part.
     pub(crate) products: Vec<[Wide; 2]>,
     /// ⟨t, y⟩.
     pub(crate) target: Vec<[Wide; 2]>,
-    /// Row of `effects` of a column, [`NONE`] where it is not of the output itself.
+    /// Row of a column in `effects`, [`NO_INDEX`] if it is not an own column.
     pub(crate) rows: Vec<usize>,
-    /// g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and the way that Fᵀt − g t has come since the first row: no two rows are
-    /// farther apart than the way between them.
+    /// g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and the path length of Fᵀt − g t since the first row. The distance of two
+    /// rows is at most the path length between them.
     pub(crate) effects: Vec<[Wide; 4]>,
     /// ‖t‖ in the dual norm.
     pub(crate) size: Vec<Wide>,
-    /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target.
+    /// Rounding-error bound of |⟨t, w⟩| per unit of a column's coefficient, and for the target.
     pub(crate) rounding: Vec<f64>,
     pub(crate) target_rounding: f64,
-    /// What rounding may add to a sum of m terms, per unit.
+    /// Relative rounding-error bound of a sum of m terms.
     pub(crate) unit: f64,
 }
 
-/// Most own columns that are looked at together.
-const TOGETHER: usize = 4;
+/// Maximum own columns whose slack is bounded jointly.
+const MAX_JOINT_OWN_COLUMNS: usize = 4;
 
-impl Probes {
+impl TestVectors {
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(
         bank: &Bank,
@@ -305,8 +307,8 @@ impl Probes {
         stop: &Stop,
     ) -> Self {
         let m = target.len();
-        let groups = count / WIDTH;
-        let vectors = vectors(count, m, stop);
+        let groups = count / LANE_COUNT;
+        let vectors = build_vectors(count, m, stop);
         let dual = |parts: &[&[f64]; 2]| -> f64 {
             let squares = parts[0].iter().zip(parts[1]).map(|(a, b)| a * a + b * b);
             match norm {
@@ -323,27 +325,28 @@ impl Probes {
         let gathered = |p: usize| -> Vec<[Wide; 2]> {
             (0..groups)
                 .map(|g| {
-                    let part = |half: usize| std::array::from_fn(|n| inner[p * halves + 2 * (g * WIDTH + n) + half]);
+                    let part =
+                        |half: usize| std::array::from_fn(|n| inner[p * halves + 2 * (g * LANE_COUNT + n) + half]);
                     [part(0), part(1)]
                 })
                 .collect()
         };
         let products: Vec<[Wide; 2]> = (0..bank.len()).flat_map(gathered).collect();
 
-        // A generous multiple of what m additions may lose; it covers columns, inner products and the march as well.
+        // Generous multiple of the error of m additions, which also covers columns, inner products and simulation.
         let unit = 16.0 * f64::EPSILON * m as f64;
         let sum = |x: &[f64]| x.iter().map(|v| v.abs()).sum::<f64>();
         let size_of_target = sum(target);
         let own: Vec<usize> = (0..bank.len()).filter(|&p| output_error && !bank.kernel(p).is_empty()).collect();
-        let mut rows = vec![NONE; bank.len()];
+        let mut rows = vec![NO_INDEX; bank.len()];
         own.iter().enumerate().for_each(|(row, &p)| rows[p] = row);
         let rounding = parallel::map(
             (0..bank.len()).collect(),
             || (),
             |(), p| unit * (sum(bank.column(p)) + sum(bank.kernel(p)) * size_of_target),
         );
-        let effects = effects(bank, &own, vectors, &sizes, (norm, unit), stop);
-        let size = (0..groups).map(|g| std::array::from_fn(|n| sizes[g * WIDTH + n])).collect();
+        let effects = divisor_effects(bank, &own, vectors, &sizes, (norm, unit), stop);
+        let size = (0..groups).map(|g| std::array::from_fn(|n| sizes[g * LANE_COUNT + n])).collect();
         Self {
             groups,
             products,
@@ -357,10 +360,12 @@ impl Probes {
         }
     }
 
-    pub(super) fn chosen(&self, which: &[usize]) -> Self {
-        let groups = which.len() / WIDTH;
+    pub(super) fn select_vectors(&self, which: &[usize]) -> Self {
+        let groups = which.len() / LANE_COUNT;
         let pick = |source: &[Wide], g: usize| -> Wide {
-            std::array::from_fn(|n| source[which[g * WIDTH + n] / WIDTH][which[g * WIDTH + n] % WIDTH])
+            std::array::from_fn(|n| {
+                source[which[g * LANE_COUNT + n] / LANE_COUNT][which[g * LANE_COUNT + n] % LANE_COUNT]
+            })
         };
         let part =
             |rows: &[[Wide; 2]], half: usize, g: usize| pick(&rows.iter().map(|r| r[half]).collect::<Vec<_>>(), g);
@@ -383,14 +388,20 @@ impl Probes {
     }
 
     #[inline(always)]
-    pub(super) fn allowance(&self, terms: &[usize], coefficients: &[f64], initial: &[usize], weights: &[f64]) -> f64 {
+    pub(super) fn rounding_bound(
+        &self,
+        terms: &[usize],
+        coefficients: &[f64],
+        initial: &[usize],
+        weights: &[f64],
+    ) -> f64 {
         let pairs = terms.iter().zip(coefficients).chain(initial.iter().zip(weights));
         pairs.fold(self.target_rounding, |sum, (&p, c)| sum + c.abs() * self.rounding[p])
     }
 
-    /// Bounds and guesses of one group of test vectors.
+    /// Bounds and score estimates of one group of test vectors.
     #[inline(always)]
-    pub(super) fn group(
+    pub(super) fn group_bounds(
         &self,
         group: usize,
         terms: &[usize],
@@ -401,23 +412,23 @@ impl Probes {
     ) -> (Wide, Wide) {
         let [mut re, mut im] = self.target[group];
         let mut divisor = self.size[group];
-        let (mut divisor_im, mut slack) = ([0.0; WIDTH], [0.0; WIDTH]);
-        let (mut own, mut count) = ([(0, 0.0); TOGETHER], 0);
+        let (mut divisor_im, mut slack) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
+        let (mut own, mut count) = ([(0, 0.0); MAX_JOINT_OWN_COLUMNS], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
             let [a, b] = &self.products[p * self.groups + group];
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 re[n] -= c * a[n];
                 im[n] -= c * b[n];
             }
             let row = self.rows[p];
-            if row != NONE {
+            if row != NO_INDEX {
                 let [a, b, rest, _] = &self.effects[row * self.groups + group];
-                for n in 0..WIDTH {
+                for n in 0..LANE_COUNT {
                     divisor[n] -= c * a[n];
                     divisor_im[n] -= c * b[n];
                     slack[n] += c.abs() * rest[n];
                 }
-                if count < TOGETHER {
+                if count < MAX_JOINT_OWN_COLUMNS {
                     own[count] = (row, c);
                 }
                 count += 1;
@@ -425,32 +436,32 @@ impl Probes {
         }
         for (&p, &c) in initial.iter().zip(weights) {
             let [a, b] = &self.products[p * self.groups + group];
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 re[n] -= c * a[n];
                 im[n] -= c * b[n];
             }
         }
-        if (2..=TOGETHER).contains(&count) {
-            let together = self.together(group, &mut own[..count]);
-            for n in 0..WIDTH {
+        if (2..=MAX_JOINT_OWN_COLUMNS).contains(&count) {
+            let together = self.joint_slack(group, &mut own[..count]);
+            for n in 0..LANE_COUNT {
                 slack[n] = if together[n] < slack[n] { together[n] } else { slack[n] };
             }
         }
-        let (mut bounds, mut guesses) = ([0.0; WIDTH], [0.0; WIDTH]);
-        for n in 0..WIDTH {
+        let (mut bounds, mut guesses) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
+        for n in 0..LANE_COUNT {
             let seen = (re[n] * re[n] + im[n] * im[n]).sqrt() - rounding;
             let size = (divisor[n] * divisor[n] + divisor_im[n] * divisor_im[n]).sqrt();
-            // A hair more, for the rounding of the divisor and of the score itself.
+            // Margin for the rounding of the divisor and of the score.
             bounds[n] = seen / ((size + slack[n]) * (1.0 + self.unit));
             guesses[n] = seen / size;
         }
         (bounds, guesses)
     }
 
-    /// At most ‖Σ c (Fᵀt − g t)‖ of own columns by row, whose coefficients may cancel: all of them times what the first
-    /// row has, and all but the first so many times the way to the next.
+    /// Upper bound of ‖Σ c (Fᵀt − g t)‖ for own columns whose coefficients may cancel. The sum of all coefficients
+    /// multiplies the first row. Each partial sum multiplies the path length to the next row.
     #[inline(always)]
-    fn together(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {
+    fn joint_slack(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {
         for i in 1..own.len() {
             let mut at = i;
             while at > 0 && own[at - 1].0 > own[at].0 {
@@ -465,15 +476,15 @@ impl Probes {
         }
         let [.., first, mut before] = self.effects[own[0].0 * self.groups + group];
         let [.., last] = &self.effects[own[own.len() - 1].0 * self.groups + group];
-        let mut most = [0.0; WIDTH];
-        for n in 0..WIDTH {
-            // What is left of sums loses as much as they are.
+        let mut most = [0.0; LANE_COUNT];
+        for n in 0..LANE_COUNT {
+            // Partial sums lose accuracy in proportion to the sum of the moduli.
             most[n] = left.abs() * first[n] + 16.0 * f64::EPSILON * all * (first[n] + last[n]);
         }
         for at in 1..own.len() {
             left -= own[at - 1].1;
             let [.., way] = self.effects[own[at].0 * self.groups + group];
-            for n in 0..WIDTH {
+            for n in 0..LANE_COUNT {
                 most[n] += left.abs() * (way[n] - before[n]);
             }
             before = way;
@@ -491,20 +502,22 @@ mod tests {
     #[allow(clippy::cast_precision_loss)]
     fn a_few_at_a_time_are_what_each_is_alone() -> crate::error::Result<()> {
         // Long enough for three batches of sixteen vectors.
-        let (m, count) = (SPECTRA / 32 / 6, 2 * WIDTH);
+        let (m, count) = (VECTOR_SPECTRA_BYTES / 32 / 6, 2 * LANE_COUNT);
         let record = Record::new(1e-3, vec![(0..m).map(|k| libm::sin(k as f64 * 0.01)).collect()], None)?;
         let mut index = Index::default();
         let own: Vec<usize> = [0.4, 1.1, 1.9].map(|eta| index.insert(Key::integral(0, eta))).into();
         let bank = Bank::new(&index, &record, 0)?;
-        let all = vectors(count, m, &Stop::default());
+        let all = build_vectors(count, m, &Stop::default());
         let sizes = vec![1.0; count];
         let found: Vec<Vec<[Wide; 4]>> = [1, 2]
             .iter()
             .filter_map(|&threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok())
-            .map(|pool| pool.install(|| effects(&bank, &own, all.clone(), &sizes, (Norm::L1, 1e-9), &Stop::default())))
+            .map(|pool| {
+                pool.install(|| divisor_effects(&bank, &own, all.clone(), &sizes, (Norm::L1, 1e-9), &Stop::default()))
+            })
             .collect();
         assert!(found.len() == 2 && found[0] == found[1], "whatever the threads");
-        let groups = count / WIDTH;
+        let groups = count / LANE_COUNT;
         for (row, &p) in own.iter().enumerate() {
             let kernel = Kernel::new(bank.kernel(p));
             let length: f64 = bank.kernel(p).iter().map(|v| v.abs()).sum();
@@ -515,10 +528,10 @@ mod tests {
                     kernel.apply(&signal, &mut out, &mut Buffers::default());
                     out
                 });
-                let [g, h, rest, ..] = effect(vector, &[re, im], None, Norm::L1, 1e-9 * length);
+                let [g, h, rest, ..] = column_effect(vector, &[re, im], None, Norm::L1, 1e-9 * length);
                 let alone = [g, h, rest];
                 for (half, value) in alone.into_iter().enumerate() {
-                    let there = found[0][row * groups + j / WIDTH][half][j % WIDTH];
+                    let there = found[0][row * groups + j / LANE_COUNT][half][j % LANE_COUNT];
                     assert!((there - value).abs() <= 1e-12 * (1.0 + value.abs()), "{row} {j} {half}: {there} {value}");
                 }
             }
@@ -534,10 +547,18 @@ mod tests {
         let own: Vec<usize> = [0.4, 1.1].map(|eta| index.insert(Key::integral(0, eta))).into();
         let (going, told) = (Stop::default(), Stop::default());
         told.set();
-        let bank = Bank::counted(&index, &record, 0, &going)?;
-        assert!(matches!(Bank::counted(&index, &record, 0, &told), Err(crate::error::Error::Interrupted)));
-        let found =
-            |stop| effects(&bank, &own, vectors(WIDTH, m, &Stop::default()), &[1.0; WIDTH], (Norm::L1, 1e-15), stop);
+        let bank = Bank::new_interruptible(&index, &record, 0, &going)?;
+        assert!(matches!(Bank::new_interruptible(&index, &record, 0, &told), Err(crate::error::Error::Interrupted)));
+        let found = |stop| {
+            divisor_effects(
+                &bank,
+                &own,
+                build_vectors(LANE_COUNT, m, &Stop::default()),
+                &[1.0; LANE_COUNT],
+                (Norm::L1, 1e-15),
+                stop,
+            )
+        };
         assert!(found(&going).iter().flatten().flatten().any(|v| *v != 0.0));
         assert!(found(&told).iter().flatten().flatten().all(|v| *v == 0.0));
         Ok(())
@@ -545,15 +566,15 @@ mod tests {
 
     #[test]
     fn ways_are_no_shorter_than_what_lies_between() -> crate::error::Result<()> {
-        let (m, count) = (96, WIDTH);
+        let (m, count) = (96, LANE_COUNT);
         let record = Record::new(0.05, vec![(0..m).map(|k| libm::sin(f64::from(k) * 0.3)).collect()], None)?;
         let mut index = Index::default();
         let orders: Vec<f64> = (1..40).map(|i| 0.05 * f64::from(i)).collect();
         let own: Vec<usize> = orders.iter().map(|&eta| index.insert(Key::integral(0, eta))).collect();
         let bank = Bank::new(&index, &record, 0)?;
-        let all = vectors(count, m as usize, &Stop::default());
+        let all = build_vectors(count, m as usize, &Stop::default());
         for norm in [Norm::L1, Norm::L2] {
-            let found = effects(&bank, &own, all.clone(), &[1.0; WIDTH], (norm, 1e-15), &Stop::default());
+            let found = divisor_effects(&bank, &own, all.clone(), &[1.0; LANE_COUNT], (norm, 1e-15), &Stop::default());
             let vector = |row: usize, j: usize| -> Vec<(f64, f64)> {
                 let [g, h] = [0, 1].map(|half: usize| found[row][half][j]);
                 let parts = [0, 1].map(|half: usize| -> Vec<f64> {

@@ -1,37 +1,39 @@
-//! Zeros of a candidate's divisor that its driven part lacks: a proof, without a run, that its free run explodes.
+//! Unstable zeros of a candidate's divisor: proof, without simulation, that its simulated output diverges.
 //!
-//! The free run obeys D ŷ = N. As polynomials, D(z) ŷ(z) = N(z) + τ(z) where τ holds what the record cuts off; inside the
-//! unit circle that is next to nothing. If ‖e‖ ≤ L then Σ|ŷ| ≤ Σ|y| + L, so on a closed path there |τ| < |N| may be
-//! proved, and by Rouché's theorem D ŷ has as many zeros inside the path as N: at least as many as D. A candidate whose
-//! D has more than its N is therefore beyond the limit. Zeros are counted by how often the values along the path turn
-//! around 0: values at nodes, chords between them, and what the second derivative allows beside these.
+//! The simulated output obeys D ŷ = N. As polynomials, D(z) ŷ(z) = N(z) + τ(z), where τ contains the terms beyond the
+//! record, which are negligible inside the unit circle. If ‖e‖ ≤ L, then Σ|ŷ| ≤ Σ|y| + L, so |τ| < |N| can be proved
+//! on a closed path inside it. By Rouché's theorem D ŷ and N have the same number of zeros inside the path, at least
+//! as many as D. A candidate whose D has more zeros than its N therefore exceeds the limit. The zeros are counted by
+//! the winding number along the path, from values at nodes, chords between them, and bounds of the second derivative.
 
 use rayon::prelude::*;
 
 use crate::equation::Equation;
 use crate::error::{check_length, Result};
 use crate::linalg::dense;
-use crate::order_search::dual_bound::tailored_vectors::modulus;
+use crate::order_search::dual_bound::tailored_vectors::sum_of_moduli;
 use crate::order_search::options::Norm;
 use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::simd::WIDTH;
+use crate::simd::LANE_COUNT;
 
-/// Decay rates of the paths, per record: a path bounds the half disc of three times its rate to the right of it. Growth
-/// that a record does not show makes no free run large; faster growth than the last is stopped early by any run.
-const RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
-/// Radius over rate, and chords on the arc and on the line of one half of a path; the other half mirrors it. The chords
-/// on the line are half as long, for there the powers decay most slowly.
-const RADIUS: f64 = 3.0;
-const CHORDS: [usize; 2] = [25, 39];
-const SEGMENTS: usize = CHORDS[0] + CHORDS[1];
-/// Nodes of a path in the tables, filled up so that each has a next one in whole lanes.
-const NODES: usize = SEGMENTS + WIDTH;
-/// Samples that are read at a time, and most samples of a record: products with all columns at all nodes take time.
-const AT_ONCE: usize = 4096;
-const LONGEST: usize = 1 << 14;
+/// Decay rates of the paths, per record. A path encloses the half disc to the right of its rate, with three times the
+/// rate as radius. Slower growth hardly enlarges the simulated output. Faster growth is stopped early by the simulation
+/// itself.
+const PATH_DECAY_RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
+/// Ratio of radius to rate, and chords on the arc and on the line of one half path. The other half is its mirror image.
+/// Chords on the line are half as long because the powers decay most slowly there.
+const PATH_RADIUS_RATIO: f64 = 3.0;
+const PATH_CHORD_COUNTS: [usize; 2] = [25, 39];
+const PATH_SEGMENT_COUNT: usize = PATH_CHORD_COUNTS[0] + PATH_CHORD_COUNTS[1];
+/// Nodes of a path in the tables, padded so that each node has a successor in whole lanes.
+const PADDED_NODE_COUNT: usize = PATH_SEGMENT_COUNT + LANE_COUNT;
+/// Samples read per block, and maximum samples of a record. Products with all columns at all nodes are expensive.
+const SAMPLES_PER_BLOCK: usize = 4096;
+const MAX_RECORD_SAMPLES: usize = 1 << 14;
 
-/// Whether the zeros of an equation's divisor prove that its output error at rest exceeds `limit`: Σ|y − ŷ| or Σ(y − ŷ)².
+/// Whether zeros of an equation's divisor prove that its output error exceeds `limit`. The error is Σ|y − ŷ| or Σ(y −
+/// ŷ)² with zero initial conditions.
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -47,11 +49,11 @@ const LONGEST: usize = 1 << 14;
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let structure = Structure { output: 0, order: 1.0, terms };
 /// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c, 1.0] };
-/// assert!(explodes(&record, &equation(1.2), Norm::L1, 100.0)?);
-/// assert!(!explodes(&record, &equation(-1.2), Norm::L1, 100.0)?);
+/// assert!(has_unstable_zeros(&record, &equation(1.2), Norm::L1, 100.0)?);
+/// assert!(!has_unstable_zeros(&record, &equation(-1.2), Norm::L1, 100.0)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn explodes(record: &Record, equation: &Equation, norm: Norm, limit: f64) -> Result<bool> {
+pub fn has_unstable_zeros(record: &Record, equation: &Equation, norm: Norm, limit: f64) -> Result<bool> {
     let Equation { structure, coefficients } = equation;
     structure.check(record.len(), |_| true)?;
     check_length("coefficients", structure.terms.len(), coefficients.len())?;
@@ -61,51 +63,57 @@ pub fn explodes(record: &Record, equation: &Equation, norm: Norm, limit: f64) ->
         .collect();
     let bank = Bank::new(&index, record, structure.output)?;
     let target = record.signal(structure.output).to_vec();
-    let roots = Roots::new(&[bank], &[target], norm);
-    Ok(roots.exclude(&columns, coefficients, limit, &mut 0))
+    let roots = UnstableZeros::new(&[bank], &[target], norm);
+    Ok(roots.excludes_candidate(&columns, coefficients, limit, &mut 0))
 }
 
-/// What the paths see of every column, on every record.
-pub(crate) struct Roots {
+/// Values of every column along the paths, on every record.
+pub(crate) struct UnstableZeros {
     norm: Norm,
     own: Vec<bool>,
-    records: Vec<Seen>,
+    records: Vec<PathSums>,
 }
 
-/// What they see on one record.
-struct Seen {
+/// Values of every column along the paths, on one record.
+struct PathSums {
     paths: usize,
     samples: f64,
-    /// Per column and node: real and imaginary part; and per segment what its second derivative and rounding allow.
-    values: Vec<[[f64; NODES]; 3]>,
+    /// Real and imaginary part per column and node, and per segment a bound from second derivative and rounding.
+    values: Vec<[[f64; PADDED_NODE_COUNT]; 3]>,
     /// Largest |z^M| of each segment.
-    tails: Vec<[f64; SEGMENTS]>,
+    tails: Vec<[f64; PATH_SEGMENT_COUNT]>,
     /// Sum of the moduli of an own column's kernel, or of another column.
     sums: Vec<f64>,
     /// Σ|y|.
-    size: f64,
-    /// What rounding may add to a sum of M terms, per unit.
+    output_modulus: f64,
+    /// Relative rounding-error bound of a sum of M terms.
     unit: f64,
 }
 
-/// Nodes of a half path of this rate, from the real axis along the arc to the line and down it to the real axis.
+/// Nodes of a half path of this rate: from the real axis along the arc, then down the line to the real axis.
 #[allow(clippy::cast_precision_loss)]
-fn nodes(rate: f64) -> Vec<(f64, f64)> {
-    let radius = RADIUS * rate;
-    let widest = libm::acos(1.0 / RADIUS);
+fn path_nodes(rate: f64) -> Vec<(f64, f64)> {
+    let radius = PATH_RADIUS_RATIO * rate;
+    let widest = libm::acos(1.0 / PATH_RADIUS_RATIO);
     let highest = radius * libm::sin(widest);
-    let arc = (0..CHORDS[0]).map(|i| {
-        let (sin, cos) = libm::sincos(widest * i as f64 / CHORDS[0] as f64);
+    let arc = (0..PATH_CHORD_COUNTS[0]).map(|i| {
+        let (sin, cos) = libm::sincos(widest * i as f64 / PATH_CHORD_COUNTS[0] as f64);
         (radius * cos, radius * sin)
     });
-    let line = (0..=CHORDS[1]).map(|i| (rate, highest * (CHORDS[1] - i) as f64 / CHORDS[1] as f64));
+    let line = (0..=PATH_CHORD_COUNTS[1])
+        .map(|i| (rate, highest * (PATH_CHORD_COUNTS[1] - i) as f64 / PATH_CHORD_COUNTS[1] as f64));
     arc.chain(line).collect()
 }
 
-/// What a path sees of some series, and its largest |z^M| by segment; a stretch of samples at a time.
+/// Values of series along a path, and its largest |z^M| by segment. Samples are read block by block.
 #[allow(clippy::cast_precision_loss)]
-fn path(rate: f64, series: &[&[f64]], moduli: &[&[f64]], unit: f64) -> (Vec<[[f64; NODES]; 3]>, [f64; SEGMENTS]) {
-    let nodes = nodes(rate);
+fn path_sums(
+    rate: f64,
+    series: &[&[f64]],
+    moduli: &[&[f64]],
+    unit: f64,
+) -> (Vec<[[f64; PADDED_NODE_COUNT]; 3]>, [f64; PATH_SEGMENT_COUNT]) {
+    let nodes = path_nodes(rate);
     let m = series.first().map_or(0, |x| x.len());
     let samples = m as f64;
     let slowest: Vec<f64> = nodes.windows(2).map(|pair| pair[0].0.min(pair[1].0)).collect();
@@ -113,9 +121,10 @@ fn path(rate: f64, series: &[&[f64]], moduli: &[&[f64]], unit: f64) -> (Vec<[[f6
         .windows(2)
         .map(|pair| ((pair[1].0 - pair[0].0).powi(2) + (pair[1].1 - pair[0].1).powi(2)) / 8.0)
         .collect();
-    let (mut seen, mut slack) = (vec![0.0; series.len() * 2 * (SEGMENTS + 1)], vec![0.0; series.len() * SEGMENTS]);
-    for lo in (0..m).step_by(AT_ONCE) {
-        let shares: Vec<f64> = (lo..m.min(lo + AT_ONCE)).map(|k| k as f64 / samples).collect();
+    let (mut seen, mut slack) =
+        (vec![0.0; series.len() * 2 * (PATH_SEGMENT_COUNT + 1)], vec![0.0; series.len() * PATH_SEGMENT_COUNT]);
+    for lo in (0..m).step_by(SAMPLES_PER_BLOCK) {
+        let shares: Vec<f64> = (lo..m.min(lo + SAMPLES_PER_BLOCK)).map(|k| k as f64 / samples).collect();
         let powers: Vec<Vec<f64>> = nodes
             .iter()
             .flat_map(|(re, im)| {
@@ -140,12 +149,12 @@ fn path(rate: f64, series: &[&[f64]], moduli: &[&[f64]], unit: f64) -> (Vec<[[f6
         }
     }
     let row = |p: usize| {
-        let mut row = [[0.0; NODES]; 3];
-        for j in 0..NODES {
-            let node = (p * (SEGMENTS + 1) + j.min(SEGMENTS)) * 2;
+        let mut row = [[0.0; PADDED_NODE_COUNT]; 3];
+        for j in 0..PADDED_NODE_COUNT {
+            let node = (p * (PATH_SEGMENT_COUNT + 1) + j.min(PATH_SEGMENT_COUNT)) * 2;
             row[0][j] = seen[node];
             row[1][j] = seen[node + 1];
-            row[2][j] = slack[p * SEGMENTS + j.min(SEGMENTS - 1)] * (1.0 + unit);
+            row[2][j] = slack[p * PATH_SEGMENT_COUNT + j.min(PATH_SEGMENT_COUNT - 1)] * (1.0 + unit);
         }
         row
     };
@@ -153,7 +162,7 @@ fn path(rate: f64, series: &[&[f64]], moduli: &[&[f64]], unit: f64) -> (Vec<[[f6
     ((0..series.len()).map(row).collect(), tails)
 }
 
-impl Seen {
+impl PathSums {
     #[allow(clippy::cast_precision_loss)]
     fn new(bank: &Bank, target: &[f64]) -> Self {
         let (m, width) = (target.len(), bank.len());
@@ -163,18 +172,26 @@ impl Seen {
             (0..width).map(|p| if bank.kernel(p).is_empty() { bank.column(p) } else { bank.kernel(p) }).collect();
         let moduli: Vec<Vec<f64>> = series.iter().map(|x| x.iter().map(|v| v.abs()).collect()).collect();
         let moduli: Vec<&[f64]> = moduli.iter().map(Vec::as_slice).collect();
-        let sums = series.iter().map(|x| modulus(x)).collect();
-        // Beyond this the powers of a pulse alias.
-        let rates: Vec<f64> = RATES.into_iter().filter(|rate| RADIUS * rate <= samples).collect();
-        let paths: Vec<_> = rates.par_iter().map(|&rate| path(rate, &series, &moduli, unit)).collect();
+        let sums = series.iter().map(|x| sum_of_moduli(x)).collect();
+        // Above this limit the powers of a pulse alias.
+        let rates: Vec<f64> = PATH_DECAY_RATES.into_iter().filter(|rate| PATH_RADIUS_RATIO * rate <= samples).collect();
+        let paths: Vec<_> = rates.par_iter().map(|&rate| path_sums(rate, &series, &moduli, unit)).collect();
         let (values, tails): (Vec<_>, Vec<_>) = paths.into_iter().unzip();
-        Self { paths: tails.len(), samples, values: values.concat(), tails, sums, size: modulus(target), unit }
+        Self {
+            paths: tails.len(),
+            samples,
+            values: values.concat(),
+            tails,
+            sums,
+            output_modulus: sum_of_moduli(target),
+            unit,
+        }
     }
 
-    /// How often D, or N, turns around 0 along a path, which is how many zeros it has inside; none where it may pass
-    /// through 0, or N through what is left out of it.
+    /// Number of zeros of D, or of N, inside a path, from the winding number of the values along it. `None` if the
+    /// values may pass through 0, or N through its truncation bound.
     #[inline(always)]
-    fn zeros(
+    fn count_zeros(
         &self,
         path: usize,
         columns: impl Iterator<Item = (usize, f64)>,
@@ -182,29 +199,31 @@ impl Seen {
         left_out: [f64; 2],
     ) -> Option<i32> {
         let width = self.sums.len();
-        let (mut re, mut im, mut slack) = ([one; NODES], [0.0; NODES], [0.0; SEGMENTS]);
+        let (mut re, mut im, mut slack) =
+            ([one; PADDED_NODE_COUNT], [0.0; PADDED_NODE_COUNT], [0.0; PATH_SEGMENT_COUNT]);
         for (slack, tail) in slack.iter_mut().zip(&self.tails[path]) {
             *slack = left_out[0] + left_out[1] * tail;
         }
         for (p, c) in columns {
             let [a, b, rest] = &self.values[path * width + p];
-            for j in 0..NODES {
+            for j in 0..PADDED_NODE_COUNT {
                 re[j] += c * a[j];
                 im[j] += c * b[j];
             }
-            for j in 0..SEGMENTS {
+            for j in 0..PATH_SEGMENT_COUNT {
                 slack[j] += c.abs() * rest[j];
             }
         }
-        let (mut turns, mut near) = ([0_i32; WIDTH], [false; WIDTH]);
-        for j in (0..SEGMENTS).step_by(WIDTH) {
-            for n in 0..WIDTH {
+        let (mut turns, mut near) = ([0_i32; LANE_COUNT], [false; LANE_COUNT]);
+        for j in (0..PATH_SEGMENT_COUNT).step_by(LANE_COUNT) {
+            for n in 0..LANE_COUNT {
                 let (a, b, c, d) = (re[j + n], im[j + n], re[j + n + 1], im[j + n + 1]);
                 let middle = ((a + c) * (a + c) + (b + d) * (b + d)).sqrt();
                 let half = ((c - a) * (c - a) + (d - b) * (d - b)).sqrt();
-                // What is not a number is near.
+                // NaN counts as near.
                 near[n] |= !(middle - half > 2.0 * slack[j + n] && middle < f64::MAX);
-                // Where a half path crosses the imaginary axis the whole one makes a turn, its mirror image the other half.
+                // A half path that crosses the imaginary axis contributes one turn, because its mirror image adds the
+                // other half.
                 let crossed = i32::from((a < 0.0) != (c < 0.0));
                 turns[n] += crossed * if a * d > b * c { 1 } else { -1 };
             }
@@ -213,33 +232,43 @@ impl Seen {
     }
 }
 
-impl Roots {
-    /// Whether records are short enough.
-    pub(crate) fn pay(targets: &[Vec<f64>]) -> bool {
-        targets.iter().all(|target| target.len() <= LONGEST)
+impl UnstableZeros {
+    /// Whether all records are short enough for the tables.
+    pub(crate) fn is_affordable(targets: &[Vec<f64>]) -> bool {
+        targets.iter().all(|target| target.len() <= MAX_RECORD_SAMPLES)
     }
 
-    /// Bytes of them on these banks.
+    /// Memory of the tables for these banks [bytes].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
-        banks.iter().map(|bank| (bank.len() * RATES.len() * size_of::<[[f64; NODES]; 3]>()) as u64).sum()
+        banks
+            .iter()
+            .map(|bank| (bank.len() * PATH_DECAY_RATES.len() * size_of::<[[f64; PADDED_NODE_COUNT]; 3]>()) as u64)
+            .sum()
     }
 
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let own =
             banks.first().map_or(Vec::new(), |bank| (0..bank.len()).map(|p| !bank.kernel(p).is_empty()).collect());
-        let records = banks.iter().zip(targets).map(|(bank, target)| Seen::new(bank, target)).collect();
+        let records = banks.iter().zip(targets).map(|(bank, target)| PathSums::new(bank, target)).collect();
         Self { norm, own, records }
     }
 
-    /// Whether some path proves that a candidate's raw score exceeds the limit; the one that did so last is asked first.
+    /// Whether some path proves that a candidate's raw score exceeds the limit. The path that excluded the previous
+    /// candidate is tried first.
     #[inline(always)]
-    pub(crate) fn exclude(&self, terms: &[usize], coefficients: &[f64], limit: f64, last: &mut usize) -> bool {
+    pub(crate) fn excludes_candidate(
+        &self,
+        terms: &[usize],
+        coefficients: &[f64],
+        limit: f64,
+        last: &mut usize,
+    ) -> bool {
         for seen in &self.records {
             let error = match self.norm {
                 Norm::L1 => limit,
                 Norm::L2 => limit.sqrt() * seen.samples.sqrt(),
             };
-            let size = seen.size + error * (1.0 + seen.unit);
+            let size = seen.output_modulus + error * (1.0 + seen.unit);
             let (mut length, mut driven) = (0.0, 0.0);
             for (&p, &c) in terms.iter().zip(coefficients) {
                 *(if self.own[p] { &mut length } else { &mut driven }) += c.abs() * seen.sums[p];
@@ -252,9 +281,9 @@ impl Roots {
             for turn in 0..seen.paths {
                 let path = (*last + turn) % seen.paths;
                 let divisor = of(true).map(|(p, c)| (p, -c));
-                let Some(most @ 1..) = seen.zeros(path, divisor, 1.0, [seen.unit, 0.0]) else { continue };
+                let Some(most @ 1..) = seen.count_zeros(path, divisor, 1.0, [seen.unit, 0.0]) else { continue };
                 let left_out = [rounding, length * size];
-                if seen.zeros(path, of(false), 0.0, left_out).is_some_and(|zeros| zeros < most) {
+                if seen.count_zeros(path, of(false), 0.0, left_out).is_some_and(|zeros| zeros < most) {
                     *last = path;
                     return true;
                 }

@@ -1,36 +1,36 @@
-//! The independent lattice: α from a list, the order of each term from an axis of its own.
+//! Order grid with independent orders: α from a list, the order of each term from its own axis.
 //!
-//! The tuples of orders that the terms of one signal may take: counted and found by number, none stored.
+//! The tuples of orders of one signal are counted and found by rank without storing them.
 
 use crate::equation::{tidy, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
 use crate::fractional::kernels::{MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
 
-/// Most candidates that one search takes: an hour or so where bounds and early stopping do their work.
+/// Maximum candidates of one search, about one hour with dual bounds and pruning.
 pub const MAX_CANDIDATES: u128 = 10_000_000_000;
-/// Most prefixes of tuples whose completions are counted when a lattice is laid out: a few seconds.
+/// Maximum prefixes of tuples whose completions are counted when a grid is built, a few seconds.
 const MAX_PREFIXES: u128 = 1 << 28;
-/// Most terms of one signal: the number of ways to swap so many just fits 128 bits.
+/// Maximum terms of one signal. The number of their permutations just fits into 128 bits.
 const MAX_TERMS: usize = 34;
 
-/// Values that the order of one term may take.
+/// Candidate orders of one term.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TermAxis {
     /// Signal of the term.
     pub signal: usize,
-    /// Allowed orders, in any order; those outside an α's range are left out for that α.
+    /// Orders in any sequence. Those outside the range of an α are excluded for that α.
     pub values: Vec<f64>,
-    /// Whether this term may be swapped with another of the same signal (both coefficients free).
+    /// Whether this term may be interchanged with another of the same signal (both coefficients free).
     pub interchangeable: bool,
 }
 
-/// All orders of one equation: α from a list, each term's order from its axis.
+/// Grid of all orders of one equation: α from a list, each term's order from its own axis.
 ///
-/// Own-output orders satisfy 0 ≤ ν < α, others 0 ≤ ν ≤ α (a value below 0 is allowed for inputs). Orders of one signal
-/// are distinct; interchangeable ones are unordered (the larger first). Indices ascend in α; within an α the last
-/// signal's tuple runs fastest, within a tuple its last order, both from the largest down.
+/// Own-output orders satisfy 0 ≤ ν < α, others 0 ≤ ν ≤ α. Inputs may have a negative order. Orders of one signal are
+/// distinct. Interchangeable ones are unordered, with the larger first. Indices ascend in α. Within an α the last
+/// signal's tuple varies fastest, within a tuple its last order, both from the largest down.
 #[derive(Debug, Clone)]
-pub struct Lattice {
+pub struct OrderGrid {
     output: usize,
     width: usize,
     pub(super) groups: Vec<Group>,
@@ -38,28 +38,28 @@ pub struct Lattice {
     pub(super) count: u64,
 }
 
-/// All candidates of one α: the product of its groups' tuples.
+/// Candidates of one α: the product of its groups' tuples.
 #[derive(Debug, Clone)]
 pub(crate) struct Block {
     pub(crate) alpha: f64,
     pub(crate) start: u64,
-    pub(crate) slices: Vec<Slice>,
+    pub(crate) tuples: Vec<GroupTuples>,
 }
 
-impl Lattice {
-    /// Lays out the axes; `is_input` tells which signals may carry a negative order.
+impl OrderGrid {
+    /// Build the grid from its axes. `is_input` selects the signals that may have a negative order.
     ///
     /// # Errors
-    /// [`Error::EmptyLattice`], [`Error::LatticeTooLarge`] before anything of that size is gone through, an α outside
-    /// (0, 10], [`Error::NotFinite`] for an order that is no number, [`Error::Structure`] for more than 34 terms of one
+    /// [`Error::EmptyOrderGrid`], [`Error::OrderGridTooLarge`] before anything of that size is enumerated, an α outside (0,
+    /// 10], [`Error::NotFinite`] for an order that is not finite, [`Error::Structure`] for more than 34 terms of one
     /// signal.
     ///
     /// ```
-    /// # use ftlm::order_search::grid::{Lattice, TermAxis};
+    /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
     /// // Two own terms that may be swapped, and the input at order 0.
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5, 1.0], interchangeable: true };
     /// let input = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-    /// let lattice = Lattice::new(0, &[0.8, 1.2], &[own.clone(), own, input], |signal| signal == 1)?;
+    /// let lattice = OrderGrid::new(0, &[0.8, 1.2], &[own.clone(), own, input], |signal| signal == 1)?;
     /// // (0.5, 0) below 0.8; (1, 0.5), (1, 0), (0.5, 0) below 1.2.
     /// assert_eq!(lattice.count(), 4);
     /// # Ok::<(), ftlm::error::Error>(())
@@ -100,7 +100,7 @@ impl Lattice {
         let firsts: Vec<Vec<Vec<usize>>> = alphas
             .iter()
             .map(|&alpha| {
-                // What is searched stays at alpha or below; an order that is asked for beside one alpha need not.
+                // Varied orders stay at or below alpha. A fixed order with a single alpha may exceed it.
                 let highest = |own: bool, count: usize| match (own, only && count == 1) {
                     (true, _) => alpha - ORDER_GRAIN,
                     (false, false) => alpha + ORDER_GRAIN,
@@ -132,21 +132,22 @@ impl Lattice {
         let mut count: u128 = 0;
         let mut why = "no value of alpha".to_owned();
         for (&alpha, firsts) in alphas.iter().zip(firsts) {
-            let slices: Vec<Slice> = groups.iter().zip(firsts).map(|(group, first)| group.slice(first)).collect();
+            let slices: Vec<GroupTuples> =
+                groups.iter().zip(firsts).map(|(group, first)| group.tuples_below(first)).collect();
             if let Some(empty) = slices.iter().position(|slice| slice.count == 0) {
                 why = format!("no orders of signal {} fit below alpha = {alpha}", groups[empty].signal);
                 continue;
             }
             let size = slices.iter().fold(1u128, |size, slice| size.saturating_mul(u128::from(slice.count)));
             #[allow(clippy::cast_possible_truncation)]
-            blocks.push(Block { alpha, start: count as u64, slices });
+            blocks.push(Block { alpha, start: count as u64, tuples: slices });
             count = count.saturating_add(size);
             if count > MAX_CANDIDATES {
-                return Err(Error::LatticeTooLarge { count, limit: MAX_CANDIDATES });
+                return Err(Error::OrderGridTooLarge { count, limit: MAX_CANDIDATES });
             }
         }
         if count == 0 {
-            return Err(Error::EmptyLattice { why });
+            return Err(Error::EmptyOrderGrid { why });
         }
         #[allow(clippy::cast_possible_truncation)]
         Ok(Self { output, width: terms.len(), groups, blocks, count: count as u64 })
@@ -179,7 +180,7 @@ impl Lattice {
     }
 }
 
-/// Refuses a lattice from the lengths of its axes alone, before a walk through it could take its time.
+/// Raise an error for a grid that is too large by the lengths of its axes, before it is enumerated.
 fn check_size(axes: &[Vec<Vec<f64>>], firsts: &[Vec<Vec<usize>>]) -> Result<()> {
     let lengths = |axes: &[Vec<f64>], first: &[usize]| -> Vec<u128> {
         axes.iter().zip(first).map(|(a, f)| (a.len() - f) as u128).collect()
@@ -191,15 +192,15 @@ fn check_size(axes: &[Vec<Vec<f64>>], firsts: &[Vec<Vec<usize>>]) -> Result<()> 
         all = all.saturating_add(groups.iter().fold(1, |p, g| p.saturating_mul(product(g))));
         prefixes = groups.iter().fold(prefixes, |sum, g| sum.saturating_add(product(&g[..g.len() - 1])));
     }
-    // Unordered tuples are at most so many times fewer than the product of the axes.
+    // The number of unordered tuples is smaller than the product of the axes by at most this factor.
     let folds = axes.iter().fold(1u128, |p, group| p.saturating_mul((1..=group.len() as u128).product()));
     if all / folds / 2 > MAX_CANDIDATES || prefixes > MAX_PREFIXES {
-        return Err(Error::LatticeTooLarge { count: all, limit: MAX_CANDIDATES });
+        return Err(Error::OrderGridTooLarge { count: all, limit: MAX_CANDIDATES });
     }
     Ok(())
 }
 
-/// Values of an axis from the largest down, each once.
+/// Distinct values of an axis from the largest down.
 fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
     let mut values: Vec<f64> = term.values.iter().map(|&v| tidy(v)).filter(|&v| v >= lowest - ORDER_GRAIN).collect();
     values.sort_by(|a, b| b.total_cmp(a));
@@ -207,10 +208,10 @@ fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
     values
 }
 
-/// The count before every so many prefixes is kept; those between are counted again when a tuple is looked up.
-pub(super) const STRIDE: usize = 64;
+/// Number of prefixes per stored count. Counts between are recomputed on look-up.
+pub(super) const PREFIX_STRIDE: usize = 64;
 
-/// The terms of one signal, their axes and which pairs of values exclude each other.
+/// Terms of one signal, their axes, and the pairs of values that exclude each other.
 #[derive(Debug, Clone)]
 pub(crate) struct Group {
     pub(crate) signal: usize,
@@ -218,19 +219,19 @@ pub(crate) struct Group {
     pub(crate) terms: Vec<usize>,
     /// Values of each term, from the largest down.
     pub(crate) axes: Vec<Vec<f64>>,
-    /// `allowed[b][a][i]`, a < b: the values of term b that may stand beside value i of term a.
+    /// Values of term b that are compatible with value i of term a, a < b, as `allowed[b][a][i]`.
     allowed: Vec<Vec<Vec<Bits>>>,
 }
 
-/// What an α leaves of a group.
+/// Tuples of a group that are admissible for one α.
 #[derive(Debug, Clone)]
-pub(crate) struct Slice {
-    /// First value of each axis that is in range.
+pub(crate) struct GroupTuples {
+    /// First value of each axis within the range.
     pub(crate) first: Vec<usize>,
-    /// Number of prefixes (all orders but the last), and of tuples.
+    /// Number of prefixes (all orders except the last), and of tuples.
     pub(super) prefixes: usize,
     pub(super) count: u64,
-    /// Number of tuples before every [`STRIDE`]th prefix.
+    /// Number of tuples before every [`PREFIX_STRIDE`]th prefix.
     pub(super) before: Vec<u64>,
 }
 
@@ -262,7 +263,7 @@ impl Bits {
         }
     }
 
-    /// How many members follow one another from here on, it included.
+    /// Number of consecutive members from this position on.
     pub(super) fn run(&self, from: usize) -> usize {
         let mut at = from;
         while let Some(&word) = self.0.get(at / 64) {
@@ -276,7 +277,7 @@ impl Bits {
         at - from
     }
 
-    /// The member with `rank` members before it.
+    /// Member with `rank` members before it.
     pub(super) fn select(&self, mut rank: u64) -> Option<usize> {
         for (word, &bits) in self.0.iter().enumerate() {
             let here = u64::from(bits.count_ones());
@@ -305,8 +306,8 @@ impl Group {
                         let twins: Vec<bool> = axes[b].iter().map(|&y| swappable && holds(&axes[a], y)).collect();
                         let completions = |&x: &f64| {
                             let twin = holds(&axes[b], x);
-                            // Of two tuples that a swap turns into each other the one with the larger order first
-                            // stands for both.
+                            // Of two tuples that differ by an interchange, only the one with the larger order first is
+                            // a candidate.
                             Bits::from(axes[b].len(), |j| {
                                 let y = axes[b][j];
                                 (x - y).abs() > ORDER_GRAIN && !(twin && twins[j] && x < y)
@@ -324,7 +325,7 @@ impl Group {
         self.terms.len() - 1
     }
 
-    /// Orders of a prefix by its number, as positions in the axes.
+    /// Axis positions of a prefix with this number.
     pub(super) fn decode(&self, first: &[usize], prefix: usize, digits: &mut [usize]) {
         let mut rest = prefix;
         for a in (0..self.last()).rev() {
@@ -334,8 +335,8 @@ impl Group {
         }
     }
 
-    /// Calls `take` with the words of the set of last values that complete a prefix, and their place; none where the
-    /// prefix excludes itself.
+    /// Call `take` with each word of the set of last values that complete a prefix, and its position. No call if the
+    /// prefix is inconsistent.
     #[inline]
     pub(super) fn completions(&self, first: &[usize], digits: &[usize], mut take: impl FnMut(usize, u64)) {
         let last = self.last();
@@ -362,19 +363,19 @@ impl Group {
         count
     }
 
-    /// The part of this group below an α; completions are counted, none is stored.
-    pub(super) fn slice(&self, first: Vec<usize>) -> Slice {
+    /// Tuples of this group below an α. Completions are counted, not stored.
+    pub(super) fn tuples_below(&self, first: Vec<usize>) -> GroupTuples {
         let prefixes: usize = (0..self.last()).map(|a| self.axes[a].len() - first[a]).product();
         let mut digits = vec![0; self.terms.len()];
-        let mut before = Vec::with_capacity(prefixes / STRIDE + 1);
+        let mut before = Vec::with_capacity(prefixes / PREFIX_STRIDE + 1);
         let mut count = 0;
         for prefix in 0..prefixes {
-            if prefix % STRIDE == 0 {
+            if prefix % PREFIX_STRIDE == 0 {
                 before.push(count);
             }
             self.decode(&first, prefix, &mut digits);
             count += self.count_completions(&first, &digits);
         }
-        Slice { first, prefixes, count, before }
+        GroupTuples { first, prefixes, count, before }
     }
 }

@@ -1,13 +1,13 @@
-//! The lattice under an order law: a few free orders give the orders of all equations of a stage.
+//! Order grid under an order law: a few free orders determine the orders of all equations of a stage.
 
 use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
 use crate::fractional::kernels::MAX_EXCESS;
 
-/// Most tuples of free orders of a stage; what a search costs follows from the distinct orders of its equations.
+/// Maximum tuples of free orders of a stage. The cost of a search depends on the distinct orders of its equations.
 pub const MAX_TUPLES: u128 = 5_000_000_000;
 
-/// One equation of a stage: its α and its terms' orders as affine functions of the stage's free orders.
+/// Equation of a stage. α and its terms' orders are affine functions of the stage's free orders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LawEquation {
     /// Output of the equation.
@@ -18,32 +18,32 @@ pub struct LawEquation {
     pub terms: Vec<(usize, AffineOrder)>,
 }
 
-/// The product of free orders under an order law; tuples that make no equation are left out.
+/// Grid of free orders under an order law. Tuples that form no equation are excluded.
 #[derive(Debug, Clone)]
-pub struct LawLattice {
+pub struct OrderLawGrid {
     axes: Vec<Vec<f64>>,
     equations: Vec<LawEquation>,
     inputs: Vec<bool>,
     product: u64,
-    /// Output and place of terms whose coefficient is known.
+    /// Output and position of terms with a fixed coefficient.
     known: Vec<(usize, usize)>,
 }
 
-impl LawLattice {
-    /// Takes the values of each free order and the equations; `inputs[s]` tells whether signal s is an input.
+impl OrderLawGrid {
+    /// Build the grid from the values of each free order and the equations. `inputs[s]` marks signal s as an input.
     ///
     /// # Errors
-    /// [`Error::EmptyLattice`] where an axis is empty, [`Error::LatticeTooLarge`] for the product of the axes,
-    /// [`Error::NotFinite`] for an order or a law that is no number, [`Error::Structure`] where there is no equation, or
-    /// one names a signal or a free order that is not there.
+    /// [`Error::EmptyOrderGrid`] for an empty axis, [`Error::OrderGridTooLarge`] for the product of the axes,
+    /// [`Error::NotFinite`] for an order or a law that is not finite, [`Error::Structure`] without an equation, or for
+    /// a signal or free order that does not exist.
     ///
     /// ```
     /// # use ftlm::equation::AffineOrder;
-    /// # use ftlm::order_search::grid::{LawEquation, LawLattice};
+    /// # use ftlm::order_search::grid::{LawEquation, OrderLawGrid};
     /// // D^α y = c D^{α−1} u for a free α.
     /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
     /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
-    /// let lattice = LawLattice::new(&[vec![0.5, 1.5]], &[equation], &[false, false])?;
+    /// let lattice = OrderLawGrid::new(&[vec![0.5, 1.5]], &[equation], &[false, false])?;
     /// assert_eq!((lattice.product(), lattice.free(1)), (2, vec![1.5]));
     /// // An order below 0 is for inputs alone.
     /// assert!(lattice.structures(0).is_none());
@@ -69,7 +69,7 @@ impl LawLattice {
             })
             .collect();
         if let Some(empty) = axes.iter().position(Vec::is_empty) {
-            return Err(Error::EmptyLattice { why: format!("free order {empty} has no value") });
+            return Err(Error::EmptyOrderGrid { why: format!("free order {empty} has no value") });
         }
         let product = axes.iter().fold(1u128, |p, a| p.saturating_mul(a.len() as u128));
         match u64::try_from(product) {
@@ -80,15 +80,16 @@ impl LawLattice {
                 product: count,
                 known: Vec::new(),
             }),
-            _ => Err(Error::LatticeTooLarge { count: product, limit: MAX_TUPLES }),
+            _ => Err(Error::OrderGridTooLarge { count: product, limit: MAX_TUPLES }),
         }
     }
 
-    /// The same with terms of known coefficients, `fixed[e]` by term of equation e: these may exceed their equation's α.
+    /// Set the fixed coefficients, `fixed[e]` by term of equation e. Terms with a fixed coefficient may exceed their
+    /// equation's α.
     ///
-    /// A term above α with a free coefficient is left out: it is a way to say that an output nearly equals itself.
+    /// A term above α with a free coefficient is excluded because it nearly equates an output with itself.
     #[must_use]
-    pub fn with_known(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
+    pub fn with_fixed_coefficients(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
         let terms = self.equations.iter().zip(fixed).flat_map(|(equation, fixed)| {
             let known = fixed.iter().enumerate().filter(|(_, value)| value.is_some());
             known.map(|(k, _)| (equation.output, k))
@@ -97,12 +98,12 @@ impl LawLattice {
         self
     }
 
-    /// Refuses records of so many signals where an equation names another.
+    /// Raise an error if an equation refers to a signal that the records lack.
     pub(crate) fn check_signals(&self, signals: usize) -> Result<()> {
         self.equations.iter().try_for_each(|equation| equation.check(self.axes.len(), signals))
     }
 
-    /// Size of the product of the axes; candidates are those of its indices that [`LawLattice::structures`] accepts.
+    /// Size of the product of the axes. Candidates are the indices that have structures.
     #[must_use]
     pub fn product(&self) -> u64 {
         self.product
@@ -114,7 +115,7 @@ impl LawLattice {
         &self.equations
     }
 
-    /// Free orders at an index of the product, the first the slowest; beyond the last the first follows again.
+    /// Free orders at an index of the product, the first varying slowest. Indices beyond the end wrap around.
     #[must_use]
     pub fn free(&self, index: u64) -> Vec<f64> {
         let mut rest = index;
@@ -134,7 +135,7 @@ impl LawLattice {
         free
     }
 
-    /// The structures at an index, or none where an order is out of range or two orders of a signal coincide.
+    /// Structures at an index. `None` if an order is out of range or two orders of a signal coincide.
     #[must_use]
     pub fn structures(&self, index: u64) -> Option<Vec<Structure>> {
         let free = self.free(index);
@@ -156,7 +157,7 @@ impl LawLattice {
         &self.axes
     }
 
-    /// Whether α and the terms' orders make an equation whose orders of one signal are distinct.
+    /// Whether α and the terms' orders form an equation whose orders of one signal are distinct.
     pub(crate) fn fits(&self, equation: &LawEquation, orders: &[f64]) -> bool {
         let alpha = orders[0];
         let input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
@@ -179,7 +180,7 @@ impl LawLattice {
 }
 
 impl LawEquation {
-    /// Refuses an equation over other signals and free orders than these.
+    /// Raise an error if the equation refers to other signals or free orders.
     fn check(&self, free: usize, signals: usize) -> Result<()> {
         for signal in std::iter::once(self.output).chain(self.terms.iter().map(|term| term.0)) {
             if signal >= signals {
@@ -202,7 +203,7 @@ impl LawEquation {
         Ok(())
     }
 
-    /// The law of α, then those of the terms.
+    /// Law of α, then the laws of the terms.
     pub(crate) fn laws(&self) -> impl Iterator<Item = &AffineOrder> {
         std::iter::once(&self.order).chain(self.terms.iter().map(|t| &t.1))
     }

@@ -1,19 +1,18 @@
-//! A walk through the candidates of a lattice in the order of their indices, from any index on.
+//! Traversal of an order grid: in index order, by two-dimensional slices, or in a low-discrepancy order.
 //!
-//! Slabs of a lattice: runs of indices over which two orders alone vary, each through all of its values.
-//!
-//! Orders of visiting that spread any first part of them over the whole range.
+//! A slice is a contiguous range of indices over which only two orders vary, each through all of its values. A
+//! low-discrepancy order spreads every initial part of the candidates evenly over the whole grid.
 
 use crate::equation::{Structure, Term};
-use crate::order_search::grid::independent::{Bits, Lattice, STRIDE};
+use crate::order_search::grid::independent::{Bits, OrderGrid, PREFIX_STRIDE};
 
-impl Lattice {
-    /// Orders of a candidate: its structure; an index beyond the last is the last.
+impl OrderGrid {
+    /// Structure of a candidate. An index beyond the end yields the last candidate.
     ///
     /// ```
-    /// # use ftlm::order_search::grid::{Lattice, TermAxis};
+    /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
-    /// let lattice = Lattice::new(0, &[0.8], &[own], |_| false)?;
+    /// let lattice = OrderGrid::new(0, &[0.8], &[own], |_| false)?;
     /// let orders: Vec<f64> = (0..lattice.count()).map(|index| lattice.structure(index).terms[0].order).collect();
     /// assert_eq!(orders, [0.5, 0.0]);
     /// # Ok::<(), ftlm::error::Error>(())
@@ -24,12 +23,12 @@ impl Lattice {
     }
 }
 
-/// Where in a lattice a walk stands.
+/// Position of a traversal of an order grid.
 #[derive(Debug, Clone)]
 pub(crate) struct Cursor<'a> {
-    lattice: &'a Lattice,
+    lattice: &'a OrderGrid,
     block: usize,
-    /// Per group: its prefix, and the values that complete it.
+    /// Prefix of each group, and the values that complete it.
     prefixes: Vec<usize>,
     completions: Vec<Bits>,
     /// Position of each term's order in its axis.
@@ -37,8 +36,8 @@ pub(crate) struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    /// Stands at a candidate; an index beyond the last is the last.
-    pub(crate) fn at(lattice: &'a Lattice, index: u64) -> Self {
+    /// Return a cursor at a candidate. An index beyond the end yields the last candidate.
+    pub(crate) fn at(lattice: &'a OrderGrid, index: u64) -> Self {
         let index = index.min(lattice.count - 1);
         let block = lattice.blocks.partition_point(|b| b.start <= index).saturating_sub(1);
         let groups = lattice.groups.len();
@@ -51,20 +50,20 @@ impl<'a> Cursor<'a> {
         };
         let mut rest = index - lattice.blocks[block].start;
         for g in (0..groups).rev() {
-            let count = lattice.blocks[block].slices[g].count;
+            let count = lattice.blocks[block].tuples[g].count;
             cursor.seek(g, rest % count);
             rest /= count;
         }
         cursor
     }
 
-    /// Index of the candidate of a block whose orders have these positions in their axes, one a term; none where there is
-    /// none.
-    pub(crate) fn find(lattice: &'a Lattice, block: usize, digits: &[usize]) -> Option<u64> {
+    /// Index of the candidate of a block with these positions in the axes, one per term. `None` if there is no such
+    /// candidate.
+    pub(crate) fn find(lattice: &'a OrderGrid, block: usize, digits: &[usize]) -> Option<u64> {
         let mut cursor = Self::at(lattice, lattice.blocks.get(block)?.start);
         let mut index = 0;
         for (g, group) in lattice.groups.iter().enumerate() {
-            let count = lattice.blocks[block].slices[g].count;
+            let count = lattice.blocks[block].tuples[g].count;
             let wanted = || group.terms.iter().map(|&term| digits[term]);
             let (mut lo, mut hi) = (0, count);
             while lo < hi {
@@ -88,12 +87,12 @@ impl<'a> Cursor<'a> {
         Some(lattice.blocks[block].start + index)
     }
 
-    /// Puts a group at the tuple with this rank.
+    /// Move a group to the tuple with this rank.
     fn seek(&mut self, g: usize, rank: u64) {
-        let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].slices[g]);
+        let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].tuples[g]);
         let stretch = slice.before.partition_point(|&b| b <= rank).saturating_sub(1);
         let mut rest = rank - slice.before[stretch];
-        for prefix in stretch * STRIDE..slice.prefixes {
+        for prefix in stretch * PREFIX_STRIDE..slice.prefixes {
             group.decode(&slice.first, prefix, &mut self.digits[g]);
             let here = group.count_completions(&slice.first, &self.digits[g]);
             if rest < here {
@@ -105,10 +104,10 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Puts a group at a prefix; tells whether anything completes it.
+    /// Move a group to a prefix. Return whether any value completes it.
     fn enter(&mut self, g: usize, prefix: usize) -> bool {
         let group = &self.lattice.groups[g];
-        let first = &self.lattice.blocks[self.block].slices[g].first;
+        let first = &self.lattice.blocks[self.block].tuples[g].first;
         group.decode(first, prefix, &mut self.digits[g]);
         let words = &mut self.completions[g].0;
         words.clear();
@@ -122,12 +121,12 @@ impl<'a> Cursor<'a> {
         any != 0
     }
 
-    /// Goes to the next candidate; at the last one it stays. Returns the first group that has changed; after a change
-    /// of block all have.
+    /// Advance to the next candidate, if there is one. Return the first group that has changed, 0 after a change of
+    /// block.
     pub(crate) fn advance(&mut self) -> usize {
         let groups = self.lattice.groups.len();
         for g in (0..groups).rev() {
-            if self.lattice.blocks[self.block].slices[g].count == 1 {
+            if self.lattice.blocks[self.block].tuples[g].count == 1 {
                 continue;
             }
             if self.step(g) {
@@ -142,11 +141,11 @@ impl<'a> Cursor<'a> {
         0
     }
 
-    /// The term, and its position in its axis, that alone changes over this and the next `len` − 1 candidates, by one
-    /// position each; none where something else does too.
+    /// Term and axis position that alone change over this and the next `len` − 1 candidates, by one position each.
+    /// `None` if something else changes, too.
     #[inline]
-    pub(crate) fn stretch(&self, len: usize) -> Option<(usize, usize)> {
-        let slices = &self.lattice.blocks[self.block].slices;
+    pub(crate) fn adjacent_block(&self, len: usize) -> Option<(usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].tuples;
         let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
         let group = &self.lattice.groups[g];
         let digit = self.digits[g][group.last()];
@@ -154,34 +153,34 @@ impl<'a> Cursor<'a> {
         (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
     }
 
-    /// The term, and its position in its axis, that alone changes over this and the next candidates, by one position each,
-    /// and how many candidates these are; none where no order varies.
+    /// Term, axis position and number of the next candidates over which this term alone changes, by one position each.
+    /// `None` if no order varies.
     #[inline]
-    pub(crate) fn run(&self) -> Option<(usize, usize, usize)> {
-        let slices = &self.lattice.blocks[self.block].slices;
+    pub(crate) fn adjacent_run(&self) -> Option<(usize, usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].tuples;
         let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
         let group = &self.lattice.groups[g];
         let digit = self.digits[g][group.last()];
         Some((group.terms[group.last()], digit, self.completions[g].run(digit)))
     }
 
-    /// Goes over this many candidates of a stretch.
+    /// Advance by this many candidates of a contiguous block.
     #[inline]
     pub(crate) fn skip(&mut self, count: usize) {
-        let slices = &self.lattice.blocks[self.block].slices;
+        let slices = &self.lattice.blocks[self.block].tuples;
         if let Some(g) = (0..slices.len()).rev().find(|&g| slices[g].count > 1) {
             self.digits[g][self.lattice.groups[g].last()] += count;
         }
     }
 
-    /// The next tuple of a group, if there is one.
+    /// Advance a group to its next tuple. Return whether there is one.
     fn step(&mut self, g: usize) -> bool {
         let last = self.lattice.groups[g].last();
         if let Some(next) = self.completions[g].next(self.digits[g][last] + 1) {
             self.digits[g][last] = next;
             return true;
         }
-        let prefixes = self.lattice.blocks[self.block].slices[g].prefixes;
+        let prefixes = self.lattice.blocks[self.block].tuples[g].prefixes;
         if !(self.prefixes[g] + 1..prefixes).any(|prefix| self.enter(g, prefix)) {
             return false;
         }
@@ -200,7 +199,7 @@ impl<'a> Cursor<'a> {
         self.block
     }
 
-    /// Calls `take` with the position in the equation and in its axis of the orders of this group and those after it.
+    /// Call `take` with the term and the axis position of each order of this group and all later ones.
     #[inline(always)]
     pub(crate) fn each(&self, from: usize, mut take: impl FnMut(usize, usize)) {
         for (group, digits) in self.lattice.groups[from..].iter().zip(&self.digits[from..]) {
@@ -208,7 +207,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Orders of the candidate: its structure.
+    /// Structure of the current candidate.
     pub(crate) fn structure(&self) -> Structure {
         let mut terms = vec![Term { signal: 0, order: 0.0 }; self.lattice.width()];
         for (group, digits) in self.lattice.groups.iter().zip(&self.digits) {
@@ -220,50 +219,51 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// Candidates `lo … hi − 1`: for each row, an order of one term, a run of orders of another.
+/// Candidates `lo … hi − 1`: one row for each order of one term, with a run of orders of another term.
 #[derive(Debug, Clone)]
-pub(crate) struct Slab {
+pub(crate) struct GridSlice {
     pub(crate) lo: u64,
     pub(crate) hi: u64,
-    /// Number of the block, and position of every term's order in its axis at `lo`.
+    /// Number of the block, and axis position of every term's order at `lo`.
     pub(crate) block: usize,
     pub(crate) digits: Vec<usize>,
-    /// The term whose order changes from row to row, and its orders.
+    /// Term whose order changes from row to row, and its orders.
     pub(crate) outer: usize,
     pub(crate) rows: Vec<usize>,
-    /// The term whose order runs along a row, the first of its orders and their number.
+    /// Term whose order varies along a row, its first order and the number of its orders.
     pub(crate) inner: usize,
     pub(crate) first: usize,
     pub(crate) len: usize,
 }
 
-impl Lattice {
-    /// First value in range of a term's axis in a block.
-    pub(crate) fn first(&self, block: usize, term: usize) -> usize {
-        let place = self.groups.iter().zip(&self.blocks[block].slices);
+impl OrderGrid {
+    /// First value of a term's axis within the range of a block.
+    pub(crate) fn first_in_range(&self, block: usize, term: usize) -> usize {
+        let place = self.groups.iter().zip(&self.blocks[block].tuples);
         let mut all = place.flat_map(|(group, slice)| group.terms.iter().zip(&slice.first));
         all.find(|(t, _)| **t == term).map_or(0, |(_, first)| *first)
     }
 
-    /// Most candidates of a slab of the same block.
-    pub(crate) fn largest(&self, slab: &Slab) -> u64 {
+    /// Maximum number of candidates of a slice of the same block.
+    pub(crate) fn max_slice_candidates(&self, slab: &GridSlice) -> u64 {
         let whole = self.groups.iter().find(|group| group.terms.contains(&slab.outer));
-        let axis = whole.map_or(0, |group| group.axes[group.last()].len() - self.first(slab.block, slab.outer));
+        let axis =
+            whole.map_or(0, |group| group.axes[group.last()].len() - self.first_in_range(slab.block, slab.outer));
         (axis * slab.len) as u64
     }
 
-    /// The slab that holds a candidate; none where the signal that runs fastest has several terms, or where no other
-    /// signal has orders to vary.
-    pub(crate) fn slab(&self, index: u64) -> Option<Slab> {
+    /// Slice that contains a candidate. `None` if the fastest signal has several terms, or no other signal has a
+    /// varying order.
+    pub(crate) fn slice_at(&self, index: u64) -> Option<GridSlice> {
         let cursor = Cursor::at(self, index);
         let block = &self.blocks[cursor.block()];
-        let mut varying = (0..self.groups.len()).rev().filter(|&g| block.slices[g].count > 1);
+        let mut varying = (0..self.groups.len()).rev().filter(|&g| block.tuples[g].count > 1);
         let (inner, outer) = (varying.next()?, varying.next()?);
         let (fast, slow) = (&self.groups[inner], &self.groups[outer]);
         if fast.terms.len() != 1 {
             return None;
         }
-        let first = block.slices[inner].first[0];
+        let first = block.tuples[inner].first[0];
         let len = fast.axes[0].len() - first;
         let rows = cursor.completions(outer);
         let mut digits = vec![0; self.width()];
@@ -274,23 +274,24 @@ impl Lattice {
         digits[u] = rows[0];
         digits[v] = first;
         let hi = lo + (rows.len() * len) as u64;
-        Some(Slab { lo, hi, block: cursor.block(), digits, outer: u, rows, inner: v, first, len })
+        Some(GridSlice { lo, hi, block: cursor.block(), digits, outer: u, rows, inner: v, first, len })
     }
 }
-/// Fractional part of the golden section: multiples of it spread evenly.
-const GOLDEN: f64 = 0.618_033_988_75;
+/// Fractional part of the golden ratio. Its multiples are evenly distributed.
+const GOLDEN_FRACTION: f64 = 0.618_033_988_75;
 
-/// A place in [0, 1) of every index; neighbours lie far apart.
+/// Position of an index in [0, 1). Consecutive indices are far apart.
 #[allow(clippy::cast_precision_loss)]
-pub(crate) fn spread(index: u64) -> f64 {
-    (index as f64 * GOLDEN).fract()
+pub(crate) fn low_discrepancy_position(index: u64) -> f64 {
+    (index as f64 * GOLDEN_FRACTION).fract()
 }
 
-/// Visits 0 … count−1 once each, spread over the whole range from the start.
-pub(crate) fn visit(count: u64) -> impl Fn(u64) -> u64 {
-    // The golden section spreads any prefix evenly; the next stride coprime with the count visits all.
+/// Permutation of 0 … count − 1 whose initial parts are evenly distributed.
+pub(crate) fn low_discrepancy_order(count: u64) -> impl Fn(u64) -> u64 {
+    // Multiples of the golden ratio are evenly distributed. The next stride that is coprime with the count visits all
+    // indices.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    let mut stride = ((count as f64 * GOLDEN) as u64).max(1);
+    let mut stride = ((count as f64 * GOLDEN_FRACTION) as u64).max(1);
     while gcd(stride, count) != 1 {
         stride += 1;
     }

@@ -1,7 +1,7 @@
-//! The search of a stage: what its equations share, and the course that it takes.
+//! Best-first evaluation of a coupled search.
 //!
-//! Each equation's distinct orders are evaluated once. Table entries start as lower bounds (left early) and are
-//! sharpened until every tuple that could be kept is exact, so the result is that of enumeration, ties by index.
+//! The distinct orders of each equation are evaluated once. Table entries start as lower bounds (early stop) and are
+//! refined until every tuple that may enter the table is exact. The result equals that of enumeration, ties by index.
 
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
@@ -10,23 +10,25 @@ use rayon::prelude::*;
 
 use crate::equation::Structure;
 use crate::error::{check_length, Error, Result};
-use crate::order_search::candidate::columns::Needed;
+use crate::order_search::candidate::columns::RequiredRegressors;
 use crate::order_search::candidate::problem::{Problem, Scratch};
-use crate::order_search::control::{another, Control};
+use crate::order_search::control::{mismatch_error, Control};
 use crate::order_search::dual_bound::lower_bound::Bound;
-use crate::order_search::grid::order_law::LawLattice;
+use crate::order_search::grid::order_law::OrderLawGrid;
 use crate::order_search::options::{Budget, Norm, Options};
 use crate::order_search::result::{Counts, Failure, Row, Verdict};
-use crate::order_search::stage_join::join::{spans, Candidates, Class, Entries, Entry, Join, Span, OPEN};
+use crate::order_search::stage_join::join::{
+    spans, Candidates, Class, Join, ScoreEntry, ScoreTables, Span, UNEVALUATED_ENTRY,
+};
 use crate::parallel::{pool, PerThread};
 use crate::regressors::Record;
 
-/// An equation's candidates are first followed up to this multiple of its best score.
+/// Ratio to the best score up to which an equation's candidates are evaluated first.
 const FIRST_LIMIT: f64 = 4.0;
-/// Candidates of one equation evaluated between two looks at its best score, at first: a later look tells less.
-const ROUND: usize = 4096;
+/// Minimum candidates of one equation between two updates of its best score.
+const CANDIDATES_PER_UPDATE: usize = 4096;
 
-/// One kept tuple of free orders.
+/// Row of the result table: one tuple of free orders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageRow {
     /// Index in the product of the axes.
@@ -37,86 +39,86 @@ pub struct StageRow {
     pub score: f64,
     /// The structure of each equation.
     pub structures: Vec<Structure>,
-    /// The row of each equation (its index is not used).
+    /// Row of each equation (its index is not used).
     pub rows: Vec<Row>,
 }
 
-/// The result of a search over a stage.
+/// Result of a search over coupled equations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageOutcome {
-    /// Kept rows, best first, ties by index.
+    /// Best rows in ascending order of the score, ties by index.
     pub rows: Vec<StageRow>,
-    /// What became of the tuples.
+    /// Number of tuples by outcome.
     pub counts: Counts,
-    /// The first tuples without a score by index, at most 100.
+    /// First tuples without a score by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
-    /// Distinct candidates of each equation.
+    /// Number of distinct candidates of each equation.
     pub distinct: Vec<u64>,
 }
 
-/// What the candidates of one equation share.
+/// Candidates of one equation and their shared data.
 struct Table {
     problem: Problem,
     candidates: Candidates,
-    /// Those that some tuple needs.
+    /// Candidates that occur in some tuple.
     used: Vec<usize>,
     scale: f64,
 }
 
 impl Table {
-    fn entry(&self, verdict: Verdict) -> Entry {
+    fn entry(&self, verdict: Verdict) -> ScoreEntry {
         let score = |raw: f64| self.problem.score(raw) / self.scale;
         match verdict {
-            Verdict::Score(raw) => Entry { value: score(raw), class: Class::Exact },
-            Verdict::Bounded(raw) => Entry { value: score(raw), class: Class::Bounded },
-            Verdict::Stopped(raw) => Entry { value: score(raw), class: Class::Open },
-            Verdict::Failed(failure) => Entry { value: f64::INFINITY, class: Class::Failed(failure) },
+            Verdict::Score(raw) => ScoreEntry { value: score(raw), class: Class::Exact },
+            Verdict::Bounded(raw) => ScoreEntry { value: score(raw), class: Class::Bounded },
+            Verdict::Stopped(raw) => ScoreEntry { value: score(raw), class: Class::Open },
+            Verdict::Failed(failure) => ScoreEntry { value: f64::INFINITY, class: Class::Failed(failure) },
         }
     }
 }
 
-/// A stage made ready: what the candidates of its equations share.
+/// Stage of coupled equations, prepared for a search, with the data shared by their candidates.
 pub struct Stage<'a> {
-    lattice: Cow<'a, LawLattice>,
+    lattice: Cow<'a, OrderLawGrid>,
     options: Options,
     tables: Vec<Table>,
     samples: f64,
 }
 
-/// How far the search of a stage is: what is known of every candidate, and which are to be followed next.
+/// State of a coupled search: scores of every candidate, and the candidates to evaluate next.
 ///
-/// What comes next depends on nothing but what the candidates before came to, so these may be followed anywhere, in any
-/// order, and a search goes on from their verdicts.
-pub struct Course {
+/// The next candidates depend only on the verdicts of earlier ones. They may therefore be evaluated anywhere and in any
+/// order.
+pub struct SearchState {
     join: Join,
-    known: Entries,
-    /// In the first pass: the equation, how many of its candidates are done or wanted, its best score so far.
+    entries: ScoreTables,
+    /// First pass: current equation, number of its candidates already requested, its best score so far.
     pass: (usize, usize, f64),
-    raise: f64,
-    wanted: Vec<Span>,
+    limit_factor: f64,
+    pending_spans: Vec<Span>,
     total: u64,
-    /// The best exact tuples, once the first pass is over.
+    /// Best exact tuples, after the first pass.
     kept: Vec<(f64, u64)>,
 }
 
 impl<'a> Stage<'a> {
-    /// Lays out the join and builds what every equation's candidates share.
+    /// Build the join and the data shared by every equation's candidates.
     ///
-    /// `fixed[e]` gives known coefficients of equation e, `scales[e]` what its score is divided by (say σ(y)·M for norm
-    /// L1), so that radians of hub and of deflection weigh alike.
+    /// The entry `fixed[e]` holds the fixed coefficients of equation e, and `scales[e]` divides its score. An example
+    /// for norm L1 is σ(y)·M. Joint angles and link deflections then have equal weight.
     ///
     /// # Errors
-    /// As [`crate::order_search::batches::search`]; [`Error::EmptyLattice`] where no tuple obeys the law,
+    /// As [`crate::order_search::batches::search`]; [`Error::EmptyOrderGrid`] where no tuple obeys the law,
     /// [`Error::OutOfRange`] for a scale that is not positive.
     pub fn new(
         records: &[Record],
-        lattice: Cow<'a, LawLattice>,
+        lattice: Cow<'a, OrderLawGrid>,
         fixed: &[Vec<Option<f64>>],
         scales: &[f64],
         options: &Options,
         pool: &rayon::ThreadPool,
         control: &Control,
-    ) -> Result<(Self, Course)> {
+    ) -> Result<(Self, SearchState)> {
         let equations = lattice.equations();
         check_length("fixed coefficients", equations.len(), fixed.len())?;
         check_length("scales", equations.len(), scales.len())?;
@@ -135,7 +137,7 @@ impl<'a> Stage<'a> {
         let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
         let (join, used) = Join::new(&lattice, &mut candidates, options.memory, pool, control)?;
         if join.tuples() == 0 {
-            return Err(Error::EmptyLattice { why: "no tuple of free orders gives orders in range".into() });
+            return Err(Error::EmptyOrderGrid { why: "no tuple of free orders gives orders in range".into() });
         }
         #[allow(clippy::cast_precision_loss)]
         let samples = records.iter().map(Record::m).sum::<usize>() as f64;
@@ -144,14 +146,14 @@ impl<'a> Stage<'a> {
         budget.add_layout(join.bytes());
         for (e, (candidates, used)) in candidates.into_iter().zip(used).enumerate() {
             check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
-            let mut needed = Needed::new(&options.initial);
+            let mut needed = RequiredRegressors::new(&options.initial);
             for &id in &used {
                 let structure = candidates.structure(id);
-                needed.alpha(structure.order);
-                structure.terms.iter().for_each(|term| needed.term(structure.order, term.signal, term.order));
+                needed.add_alpha(structure.order);
+                structure.terms.iter().for_each(|term| needed.add_term(structure.order, term.signal, term.order));
             }
-            let index = needed.index();
-            budget.add(records, equations[e].output, &index, options, Bound::POOL);
+            let index = needed.into_index();
+            budget.add(records, equations[e].output, &index, options, Bound::MAX_TEST_VECTORS);
             indices.push((index, candidates, used));
         }
         budget.check(options.memory)?;
@@ -166,47 +168,47 @@ impl<'a> Stage<'a> {
             tables.push(Table { problem, candidates, used, scale: scales[e] });
         }
         let stage = Self { lattice, options: options.clone(), tables, samples };
-        let mut course = Course {
+        let mut course = SearchState {
             join,
-            known: stage.tables.iter().map(|t| vec![OPEN; t.candidates.len()]).collect(),
+            entries: stage.tables.iter().map(|t| vec![UNEVALUATED_ENTRY; t.candidates.len()]).collect(),
             pass: (0, 0, f64::INFINITY),
-            raise: FIRST_LIMIT,
-            wanted: Vec::new(),
+            limit_factor: FIRST_LIMIT,
+            pending_spans: Vec::new(),
             total: stage.tables.iter().map(|t| t.used.len() as u64).sum(),
             kept: Vec::new(),
         };
-        course.next(&stage, pool, control)?;
+        course.plan_next(&stage, pool, control)?;
         Ok((stage, course))
     }
 
-    /// The raw sum up to which a candidate is followed for a scaled score.
-    fn raw(&self, equation: usize, score: f64) -> f64 {
+    /// Raw sum up to which a candidate is evaluated for a scaled score.
+    fn raw_limit(&self, equation: usize, score: f64) -> f64 {
         let scaled = score * self.tables[equation].scale;
         let raw = match self.options.norm {
             Norm::L1 => scaled,
             Norm::L2 => scaled * scaled * self.samples,
         };
-        // A hair above, so that a tie in the scaled sum is followed to its end.
+        // Margin, so that a tie in the scaled sum is evaluated completely.
         raw * (1.0 + 1e-12)
     }
 
-    /// Follows these candidates: what each came to, in raw sums.
+    /// Evaluate these candidates. Return their verdicts in raw sums.
     ///
     /// # Errors
-    /// Candidates that this stage has not, or [`Error::Interrupted`].
+    /// Candidates that are not part of this stage, or [`Error::Interrupted`].
     pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
         let mut wanted = Vec::new();
         for &Span { equation, first, last, limit } in spans {
             let used = self.tables.get(equation).map_or(&[][..], |table| &table.used);
-            // Candidates that no tuple needs have no regressors.
+            // Candidates that occur in no tuple have no regressors.
             let known =
                 first < last && last - first <= used.len() && (first..last).all(|id| used.binary_search(&id).is_ok());
             if !known || limit.is_nan() {
                 let count = used.len();
                 let what = format!("candidates {first} to {last} of equation {equation} are not among its {count}");
-                return Err(another(what));
+                return Err(mismatch_error(what));
             }
-            let limit = self.raw(equation, limit);
+            let limit = self.raw_limit(equation, limit);
             wanted.extend((first..last).map(|id| (equation, id, limit)));
         }
         let scratches = PerThread::<Scratch>::new(pool);
@@ -228,17 +230,17 @@ impl<'a> Stage<'a> {
         Ok(verdicts)
     }
 
-    /// The result of a search that has nothing left to follow.
+    /// Result of a completed search.
     ///
     /// # Errors
-    /// A search that has something left, or an internal fault.
-    pub fn outcome(&self, course: &Course, control: &Control) -> Result<StageOutcome> {
-        if !course.wanted.is_empty() {
+    /// Candidates that are not evaluated yet, or an internal fault.
+    pub fn outcome(&self, course: &SearchState, control: &Control) -> Result<StageOutcome> {
+        if !course.pending_spans.is_empty() {
             let what = "a search that has candidates left to follow has no result".into();
             return Err(Error::Structure { what, remedy: "follow them, and take in what they come to".into() });
         }
         course.check(self)?;
-        let (mut counts, failures) = course.join.count(&course.states());
+        let (mut counts, failures) = course.join.count_outcomes(&course.states());
         counts.kept = course.kept.len() as u64;
         counts.beaten -= counts.kept;
         let mut scratch = Scratch::default();
@@ -260,51 +262,51 @@ impl<'a> Stage<'a> {
         Ok(StageOutcome { rows, counts, failures, distinct })
     }
 
-    /// Its lattice.
+    /// Order grid of the stage.
     #[must_use]
-    pub fn lattice(&self) -> &LawLattice {
+    pub fn lattice(&self) -> &OrderLawGrid {
         &self.lattice
     }
 }
 
-impl Course {
-    /// Candidates to follow next; none at the end.
+impl SearchState {
+    /// Candidates to evaluate next. Empty at the end.
     #[must_use]
-    pub fn wanted(&self) -> &[Span] {
-        &self.wanted
+    pub fn pending_spans(&self) -> &[Span] {
+        &self.pending_spans
     }
 
-    /// Candidates to follow in all, as far as is known: one that was left early may have to be followed further.
+    /// Number of candidates to evaluate in total, as far as known. A candidate stopped early may be evaluated again.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.total
     }
 
-    /// Best score of a tuple, once there is one.
+    /// Best score of a tuple, if there is one.
     #[must_use]
     pub fn best(&self) -> Option<f64> {
         self.kept.first().map(|kept| kept.0)
     }
 
-    /// Refuses to go on with another stage.
+    /// Raise an error if the state belongs to another stage.
     fn check(&self, stage: &Stage<'_>) -> Result<()> {
         let candidates = stage.tables.iter().map(|table| table.candidates.len());
-        if candidates.eq(self.known.iter().map(Vec::len)) {
+        if candidates.eq(self.entries.iter().map(Vec::len)) {
             Ok(())
         } else {
-            Err(another("a search goes on with another stage than it began with".into()))
+            Err(mismatch_error("a search goes on with another stage than it began with".into()))
         }
     }
 
-    fn states(&self) -> [Vec<Entry>; 2] {
-        std::array::from_fn(|h| self.join.halves[h].states(&self.known))
+    fn states(&self) -> [Vec<ScoreEntry>; 2] {
+        std::array::from_fn(|h| self.join.halves[h].states(&self.entries))
     }
 
-    /// Takes in what the wanted candidates came to, in their order, and finds those to follow next.
+    /// Record the verdicts of the pending candidates, in their order, and select the next ones.
     ///
     /// # Errors
-    /// Verdicts that are not theirs, or [`Error::Interrupted`].
-    pub fn take(
+    /// Verdicts that do not match, or [`Error::Interrupted`].
+    pub fn record_verdicts(
         &mut self,
         stage: &Stage<'_>,
         verdicts: &[Verdict],
@@ -312,55 +314,55 @@ impl Course {
         control: &Control,
     ) -> Result<()> {
         self.check(stage)?;
-        let wanted: usize = self.wanted.iter().map(|span| span.last - span.first).sum();
+        let wanted: usize = self.pending_spans.iter().map(|span| span.last - span.first).sum();
         let sound = |verdict: &Verdict| match *verdict {
             Verdict::Score(raw) | Verdict::Bounded(raw) | Verdict::Stopped(raw) => raw >= 0.0,
             Verdict::Failed(_) => true,
         };
         if verdicts.len() != wanted || !verdicts.iter().all(sound) {
-            return Err(another(format!("{} verdicts are not those of {wanted} candidates", verdicts.len())));
+            return Err(mismatch_error(format!("{} verdicts are not those of {wanted} candidates", verdicts.len())));
         }
         let first_pass = self.pass.0 < stage.tables.len();
         let mut verdicts = verdicts.iter();
-        for span in &self.wanted {
+        for span in &self.pending_spans {
             let table = &stage.tables[span.equation];
-            for (entry, &verdict) in self.known[span.equation][span.first..span.last].iter_mut().zip(&mut verdicts) {
+            for (entry, &verdict) in self.entries[span.equation][span.first..span.last].iter_mut().zip(&mut verdicts) {
                 *entry = table.entry(verdict);
                 if first_pass && entry.class == Class::Exact {
                     self.pass.2 = self.pass.2.min(entry.value);
                 }
             }
         }
-        self.next(stage, pool, control)
+        self.plan_next(stage, pool, control)
     }
 
-    fn next(&mut self, stage: &Stage<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
+    fn plan_next(&mut self, stage: &Stage<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
         control.total.store(self.total, Ordering::Relaxed);
-        // First pass: each equation's own best, the others left at a few times it.
+        // First pass: find each equation's best score. Evaluations stop at a multiple of it.
         while let Some(Table { used, .. }) = stage.tables.get(self.pass.0) {
             let (equation, start, best) = self.pass;
             if start < used.len() {
-                let end = used.len().min(start + if start == 0 { 256 } else { ROUND.max(start / 2) });
-                let limit = if stage.options.early_stopping { FIRST_LIMIT * best } else { f64::INFINITY };
-                self.wanted = spans(equation, used[start..end].iter().map(|&id| (id, limit)));
+                let end = used.len().min(start + if start == 0 { 256 } else { CANDIDATES_PER_UPDATE.max(start / 2) });
+                let limit = if stage.options.pruning { FIRST_LIMIT * best } else { f64::INFINITY };
+                self.pending_spans = spans(equation, used[start..end].iter().map(|&id| (id, limit)));
                 self.pass.1 = end;
                 return Ok(());
             }
             self.pass = (equation + 1, 0, f64::INFINITY);
         }
-        let keep = stage.options.keep;
+        let keep = stage.options.top;
         let states = self.states();
-        self.kept = self.join.best(&states, &self.known, keep, pool, control)?;
+        self.kept = self.join.best(&states, &self.entries, keep, pool, control)?;
         let worst = if self.kept.len() == keep { self.kept[keep - 1].0 } else { f64::INFINITY };
-        self.wanted = self.join.unresolved(&states, &self.known, worst, self.raise, control)?;
-        self.raise *= FIRST_LIMIT;
-        self.total += self.wanted.iter().map(|span| (span.last - span.first) as u64).sum::<u64>();
+        self.pending_spans = self.join.unresolved_spans(&states, &self.entries, worst, self.limit_factor, control)?;
+        self.limit_factor *= FIRST_LIMIT;
+        self.total += self.pending_spans.iter().map(|span| (span.last - span.first) as u64).sum::<u64>();
         control.total.store(self.total, Ordering::Relaxed);
         Ok(())
     }
 }
 
-/// Searches the free orders of a stage: the sum over equations of score / scale is smallest.
+/// Search the free orders that minimize the sum of score / scale over the equations.
 ///
 /// # Errors
 /// As [`Stage::new`].
@@ -370,7 +372,7 @@ impl Course {
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::order_search::stage_join::search;
 /// # use ftlm::equation::AffineOrder;
-/// # use ftlm::order_search::grid::{LawEquation, LawLattice};
+/// # use ftlm::order_search::grid::{LawEquation, OrderLawGrid};
 /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
 /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
 /// # use ftlm::regressors::Record;
@@ -381,7 +383,7 @@ impl Course {
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 1.0);
 /// // D^α y = D^{α−1} u for any α: y is the integral of u.
 /// let record = Record::new(0.1, vec![output, input], None)?;
-/// let lattice = LawLattice::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
+/// let lattice = OrderLawGrid::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
 /// let fixed = [vec![None]];
 /// let found = search(&[record], &lattice, &fixed, &[1.0], &Options::default(), &Control::default())?;
 /// assert_eq!(found.counts.candidates, 2);
@@ -390,7 +392,7 @@ impl Course {
 /// ```
 pub fn search(
     records: &[Record],
-    lattice: &LawLattice,
+    lattice: &OrderLawGrid,
     fixed: &[Vec<Option<f64>>],
     scales: &[f64],
     options: &Options,
@@ -398,9 +400,9 @@ pub fn search(
 ) -> Result<StageOutcome> {
     let pool = pool(options.threads)?;
     let (stage, mut course) = Stage::new(records, Cow::Borrowed(lattice), fixed, scales, options, &pool, control)?;
-    while !course.wanted().is_empty() {
-        let verdicts = stage.evaluate(course.wanted(), &pool, control)?;
-        course.take(&stage, &verdicts, &pool, control)?;
+    while !course.pending_spans().is_empty() {
+        let verdicts = stage.evaluate(course.pending_spans(), &pool, control)?;
+        course.record_verdicts(&stage, &verdicts, &pool, control)?;
     }
     stage.outcome(&course, control)
 }

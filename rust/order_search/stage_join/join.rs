@@ -1,17 +1,11 @@
-//! The layout of a join: which orders of the equations fit together under the law.
+//! Layout of a join: compatible orders of the equations under the order law, with their scores and bounds.
 //!
-//! The law ties the equations' orders to a few free ones, so many tuples of free orders share an equation's orders.
-//! The free orders are split between the first equation and the others: x = (a, b). An equation's orders are then what
-//! its own half of x gives plus what the other half adds, and that addend takes few distinct values: (a, addend from b)
-//! and (b, addend from a) fit together exactly where each names the other's addend. Rows of both halves meet in the
-//! bucket of the two addends; within a bucket every pair is a tuple, and every tuple is one pair of one bucket. The
-//! product of the axes is never gone through.
-//!
-//! What is known of the candidates of each equation: a score, or a bound below it.
-//!
-//! The distinct orders that an order law gives one equation: the candidates of a stage, by number.
-//!
-//! What free orders add to the order laws of some equations: the addends by which the halves of a join meet.
+//! The law ties the equations' orders to a few free orders, so many tuples of free orders share an equation's orders.
+//! The free orders are divided between the first equation and the others: x = (a, b). An equation's orders are the
+//! contribution of its own half of x plus an addend from the other half, which takes few distinct values. (a, addend
+//! from b) and (b, addend from a) are compatible exactly if each names the other's addend. Rows of both halves meet
+//! in the bucket of the two addends. Every pair within a bucket is a tuple, and every tuple is one pair of one
+//! bucket. The product of the axes is never enumerated.
 
 use std::collections::hash_map::Entry as Slot;
 use std::collections::HashMap;
@@ -22,42 +16,42 @@ use rayon::prelude::*;
 use crate::equation::{grains, tidy, Structure, Term};
 use crate::error::{Error, Result};
 use crate::order_search::control::Control;
-use crate::order_search::grid::order_law::{LawEquation, LawLattice};
+use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
 use crate::order_search::result::Failure;
 
-/// A row of one half of the join: a choice of its own free orders, and the addend of the other half's.
+/// Row of one half of the join: values of its own free orders, and the addend of the other half.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Part {
-    /// The two addends by which it meets rows of the other half.
+pub(super) struct HalfRow {
+    /// Bucket number, from the two addends that the row shares with rows of the other half.
     bucket: u64,
-    /// What its own free orders contribute to the index of a tuple.
+    /// Contribution of its own free orders to the index of a tuple.
     pub(super) index: u64,
-    /// Which candidates of its equations it names.
+    /// Number of the combination of candidates of its equations.
     pub(super) combination: u32,
 }
 
 /// One half of the join.
 pub(super) struct Half {
     pub(super) equations: Range<usize>,
-    /// Candidates of each equation, combination after combination.
+    /// Candidates of each equation, combination by combination.
     combinations: Vec<u32>,
-    pub(super) parts: Vec<Part>,
+    pub(super) rows: Vec<HalfRow>,
 }
 
 impl Half {
-    /// Sum and class of every combination.
-    pub(super) fn states(&self, known: &Entries) -> Vec<Entry> {
+    /// Sum of scores and class of every combination.
+    pub(super) fn states(&self, known: &ScoreTables) -> Vec<ScoreEntry> {
         let width = self.equations.len();
         if width == 0 {
-            return vec![Entry { value: 0.0, class: Class::Exact }];
+            return vec![ScoreEntry { value: 0.0, class: Class::Exact }];
         }
         self.combinations
             .chunks_exact(width)
             .map(|ids| {
                 let entries = self.equations.clone().zip(ids).map(|(e, &id)| known[e][id as usize]);
-                entries.fold(Entry { value: 0.0, class: Class::Exact }, |sum, entry| Entry {
+                entries.fold(ScoreEntry { value: 0.0, class: Class::Exact }, |sum, entry| ScoreEntry {
                     value: sum.value + entry.value,
-                    class: sum.class.with(entry.class),
+                    class: sum.class.combine(entry.class),
                 })
             })
             .collect()
@@ -69,29 +63,35 @@ impl Half {
     }
 }
 
-/// Rows of both halves that fit together, each with each.
+/// Rows of both halves that are compatible, each with each.
 pub(super) struct Bucket {
     pub(super) rows: [Range<usize>; 2],
 }
 
-/// The layout of a join.
+/// Layout of a join.
 pub(super) struct Join {
     pub(super) halves: [Half; 2],
     pub(super) buckets: Vec<Bucket>,
 }
 
-/// Most rows of both halves: they take a GB.
-const MAX_PARTS: u128 = 40_000_000;
-/// Memory of a row, and as much again while their list grows.
-const ROW: u128 = 2 * size_of::<Part>() as u128;
-/// Free orders whose place in either half is tried; more go to the second.
-const PLACED: usize = 10;
+/// Maximum rows of both halves, about 1 GB.
+const MAX_HALF_ROWS: u128 = 40_000_000;
+/// Memory per row, doubled while the list grows [bytes].
+const BYTES_PER_HALF_ROW: u128 = 2 * size_of::<HalfRow>() as u128;
+/// Maximum free orders assigned to either half by trial. Further ones belong to the second half.
+const MAX_SPLIT_ORDERS: usize = 10;
 
-/// The free orders that go to the first half: those that leave the fewest rows.
-fn split(lattice: &LawLattice, rows: &[Sums; 2], memory: u64, control: &Control) -> Result<Vec<usize>> {
+/// Select the free orders of the first half such that the number of rows is smallest.
+fn split_free_orders(
+    lattice: &OrderLawGrid,
+    rows: &[OrderLawSums; 2],
+    memory: u64,
+    control: &Control,
+) -> Result<Vec<usize>> {
     let axes: Vec<usize> = (0..lattice.axes().len()).collect();
     let size = |axes: &[usize]| axes.iter().map(|&a| lattice.axes()[a].len() as u128).product::<u128>();
-    let several: Vec<usize> = axes.iter().copied().filter(|&a| lattice.axes()[a].len() > 1).take(PLACED).collect();
+    let several: Vec<usize> =
+        axes.iter().copied().filter(|&a| lattice.axes()[a].len() > 1).take(MAX_SPLIT_ORDERS).collect();
     let mut plans: Vec<(u128, Vec<usize>, Vec<usize>)> = (0..1usize << several.len())
         .map(|mask| {
             let own: Vec<usize> =
@@ -107,18 +107,18 @@ fn split(lattice: &LawLattice, rows: &[Sums; 2], memory: u64, control: &Control)
         if floor >= least {
             break;
         }
-        let limit = |size: u128| usize::try_from((least / size).min(MAX_PARTS)).unwrap_or(usize::MAX);
-        let Some(first) = rows[0].image(lattice, &other, limit(size(&own)), control)? else { continue };
-        let Some(second) = rows[1].image(lattice, &own, limit(size(&other)), control)? else { continue };
+        let limit = |size: u128| usize::try_from((least / size).min(MAX_HALF_ROWS)).unwrap_or(usize::MAX);
+        let Some(first) = rows[0].distinct_sums(lattice, &other, limit(size(&own)), control)? else { continue };
+        let Some(second) = rows[1].distinct_sums(lattice, &own, limit(size(&other)), control)? else { continue };
         let count = size(&own) * first.len() as u128 + size(&other) * second.len() as u128;
         if count < least {
             (least, best) = (count, own);
         }
     }
-    if least > MAX_PARTS {
-        return Err(Error::LatticeTooLarge { count: least.min(u128::from(lattice.product())), limit: MAX_PARTS });
+    if least > MAX_HALF_ROWS {
+        return Err(Error::OrderGridTooLarge { count: least.min(u128::from(lattice.product())), limit: MAX_HALF_ROWS });
     }
-    let (bytes, limit) = (ROW * least, u128::from(memory));
+    let (bytes, limit) = (BYTES_PER_HALF_ROW * least, u128::from(memory));
     if bytes > limit {
         return Err(Error::Memory { what: format!("{least} rows of the layout of the order law"), bytes, limit });
     }
@@ -126,10 +126,10 @@ fn split(lattice: &LawLattice, rows: &[Sums; 2], memory: u64, control: &Control)
 }
 
 impl Join {
-    /// Lays out the join and the distinct candidates of every equation; marks those that some tuple needs. Refuses rows of
-    /// more than so many bytes.
+    /// Build the join and the distinct candidates of every equation, and mark the candidates that occur in some tuple.
+    /// Raises an error for rows beyond this memory [bytes].
     pub(super) fn new(
-        lattice: &LawLattice,
+        lattice: &OrderLawGrid,
         candidates: &mut [Candidates],
         memory: u64,
         pool: &rayon::ThreadPool,
@@ -137,11 +137,11 @@ impl Join {
     ) -> Result<(Self, Vec<Vec<usize>>)> {
         let count = candidates.len();
         let ranges = [0..count.min(1), count.min(1)..count];
-        let rows = ranges.clone().map(|range| Sums::new(lattice, range));
-        let own = split(lattice, &rows, memory, control)?;
+        let rows = ranges.clone().map(|range| OrderLawSums::new(lattice, range));
+        let own = split_free_orders(lattice, &rows, memory, control)?;
         let other: Vec<usize> = (0..lattice.axes().len()).filter(|axis| !own.contains(axis)).collect();
-        let full = |axes: &[usize], rows: &Sums| {
-            rows.image(lattice, axes, usize::MAX, control)?
+        let full = |axes: &[usize], rows: &OrderLawSums| {
+            rows.distinct_sums(lattice, axes, usize::MAX, control)?
                 .ok_or_else(|| Error::Internal { what: "an image without a limit".into() })
         };
         let addends = [full(&other, &rows[0])?, full(&own, &rows[1])?];
@@ -149,14 +149,14 @@ impl Join {
         let mut halves = Vec::with_capacity(2);
         for (h, axes) in [&own, &other].into_iter().enumerate() {
             let equations = ranges[h].clone();
-            let mut half = Half { equations: equations.clone(), combinations: Vec::new(), parts: Vec::new() };
+            let mut half = Half { equations: equations.clone(), combinations: Vec::new(), rows: Vec::new() };
             let mut known: HashMap<Box<[u32]>, u32> = HashMap::new();
             let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
-            rows[h].each(lattice, axes, &rows[1 - h], |index, sums, theirs| {
+            rows[h].for_each_choice(lattice, axes, &rows[1 - h], |index, sums, theirs| {
                 control.check_stop()?;
                 let Some(named) = addends[1 - h].find(theirs) else { return Ok(()) };
                 for (number_of_addend, addend) in addends[h].each().enumerate() {
-                    if number_of_addend % LOOK == LOOK - 1 {
+                    if number_of_addend % ROWS_PER_STOP_CHECK == ROWS_PER_STOP_CHECK - 1 {
                         control.check_stop()?;
                     }
                     if !rows[h].orders(lattice, sums, addend, &mut orders) {
@@ -166,25 +166,25 @@ impl Join {
                         combination(lattice, candidates, &mut half, &mut known, &orders, &mut key, &mut ids)?;
                     let (mine, named) = (number_of_addend as u64, u64::from(named));
                     let bucket = if h == 0 { mine * stride + named } else { named * stride + mine };
-                    half.parts.push(Part { bucket, index, combination });
+                    half.rows.push(HalfRow { bucket, index, combination });
                 }
                 Ok(())
             })?;
             control.check_stop()?;
-            pool.install(|| half.parts.par_sort_unstable_by_key(|part| (part.bucket, part.index)));
+            pool.install(|| half.rows.par_sort_unstable_by_key(|part| (part.bucket, part.index)));
             halves.push(half);
         }
         let [first, second] =
             <[Half; 2]>::try_from(halves).map_err(|_| Error::Internal { what: "a join without two halves".into() })?;
         let mut join = Self { halves: [first, second], buckets: Vec::new() };
-        join.meet(control)?;
+        join.match_buckets(control)?;
         let mut used: Vec<Vec<bool>> = candidates.iter().map(|c| vec![false; c.len()]).collect();
         for (i, bucket) in join.buckets.iter().enumerate() {
-            if i % LOOK == 0 {
+            if i % ROWS_PER_STOP_CHECK == 0 {
                 control.check_stop()?;
             }
             for (half, rows) in join.halves.iter().zip(&bucket.rows) {
-                for part in &half.parts[rows.clone()] {
+                for part in &half.rows[rows.clone()] {
                     for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
                         used[e][id as usize] = true;
                     }
@@ -195,10 +195,10 @@ impl Join {
         Ok((join, used))
     }
 
-    /// Finds the buckets that hold rows of both halves.
-    fn meet(&mut self, control: &Control) -> Result<()> {
-        let [a, b] = [&self.halves[0].parts, &self.halves[1].parts];
-        let end = |parts: &[Part], start: usize| {
+    /// Find the buckets with rows of both halves.
+    fn match_buckets(&mut self, control: &Control) -> Result<()> {
+        let [a, b] = [&self.halves[0].rows, &self.halves[1].rows];
+        let end = |parts: &[HalfRow], start: usize| {
             start + parts[start..].iter().take_while(|part| part.bucket == parts[start].bucket).count()
         };
         let (mut i, mut j) = (0, 0);
@@ -206,7 +206,7 @@ impl Join {
             if i >= a.len() || j >= b.len() {
                 break;
             }
-            if step % LOOK == 0 {
+            if step % ROWS_PER_STOP_CHECK == 0 {
                 control.check_stop()?;
             }
             match a[i].bucket.cmp(&b[j].bucket) {
@@ -222,9 +222,9 @@ impl Join {
         Ok(())
     }
 
-    /// Memory of its rows.
+    /// Memory of the rows [bytes].
     pub(super) fn bytes(&self) -> u128 {
-        self.halves.iter().map(|half| (half.parts.capacity() * size_of::<Part>()) as u128).sum()
+        self.halves.iter().map(|half| (half.rows.capacity() * size_of::<HalfRow>()) as u128).sum()
     }
 
     /// Number of tuples.
@@ -233,9 +233,9 @@ impl Join {
     }
 }
 
-/// The combination of candidates with these orders, equation after equation, added at the end if new.
+/// Number of the combination of candidates with these orders, appended if it is new.
 fn combination(
-    lattice: &LawLattice,
+    lattice: &OrderLawGrid,
     candidates: &mut [Candidates],
     half: &mut Half,
     known: &mut HashMap<Box<[u32]>, u32>,
@@ -253,39 +253,39 @@ fn combination(
     match known.entry(ids.as_slice().into()) {
         Slot::Occupied(slot) => Ok(*slot.get()),
         Slot::Vacant(slot) => {
-            // Every equation adds its candidates in the order of combinations where it is alone.
-            let next = number(if ids.is_empty() { 0 } else { half.combinations.len() / ids.len() })?;
+            // Without free orders of their own, equations add candidates in the order of combinations.
+            let next = to_u32(if ids.is_empty() { 0 } else { half.combinations.len() / ids.len() })?;
             half.combinations.extend_from_slice(ids);
             Ok(*slot.insert(next))
         }
     }
 }
 
-/// What is known of one equation's candidate: its scaled score, or a bound below it.
+/// Score of one equation's candidate divided by its scale, or a lower bound of it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Entry {
+pub(super) struct ScoreEntry {
     pub(super) value: f64,
     pub(super) class: Class,
 }
 
-/// What became of a candidate, or of several together: the first failure, else the largest.
+/// Class of an entry, or of several combined: the first failure, else the largest class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Class {
     Exact,
-    /// A bound without a run is all that is known.
+    /// Only a lower bound without simulation exists.
     Bounded,
-    /// Left at a partial sum, or not looked at.
+    /// Early stop at a partial sum, or no evaluation yet.
     Open,
     Failed(Failure),
 }
 
 impl Class {
-    pub(super) fn failed(self) -> bool {
+    pub(super) fn is_failed(self) -> bool {
         matches!(self, Self::Failed(_))
     }
 
-    pub(super) fn with(self, later: Self) -> Self {
-        if self.failed() {
+    pub(super) fn combine(self, later: Self) -> Self {
+        if self.is_failed() {
             self
         } else {
             self.max(later)
@@ -293,26 +293,26 @@ impl Class {
     }
 }
 
-/// Of a candidate that was not looked at.
-pub(super) const OPEN: Entry = Entry { value: 0.0, class: Class::Open };
+/// Entry of a candidate that has not been evaluated.
+pub(super) const UNEVALUATED_ENTRY: ScoreEntry = ScoreEntry { value: 0.0, class: Class::Open };
 
-/// What is known of every candidate of every equation.
-pub(super) type Entries = Vec<Vec<Entry>>;
+/// Entries of every candidate of every equation.
+pub(super) type ScoreTables = Vec<Vec<ScoreEntry>>;
 
-/// Candidates `first … last − 1` of one equation, to be followed up to one limit of its scaled score.
+/// Candidates `first … last − 1` of one equation, to be evaluated up to one limit of the scaled score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
-    /// Equation.
+    /// Number of the equation.
     pub equation: usize,
-    /// See above.
+    /// First candidate.
     pub first: usize,
-    /// See above.
+    /// Candidate after the last one.
     pub last: usize,
-    /// See above.
+    /// Limit of the scaled score.
     pub limit: f64,
 }
 
-/// Candidates of an equation with the limit of each, in stretches that share one.
+/// Group the candidates of an equation into spans with the same limit.
 pub(super) fn spans(equation: usize, wanted: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
     let mut spans: Vec<Span> = Vec::new();
     for (id, limit) in wanted {
@@ -343,14 +343,14 @@ impl Candidates {
         self.ids.len()
     }
 
-    /// Number of the candidate with these orders, added at the end if new.
+    /// Number of the candidate with these orders, appended if it is new.
     pub(super) fn id(&mut self, orders: &[f64], key: &mut Vec<i64>) -> Result<u32> {
         key.clear();
         key.extend(orders.iter().map(|&v| grains(v)));
         if let Some(&id) = self.ids.get(key.as_slice()) {
             return Ok(id);
         }
-        let id = number(self.ids.len())?;
+        let id = to_u32(self.ids.len())?;
         self.ids.insert(key.as_slice().into(), id);
         self.orders.extend_from_slice(orders);
         Ok(id)
@@ -364,40 +364,41 @@ impl Candidates {
     }
 }
 
-/// A count as a number of 32 bits, which is what tables hold.
-pub(super) fn number(count: usize) -> Result<u32> {
+/// A count as a 32-bit number, the type of the tables.
+pub(super) fn to_u32(count: usize) -> Result<u32> {
     u32::try_from(count).map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })
 }
 
-/// Rows of a layout between two looks at whether it is to stop.
-pub(super) const LOOK: usize = 4096;
+/// Rows of a layout between two checks for a stop request.
+pub(super) const ROWS_PER_STOP_CHECK: usize = 4096;
 
-/// Vectors of sums, each once.
+/// Distinct vectors of sums.
 #[derive(Debug)]
-pub(super) struct Distinct {
+pub(super) struct DistinctSums {
     width: usize,
     count: usize,
     values: Vec<f64>,
     ids: HashMap<Box<[i64]>, u32>,
 }
 
-impl Drop for Distinct {
-    /// Millions of keys take longer to give back than Ctrl-C may take, so nobody waits for it.
+impl Drop for DistinctSums {
+    /// Deallocate millions of keys in the background, since this would delay a response to Ctrl-C.
     fn drop(&mut self) {
-        if self.count > 8 * LOOK {
+        if self.count > 8 * ROWS_PER_STOP_CHECK {
             let ids = std::mem::take(&mut self.ids);
-            // Where no thread can be had they are given back here.
+            // If no thread can be started, the keys are deallocated here.
             drop(std::thread::Builder::new().spawn(move || drop(ids)));
         }
     }
 }
 
-impl Distinct {
+impl DistinctSums {
     fn of(width: usize) -> Self {
         Self { width, count: 0, values: Vec::new(), ids: HashMap::new() }
     }
 
-    /// Sums are of multiples of the grain by short weights: a thousandth of it tells them apart and forgives rounding.
+    /// Key of a vector of sums, in units of a thousandth of the order resolution. This absorbs the rounding of the
+    /// sums.
     #[allow(clippy::cast_possible_truncation)]
     fn key(sums: &[f64]) -> Box<[i64]> {
         sums.iter().map(|v| (v * 1e12).round() as i64).collect()
@@ -426,16 +427,16 @@ impl Distinct {
     }
 }
 
-/// The order laws of some equations of a stage, whose free orders come in two parts.
-pub(super) struct Sums {
+/// Order laws of some equations of a stage, with the free orders divided into two sets.
+pub(super) struct OrderLawSums {
     equations: Range<usize>,
     constants: Vec<f64>,
     /// Weights of each free order.
     weights: Vec<Vec<f64>>,
 }
 
-impl Sums {
-    pub(super) fn new(lattice: &LawLattice, equations: Range<usize>) -> Self {
+impl OrderLawSums {
+    pub(super) fn new(lattice: &OrderLawGrid, equations: Range<usize>) -> Self {
         let laws = || lattice.equations()[equations.clone()].iter().flat_map(LawEquation::laws);
         let constants = laws().map(|law| law.constant).collect();
         let weights = (0..lattice.axes().len())
@@ -444,25 +445,25 @@ impl Sums {
         Self { constants, weights, equations }
     }
 
-    /// What these free orders add to the laws: distinct sums, or none where there are more than the limit.
+    /// Distinct contributions of these free orders to the laws. `None` if there are more than the limit.
     ///
     /// # Errors
     /// [`crate::error::Error::Interrupted`].
-    pub(super) fn image(
+    pub(super) fn distinct_sums(
         &self,
-        lattice: &LawLattice,
+        lattice: &OrderLawGrid,
         axes: &[usize],
         limit: usize,
         control: &Control,
-    ) -> Result<Option<Distinct>> {
+    ) -> Result<Option<DistinctSums>> {
         let width = self.constants.len();
-        let mut found = Distinct::of(width);
+        let mut found = DistinctSums::of(width);
         found.insert(&vec![0.0; width]);
         for &axis in axes {
-            let mut next = Distinct::of(width);
+            let mut next = DistinctSums::of(width);
             for sums in found.each() {
                 for (i, value) in lattice.axes()[axis].iter().enumerate() {
-                    if i % LOOK == 0 {
+                    if i % ROWS_PER_STOP_CHECK == 0 {
                         control.check_stop()?;
                     }
                     let sums: Vec<f64> = sums.iter().zip(&self.weights[axis]).map(|(s, w)| s + w * value).collect();
@@ -477,14 +478,14 @@ impl Sums {
         Ok(Some(found))
     }
 
-    /// Calls `take` for every choice of these free orders with its part of a tuple's index, its sums in these laws
-    /// (constants included) and its sums in the others (without).
+    /// Call `take` for every choice of these free orders. Its arguments are the contribution to a tuple's index, the
+    /// sums in these laws (constants included) and the sums in the other laws (without).
     ///
     /// # Errors
-    /// The first of `take`.
-    pub(super) fn each(
+    /// The first error of `take`.
+    pub(super) fn for_each_choice(
         &self,
-        lattice: &LawLattice,
+        lattice: &OrderLawGrid,
         axes: &[usize],
         others: &Self,
         mut take: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
@@ -514,8 +515,8 @@ impl Sums {
         }
     }
 
-    /// The orders of these equations from own sums and an addend; tells whether they make equations.
-    pub(super) fn orders(&self, lattice: &LawLattice, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
+    /// Compute the orders of these equations from their own sums and an addend. Return whether they form equations.
+    pub(super) fn orders(&self, lattice: &OrderLawGrid, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
         orders.clear();
         orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));
         let mut rest = &orders[..];

@@ -1,8 +1,8 @@
-//! Order search over all equations of a stage under its order law, by joining the equations' score tables on the law.
+//! Order search over coupled equations, by joining the score tables of the equations on their order law.
 
 mod best_first;
 mod join;
 mod tuples;
 
-pub use best_first::{search, Course, Stage, StageOutcome, StageRow};
+pub use best_first::{search, SearchState, Stage, StageOutcome, StageRow};
 pub use join::Span;

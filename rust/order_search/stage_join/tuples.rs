@@ -1,21 +1,27 @@
-//! Tuples of a join: the best of the best buckets, those that are yet to be resolved, and what became of all, counted
-//! bucket by bucket.
+//! Tuples of a join: the best ones, the unresolved ones, and the counts by outcome.
+//!
+//! They are found bucket by bucket.
 
 use rayon::prelude::*;
 
 use crate::error::Result;
 use crate::order_search::control::Control;
-use crate::order_search::result::{Counts, Failure, LISTED};
-use crate::order_search::stage_join::join::{spans, Bucket, Class, Entries, Entry, Join, Part, Span};
+use crate::order_search::result::{Counts, Failure, MAX_LISTED_FAILURES};
+use crate::order_search::stage_join::join::{spans, Bucket, Class, HalfRow, Join, ScoreEntry, ScoreTables, Span};
 
-/// Sums of scores are compared with this much room: their terms may have been added in another order.
-const ROUNDING: f64 = 1e-12;
+/// Relative tolerance of sums of scores, whose terms may have been added in another order.
+const SCORE_TOLERANCE: f64 = 1e-12;
 
 impl Join {
-    fn least(&self, bucket: &Bucket, states: &[Vec<Entry>; 2], passes: impl Fn(Class) -> bool) -> Option<[f64; 2]> {
+    fn least_scores(
+        &self,
+        bucket: &Bucket,
+        states: &[Vec<ScoreEntry>; 2],
+        passes: impl Fn(Class) -> bool,
+    ) -> Option<[f64; 2]> {
         let mut least = [f64::INFINITY; 2];
         for h in 0..2 {
-            for part in &self.halves[h].parts[bucket.rows[h].clone()] {
+            for part in &self.halves[h].rows[bucket.rows[h].clone()] {
                 let state = states[h][part.combination as usize];
                 if passes(state.class) && state.value < least[h] {
                     least[h] = state.value;
@@ -25,8 +31,8 @@ impl Join {
         least.iter().all(|v| v.is_finite()).then_some(least)
     }
 
-    /// Score of a tuple: its equations' in their order, as enumeration adds them.
-    fn score(&self, known: &Entries, pair: [u32; 2]) -> f64 {
+    /// Score of a tuple, added over the equations in the order of an enumeration.
+    fn score(&self, known: &ScoreTables, pair: [u32; 2]) -> f64 {
         let halves = self.halves.iter().zip(pair);
         halves
             .flat_map(|(half, combination)| half.equations.clone().zip(half.ids(combination)))
@@ -34,11 +40,11 @@ impl Join {
             .sum()
     }
 
-    /// The best exact tuples, best first, ties by index.
+    /// Best exact tuples in ascending order of the score, ties by index.
     pub(super) fn best(
         &self,
-        states: &[Vec<Entry>; 2],
-        known: &Entries,
+        states: &[Vec<ScoreEntry>; 2],
+        known: &ScoreTables,
         keep: usize,
         pool: &rayon::ThreadPool,
         control: &Control,
@@ -46,7 +52,7 @@ impl Join {
         let exact = |class: Class| class == Class::Exact;
         let mut order: Vec<(f64, usize, [f64; 2])> = pool.install(|| {
             let found = self.buckets.par_iter().enumerate().filter_map(|(i, bucket)| {
-                self.least(bucket, states, exact).map(|least| (least[0] + least[1], i, least))
+                self.least_scores(bucket, states, exact).map(|least| (least[0] + least[1], i, least))
             });
             let mut order: Vec<_> = found.collect();
             order.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -58,7 +64,7 @@ impl Join {
             kept.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
             kept.truncate(keep);
             if kept.len() == keep {
-                kept[keep - 1].0 * (1.0 + ROUNDING)
+                kept[keep - 1].0 * (1.0 + SCORE_TOLERANCE)
             } else {
                 f64::INFINITY
             }
@@ -70,9 +76,9 @@ impl Join {
             if bound > worst {
                 break;
             }
-            let rows: [Vec<(f64, Part)>; 2] = std::array::from_fn(|h| {
-                let parts = self.halves[h].parts[self.buckets[i].rows[h].clone()].iter();
-                let mut rows: Vec<(f64, Part)> = parts
+            let rows: [Vec<(f64, HalfRow)>; 2] = std::array::from_fn(|h| {
+                let parts = self.halves[h].rows[self.buckets[i].rows[h].clone()].iter();
+                let mut rows: Vec<(f64, HalfRow)> = parts
                     .map(|&part| (states[h][part.combination as usize], part))
                     .filter(|(state, _)| exact(state.class) && state.value + least[1 - h] <= worst)
                     .map(|(state, part)| (state.value, part))
@@ -103,11 +109,11 @@ impl Join {
         Ok(kept)
     }
 
-    /// Inexact entries that could still be part of a kept tuple, with the score up to which to follow each.
-    pub(super) fn unresolved(
+    /// Inexact entries that may still belong to a row of the table, with the score up to which to evaluate each.
+    pub(super) fn unresolved_spans(
         &self,
-        states: &[Vec<Entry>; 2],
-        known: &Entries,
+        states: &[Vec<ScoreEntry>; 2],
+        known: &ScoreTables,
         worst: f64,
         raise: f64,
         control: &Control,
@@ -115,16 +121,16 @@ impl Join {
         let mut limits: Vec<Vec<f64>> = known.iter().map(|k| vec![f64::NEG_INFINITY; k.len()]).collect();
         for bucket in &self.buckets {
             control.check_stop()?;
-            // Not finite where all of one half have failed.
-            let Some(least) = self.least(bucket, states, |class| !class.failed()) else { continue };
-            if least[0] + least[1] > worst * (1.0 + ROUNDING) {
+            // `None` if all candidates of one half have failed.
+            let Some(least) = self.least_scores(bucket, states, |class| !class.is_failed()) else { continue };
+            if least[0] + least[1] > worst * (1.0 + SCORE_TOLERANCE) {
                 continue;
             }
             for (h, half) in self.halves.iter().enumerate() {
-                for part in &half.parts[bucket.rows[h].clone()] {
+                for part in &half.rows[bucket.rows[h].clone()] {
                     let state = states[h][part.combination as usize];
                     let open = matches!(state.class, Class::Bounded | Class::Open);
-                    if !open || state.value + least[1 - h] > worst * (1.0 + ROUNDING) {
+                    if !open || state.value + least[1 - h] > worst * (1.0 + SCORE_TOLERANCE) {
                         continue;
                     }
                     for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
@@ -132,13 +138,13 @@ impl Join {
                         if entry.class == Class::Exact {
                             continue;
                         }
-                        // Without a full table any tuple may enter: follow this one a few times further than before.
+                        // Without a full table any tuple may enter, so the limit is raised by a factor.
                         let limit = if worst.is_finite() {
                             worst - least[1 - h] - (state.value - entry.value)
                         } else {
                             raise * entry.value
                         };
-                        // Where rounding leaves no room between bound and worst, only its end tells more.
+                        // If rounding leaves no gap between bound and worst score, only a complete evaluation decides.
                         let limit = if limit > entry.value { limit } else { f64::INFINITY };
                         let old = &mut limits[e][id as usize];
                         *old = old.max(limit);
@@ -153,12 +159,12 @@ impl Join {
         Ok(wanted.collect())
     }
 
-    /// What became of all tuples, and the first failures by index.
-    pub(super) fn count(&self, states: &[Vec<Entry>; 2]) -> (Counts, Vec<(u64, Failure)>) {
+    /// Number of tuples by outcome, and the first failures by index.
+    pub(super) fn count_outcomes(&self, states: &[Vec<ScoreEntry>; 2]) -> (Counts, Vec<(u64, Failure)>) {
         let mut counts = Counts::default();
         let mut failures: Vec<(u64, Failure)> = Vec::new();
         for bucket in &self.buckets {
-            let parts: [&[Part]; 2] = std::array::from_fn(|h| &self.halves[h].parts[bucket.rows[h].clone()]);
+            let parts: [&[HalfRow]; 2] = std::array::from_fn(|h| &self.halves[h].rows[bucket.rows[h].clone()]);
             let tally: [Vec<(Class, u64)>; 2] = std::array::from_fn(|h| {
                 let mut tally: Vec<(Class, u64)> = Vec::new();
                 for part in parts[h] {
@@ -175,44 +181,44 @@ impl Join {
                 for &(b, y) in &tally[1] {
                     let count = x * y;
                     counts.candidates += count;
-                    *match a.with(b) {
+                    *match a.combine(b) {
                         Class::Exact => &mut counts.beaten,
-                        Class::Bounded => &mut counts.bounded,
+                        Class::Bounded => &mut counts.excluded_by_bound,
                         Class::Open => &mut counts.stopped,
                         Class::Failed(Failure::Singular) => &mut counts.singular,
                         Class::Failed(Failure::Diverged) => &mut counts.diverged,
                     } += count;
-                    failed |= a.with(b).failed();
+                    failed |= a.combine(b).is_failed();
                 }
             }
             if failed {
-                self.list(parts, states, &mut failures);
+                self.list_failures(parts, states, &mut failures);
             }
         }
         failures.sort_unstable();
-        failures.truncate(LISTED);
+        failures.truncate(MAX_LISTED_FAILURES);
         (counts, failures)
     }
 
-    /// Adds the failures of a bucket that may be among the first; parts come in the order of their index.
-    fn list(&self, parts: [&[Part]; 2], states: &[Vec<Entry>; 2], failures: &mut Vec<(u64, Failure)>) {
+    /// Add the failures of a bucket that may be among the first. Rows are sorted by index.
+    fn list_failures(&self, parts: [&[HalfRow]; 2], states: &[Vec<ScoreEntry>; 2], failures: &mut Vec<(u64, Failure)>) {
         for first in parts[0] {
             for second in parts[1] {
                 let index = first.index + second.index;
-                if failures.len() >= LISTED && index > failures[LISTED - 1].0 {
+                if failures.len() >= MAX_LISTED_FAILURES && index > failures[MAX_LISTED_FAILURES - 1].0 {
                     break;
                 }
                 let [a, b] = [(0, first), (1, second)].map(|(h, p)| states[h][p.combination as usize].class);
-                if let Class::Failed(failure) = a.with(b) {
+                if let Class::Failed(failure) = a.combine(b) {
                     failures.push((index, failure));
-                    if failures.len() >= 8 * LISTED {
+                    if failures.len() >= 8 * MAX_LISTED_FAILURES {
                         failures.sort_unstable();
-                        failures.truncate(LISTED);
+                        failures.truncate(MAX_LISTED_FAILURES);
                     }
                 }
             }
         }
         failures.sort_unstable();
-        failures.truncate(LISTED);
+        failures.truncate(MAX_LISTED_FAILURES);
     }
 }

@@ -1,4 +1,4 @@
-//! Joint fits: structures by name, races, one call from starts to intervals, and what residuals say.
+//! Bindings of the joint fit: structures by name, multistart, fit with intervals, residual analysis.
 
 mod fit;
 mod problem;
@@ -6,8 +6,9 @@ mod resampler;
 mod residuals;
 mod structure;
 
-pub use fit::{joint_fit, joint_grids, joint_race, JointRace};
-pub use problem::{JointClock, JointProblem};
+pub use fit::{joint_fit, joint_multistart, refine_candidates, JointMultistart};
+pub use problem::{JointProblem, JointTimeScaling};
 pub use residuals::{
-    autocovariances, chi_squared, colour_covariances, coloured, covariance_of, fit_covariance, is_white, long_run,
+    autocovariances, chi_squared, covariance_of, filter_autocovariances, fit_covariance, is_white, long_run_covariance,
+    whitening_filter,
 };

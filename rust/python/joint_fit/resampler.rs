@@ -1,4 +1,4 @@
-//! Runs that Python samples while the core fits: every question is asked once.
+//! Data source that samples runs by Python callbacks during a fit. Responses are cached.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -11,47 +11,47 @@ use crate::estimation::joint_fit::{Recordings, Sampling, Source};
 use crate::estimation::output_error::Experiment;
 use crate::python::convert::{records, List, RecordArg};
 use crate::python::estimation::{experiment, ExperimentArg};
-use crate::python::order_search::watch::Desk;
+use crate::python::order_search::watch::RequestChannel;
 use crate::regressors::Record;
 use crate::signal::block_pulse::Intersample;
 
-/// (its methods sampled, records and read, sample interval and duration of each run \[s\], what each signal does between
-/// samples where it is an input, who is told how far a fit is).
+/// Runs: (object with methods sampled, records and read; sampling interval and duration of each run \[s\]; inter-sample
+/// behavior of each signal, None for outputs; progress callback).
 pub type RunsArg = (Py<PyAny>, List<(f64, f64)>, List<Option<String>>, Option<Py<PyAny>>);
 
-/// What the core asks.
-pub enum Question {
-    /// Runs on a grid.
+/// Request from the core to Python.
+pub enum Request {
+    /// Runs sampled on a grid.
     Experiments(Sampling),
-    /// Records of so many pulses, inputs acting with these numbers.
+    /// Records of so many pulses, with inputs transformed by these parameters.
     Records(usize, Vec<f64>),
-    /// What was read of a signal.
+    /// Samples of a signal.
     Samples(usize),
-    /// Nothing: so much of a whole is done.
-    Told(usize, usize),
+    /// Progress: steps done and total.
+    Progress(usize, usize),
 }
 
-/// What Python answers.
-pub enum Answer {
-    /// To runs on a grid.
+/// Response of Python to a request.
+pub enum Response {
+    /// Response to a grid.
     Experiments(Vec<Experiment>),
-    /// To records.
+    /// Response to records.
     Records(Vec<Record>),
-    /// To what was read, by run.
+    /// Response to samples, by run.
     Samples(Vec<Vec<f64>>),
-    /// To being told.
-    Heard,
+    /// Response to progress.
+    Empty,
 }
 
-/// What is known of the runs without asking.
-pub struct Known {
+/// Properties of the runs that need no request.
+pub struct RunProperties {
     spans: Vec<(f64, f64)>,
     inputs: Vec<Option<Intersample>>,
 }
 
-impl Known {
-    /// Of an argument, and who answers.
-    pub fn of(argument: RunsArg) -> PyResult<(Self, Answering)> {
+impl RunProperties {
+    /// Properties from an argument, and the resampler.
+    pub fn of(argument: RunsArg) -> PyResult<(Self, PythonResampler)> {
         let (runs, spans, inputs, told) = argument;
         for &(step, duration) in spans.iter() {
             check_step(step)?;
@@ -67,85 +67,85 @@ impl Known {
             }),
         };
         let inputs = inputs.iter().map(between).collect::<Result<_, _>>()?;
-        Ok((Self { spans: spans.into(), inputs }, Answering { runs, told }))
+        Ok((Self { spans: spans.into(), inputs }, PythonResampler { runs, told }))
     }
 }
 
-/// Who answers, where Python is attached.
-pub struct Answering {
+/// Python object that serves requests while Python is attached.
+pub struct PythonResampler {
     runs: Py<PyAny>,
     told: Option<Py<PyAny>>,
 }
 
-impl Answering {
-    /// The answer to a question.
-    pub fn answer(&self, py: Python<'_>, question: Question) -> PyResult<Answer> {
+impl PythonResampler {
+    /// Serve a request.
+    pub fn answer(&self, py: Python<'_>, question: Request) -> PyResult<Response> {
         Ok(match question {
-            Question::Experiments(Sampling { every, decimation, first }) => {
+            Request::Experiments(Sampling { pulses_per_sample: every, decimation, leading_intervals: first }) => {
                 let given: List<ExperimentArg<'_>> =
                     self.runs.call_method1(py, "sample", (every, decimation, first))?.extract(py)?;
-                Answer::Experiments(given.iter().map(experiment).collect::<PyResult<_>>()?)
+                Response::Experiments(given.iter().map(experiment).collect::<PyResult<_>>()?)
             }
-            Question::Records(m, inputs) => {
+            Request::Records(m, inputs) => {
                 let given: List<RecordArg<'_>> = self.runs.call_method1(py, "records", (m, inputs))?.extract(py)?;
-                Answer::Records(records(&given)?)
+                Response::Records(records(&given)?)
             }
-            Question::Samples(signal) => {
+            Request::Samples(signal) => {
                 let given: List<PyReadonlyArray1<'_, f64>> =
                     self.runs.call_method1(py, "read", (signal,))?.extract(py)?;
-                Answer::Samples(given.iter().map(|samples| samples.as_array().to_vec()).collect())
+                Response::Samples(given.iter().map(|samples| samples.as_array().to_vec()).collect())
             }
-            Question::Told(done, of) => {
+            Request::Progress(done, of) => {
                 if let Some(told) = &self.told {
                     told.call1(py, (done, of))?;
                 }
-                Answer::Heard
+                Response::Empty
             }
         })
     }
 }
 
-/// Records by their pulses and the bits of the numbers of inputs.
+/// Records by number of pulses and the bits of the input parameters.
 type Records = BTreeMap<(usize, Vec<u64>), Vec<Record>>;
 
-/// The runs, as the core has them.
-pub struct Asked<'a, T> {
-    desk: &'a Desk<Question, Answer, T>,
-    known: Known,
+/// Source of runs that sends requests to Python.
+pub struct CallbackSource<'a, T> {
+    desk: &'a RequestChannel<Request, Response, T>,
+    known: RunProperties,
     samples: RefCell<BTreeMap<usize, Vec<Vec<f64>>>>,
     records: RefCell<Records>,
 }
 
-impl<'a, T> Asked<'a, T> {
-    /// Runs behind a desk.
-    pub fn new(desk: &'a Desk<Question, Answer, T>, known: Known) -> Self {
+impl<'a, T> CallbackSource<'a, T> {
+    /// Source behind a request channel.
+    pub fn new(desk: &'a RequestChannel<Request, Response, T>, known: RunProperties) -> Self {
         Self { desk, known, samples: RefCell::default(), records: RefCell::default() }
     }
 
-    /// Tells so much of a whole.
-    pub fn tell(&self, done: usize, of: usize) -> Result<(), Error> {
-        self.desk.ask(Question::Told(done, of)).map(drop)
+    /// Report progress.
+    pub fn report_progress(&self, done: usize, of: usize) -> Result<(), Error> {
+        self.desk.ask(Request::Progress(done, of)).map(drop)
     }
 }
 
-fn other() -> Error {
+fn unexpected_response_error() -> Error {
     Error::Internal { what: "an answer to another question".into() }
 }
 
-impl<T> Source for Asked<'_, T> {
+impl<T> Source for CallbackSource<'_, T> {
     fn spans(&self) -> Vec<(f64, f64)> {
         self.known.spans.clone()
     }
 
     fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>, Error> {
-        match self.desk.ask(Question::Experiments(sampling))? {
-            Answer::Experiments(found) => Ok(found),
-            _ => Err(other()),
+        match self.desk.ask(Request::Experiments(sampling))? {
+            Response::Experiments(found) => Ok(found),
+            _ => Err(unexpected_response_error()),
         }
     }
 }
 
-impl<T> Recordings for Asked<'_, T> {
+impl<T> Recordings for CallbackSource<'_, T> {
     fn inputs(&self) -> Vec<Option<Intersample>> {
         self.known.inputs.clone()
     }
@@ -154,7 +154,9 @@ impl<T> Recordings for Asked<'_, T> {
         if let Some(found) = self.samples.borrow().get(&signal) {
             return Ok(found.clone());
         }
-        let Answer::Samples(found) = self.desk.ask(Question::Samples(signal))? else { return Err(other()) };
+        let Response::Samples(found) = self.desk.ask(Request::Samples(signal))? else {
+            return Err(unexpected_response_error());
+        };
         self.samples.borrow_mut().insert(signal, found.clone());
         Ok(found)
     }
@@ -164,7 +166,9 @@ impl<T> Recordings for Asked<'_, T> {
         if let Some(found) = self.records.borrow().get(&key) {
             return Ok(found.clone());
         }
-        let Answer::Records(found) = self.desk.ask(Question::Records(m, inputs.into()))? else { return Err(other()) };
+        let Response::Records(found) = self.desk.ask(Request::Records(m, inputs.into()))? else {
+            return Err(unexpected_response_error());
+        };
         self.records.borrow_mut().insert(key, found.clone());
         Ok(found)
     }

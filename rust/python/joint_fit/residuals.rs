@@ -1,22 +1,22 @@
-//! What residuals of a fit say: its covariance, their colour, their whiteness.
+//! Bindings of residual analysis: covariance of a fit, noise coloring, whiteness.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use crate::estimation::joint_fit::covariance as spread;
-use crate::python::convert::{copied, matrix, rows, vector, List};
-use crate::python::errors::attached;
-use crate::python::order_search::watch::leavable;
+use crate::python::convert::{copy_vector, matrix, rows, vector, List};
+use crate::python::errors::run_attached;
+use crate::python::order_search::watch::run_interruptible;
 use crate::signal::statistics;
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 type Table<'py> = Bound<'py, PyArray2<f64>>;
 
-fn all_copied(name: &str, arrays: &[PyReadonlyArray1<'_, f64>]) -> PyResult<Vec<Vec<f64>>> {
-    arrays.iter().map(|array| copied(name, array)).collect()
+fn copy_vectors(name: &str, arrays: &[PyReadonlyArray1<'_, f64>]) -> PyResult<Vec<Vec<f64>>> {
+    arrays.iter().map(|array| copy_vector(name, array)).collect()
 }
 
-/// Covariance from a Jacobian, a row a parameter, residuals by run and output, and the sum of their squares.
+/// Covariance from a Jacobian (a row a parameter), residuals by run and output, and their sum of squares.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn covariance_of<'py>(
@@ -25,13 +25,14 @@ pub fn covariance_of<'py>(
     series: List<PyReadonlyArray1<'py, f64>>,
     squares: f64,
 ) -> PyResult<Table<'py>> {
-    let (jacobian, series) = (rows(&jacobian)?, all_copied("residuals", &series)?);
+    let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let found = leavable(py, points, None, move |_| spread::of_residuals(&jacobian, &series, squares))?;
+    let found =
+        run_interruptible(py, points, None, move |_| spread::covariance_of_residuals(&jacobian, &series, squares))?;
     matrix(py, found, size)
 }
 
-/// The same of a fit, whose residuals may have counted by shares.
+/// Covariance of a fit, whose residuals may have robust weights.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fit_covariance<'py>(
@@ -40,62 +41,63 @@ pub fn fit_covariance<'py>(
     series: List<PyReadonlyArray1<'py, f64>>,
     shares: Option<PyReadonlyArray1<'py, f64>>,
 ) -> PyResult<Table<'py>> {
-    let (jacobian, series) = (rows(&jacobian)?, all_copied("residuals", &series)?);
+    let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let shares = shares.map(|shares| vector("shares", &shares)).transpose()?;
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let found = leavable(py, points, None, move |_| spread::of_fit(&jacobian, series, shares.as_deref()))?;
+    let found =
+        run_interruptible(py, points, None, move |_| spread::robust_covariance(&jacobian, series, shares.as_deref()))?;
     matrix(py, found, size)
 }
 
-/// Covariance of sums of scores with Bartlett weights.
+/// Long-run covariance of sums of scores, with Bartlett weights.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn long_run<'py>(
+pub fn long_run_covariance<'py>(
     py: Python<'py>,
     jacobian: PyReadonlyArray2<'py, f64>,
     series: List<PyReadonlyArray1<'py, f64>>,
 ) -> PyResult<Table<'py>> {
-    let (jacobian, series) = (rows(&jacobian)?, all_copied("residuals", &series)?);
+    let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let found = leavable(py, points, None, move |_| spread::long_run(&jacobian, &series))?;
+    let found = run_interruptible(py, points, None, move |_| spread::long_run_covariance(&jacobian, &series))?;
     matrix(py, found, size)
 }
 
-/// The whitening filter of series that share one colour, and the power that it leaves.
+/// Filter that whitens series with one spectrum, and the innovation variance.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn coloured<'py>(
+pub fn whitening_filter<'py>(
     py: Python<'py>,
     series: List<PyReadonlyArray1<'py, f64>>,
     most: usize,
 ) -> PyResult<(Array<'py>, f64)> {
-    let series = all_copied("series", &series)?;
+    let series = copy_vectors("series", &series)?;
     let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(most.max(1));
-    let (filter, power) = leavable(py, points, None, move |_| {
-        Ok(statistics::coloured(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), most))
+    let (filter, power) = run_interruptible(py, points, None, move |_| {
+        Ok(statistics::whitening_filter(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), most))
     })?;
     Ok((PyArray1::from_vec(py, filter), power))
 }
 
-/// Autocovariances of noise that a filter makes white.
+/// Autocovariances of noise that a filter whitens.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn colour_covariances<'py>(
+pub fn filter_autocovariances<'py>(
     py: Python<'py>,
     through: PyReadonlyArray1<'py, f64>,
     power: f64,
     count: usize,
 ) -> PyResult<Array<'py>> {
     let through = vector("filter", &through)?;
-    let found = leavable(py, count, None, move |_| {
-        // A circle of many times as many points holds them.
+    let found = run_interruptible(py, count, None, move |_| {
+        // The circulant has many times as many points.
         crate::error::check_points("points for autocovariances", count.saturating_mul(16))?;
-        Ok(statistics::covariances(&through, power, count))
+        Ok(statistics::filter_autocovariances(&through, power, count))
     })?;
     Ok(PyArray1::from_vec(py, found))
 }
 
-/// Autocovariances of series at lags from 0, and how many pairs each is the mean of.
+/// Autocovariances of series at lags from 0, and the number of pairs in each mean.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn autocovariances<'py>(
@@ -103,25 +105,25 @@ pub fn autocovariances<'py>(
     series: List<PyReadonlyArray1<'py, f64>>,
     most: usize,
 ) -> PyResult<(Array<'py>, Array<'py>)> {
-    let series = all_copied("series", &series)?;
+    let series = copy_vectors("series", &series)?;
     let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(most.max(1));
-    let (sums, pairs) = leavable(py, points, None, move |_| {
+    let (sums, pairs) = run_interruptible(py, points, None, move |_| {
         crate::error::check_points("lags by 256", most.saturating_mul(256))?;
         Ok(statistics::autocovariances(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), most))
     })?;
     Ok((PyArray1::from_vec(py, sums), PyArray1::from_vec(py, pairs)))
 }
 
-/// Whether autocorrelations of a series could be those of white noise.
+/// Whether autocorrelations of a series are consistent with white noise.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn is_white(py: Python<'_>, series: PyReadonlyArray1<'_, f64>, lags: usize) -> PyResult<bool> {
-    let series = copied("series", &series)?;
-    leavable(py, series.len(), None, move |_| Ok(statistics::is_white(&series, lags)))
+    let series = copy_vector("series", &series)?;
+    run_interruptible(py, series.len(), None, move |_| Ok(statistics::is_white(&series, lags)))
 }
 
-/// Value that chi-squared exceeds as often as a normal variable exceeds a quantile.
+/// Quantile of chi-squared at the level of a normal quantile.
 #[pyfunction]
 pub fn chi_squared(degrees: f64, quantile: f64) -> PyResult<f64> {
-    attached(|| Ok(statistics::chi_squared(degrees, quantile)))
+    run_attached(|| Ok(statistics::chi_squared(degrees, quantile)))
 }

@@ -1,22 +1,24 @@
-//! Structures by name, as Python tells them.
+//! Parsing of structures with named parameters from Python.
 
 use pyo3::prelude::*;
 
 use crate::error::Error;
-use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Law, Order, Rubs, Structure, Term};
+use crate::estimation::joint_fit::structure::{
+    Coefficient, Equation, FrictionParameters, Hints, Input, Law, Order, Structure, Term,
+};
 use crate::python::convert::{initial, InitialArg, List};
 use crate::python::estimation::free_inputs;
 
-/// (constant, weight of each free order by name).
+/// Order: (constant, weight of each free order by name).
 type OrderArg = (f64, List<(String, f64)>);
-/// (factor, coefficient).
+/// Coefficient with a factor: (factor, coefficient).
 type NumberArg = (f64, CoefficientArg);
-/// (signal, order, coefficient, factor).
+/// Term: (signal, order, coefficient, factor).
 type TermArg = (usize, OrderArg, CoefficientArg, f64);
-/// (output, order, terms, fc, fs and vs of friction).
+/// Equation: (output, order, terms, fc, fs and vs of friction).
 type EquationArg = (usize, OrderArg, List<TermArg>, Option<[NumberArg; 3]>);
 
-/// A name or a number.
+/// Coefficient: a name if free, a number if fixed.
 #[derive(FromPyObject)]
 pub enum CoefficientArg {
     Free(String),
@@ -32,7 +34,7 @@ impl From<CoefficientArg> for Coefficient {
     }
 }
 
-/// A structure: a dictionary of these.
+/// Structure from a dictionary with these keys.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct StructureArg {
@@ -48,7 +50,7 @@ pub struct StructureArg {
     hints: HintsArg,
 }
 
-/// What is known of where orders lie.
+/// Prior knowledge of orders and coefficients.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct HintsArg {
@@ -63,13 +65,13 @@ fn order((constant, weights): OrderArg) -> Order {
     Order { constant, weights: weights.into() }
 }
 
-fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> Rubs {
+fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> FrictionParameters {
     let number = |(factor, coefficient): NumberArg| (factor, coefficient.into());
-    Rubs { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
+    FrictionParameters { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
 }
 
-/// A structure whose signals and coefficients are there.
-pub fn named(argument: StructureArg) -> PyResult<Structure> {
+/// Structure whose signals and coefficients exist.
+pub fn parse_structure(argument: StructureArg) -> PyResult<Structure> {
     let term = |(signal, at, coefficient, factor): TermArg| Term {
         signal,
         order: order(at),
@@ -102,7 +104,7 @@ pub fn named(argument: StructureArg) -> PyResult<Structure> {
         hints: Hints {
             highest: hints.highest,
             natural: hints.natural.into_iter().map(|(name, values)| (name, values.into())).collect(),
-            exceeds: hints.exceeds.into_iter().collect(),
+            ratio_lower_bounds: hints.exceeds.into_iter().collect(),
             positive: hints.positive.into_iter().collect(),
             known: hints.known.into_iter().collect(),
         },

@@ -1,4 +1,4 @@
-//! Tuples from Python become settings, lattices, parts and verdicts, and what a search comes to becomes tuples.
+//! Conversion of Python tuples to settings, order grids, parts and verdicts of a search, and of results to tuples.
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -6,24 +6,24 @@ use pyo3::types::PyDict;
 use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
 use crate::estimation::instrumental_variables::{with_projections, Settings};
-use crate::estimation::multi_innovation::{Innovation, Rows};
-use crate::order_search::control::{another, Checkpoint, Control, Place};
-use crate::order_search::grid::independent::{Lattice, TermAxis};
-use crate::order_search::grid::order_law::{LawEquation, LawLattice};
+use crate::estimation::multi_innovation::{Innovation, RowBasis};
+use crate::order_search::control::{mismatch_error, BatchPosition, Checkpoint, Control};
+use crate::order_search::grid::independent::{OrderGrid, TermAxis};
+use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
 use crate::order_search::options::{Criterion, Estimator, Norm, Options};
 use crate::order_search::result::{Counts, Failure, Part, Row, Verdict};
 use crate::order_search::stage_join::Span;
-use crate::python::convert::{initial, lists, nested, records, InitialArg, List, RecordArg};
+use crate::python::convert::{initial, records, to_lists, to_vectors, InitialArg, List, RecordArg};
 use crate::regressors::Record;
 
-/// Change below which a candidate's instrumental variables stand still: far below what moves a rank.
-const REFINED: f64 = 1e-4;
+/// Convergence tolerance of a candidate's instrumental variables, far below a change of the ranking.
+const IV_CONVERGENCE_TOLERANCE: f64 = 1e-4;
 
-/// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping, steps of instrumental
-/// variables or 0, bytes of memory).
+/// Settings: (criterion, norm, p or 0 for least squares, K₀, Haar rows, rows kept, threads, pruning, iterations of
+/// instrumental variables or 0, bytes of memory).
 type SettingsTuple = (String, String, usize, f64, bool, usize, usize, bool, usize, u64);
 
-/// Settings of a search but for its initial terms.
+/// Settings of a search without its initial terms.
 pub struct SettingsArg {
     criterion: Criterion,
     norm: Norm,
@@ -57,12 +57,12 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
                 other => return Err(unknown(format!("norm '{other}' is not known"), "use l1 or l2").into()),
             },
             estimator: if iterations > 0 {
-                Estimator::InstrumentalVariables(Settings { iterations, tolerance: REFINED })
+                Estimator::InstrumentalVariables(Settings { iterations, tolerance: IV_CONVERGENCE_TOLERANCE })
             } else if length == 0 {
                 Estimator::LeastSquares
             } else {
-                let rows = if haar { Rows::Haar } else { Rows::Time };
-                Estimator::MultiInnovation(Innovation { length, prior_covariance, rows })
+                let rows = if haar { RowBasis::Haar } else { RowBasis::Time };
+                Estimator::MultiInnovation(Innovation { length, prior_covariance, row_basis: rows })
             },
             keep,
             threads,
@@ -73,22 +73,31 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
 }
 
 impl SettingsArg {
-    /// With the initial terms of the records.
+    /// Options with the initial terms of the records.
     pub fn options(self, terms: InitialArg) -> PyResult<Options> {
         let Self { criterion, norm, estimator, keep, threads, early_stopping, memory } = self;
-        Ok(Options { criterion, norm, estimator, initial: initial(terms)?, keep, threads, early_stopping, memory })
+        Ok(Options {
+            criterion,
+            norm,
+            estimator,
+            initial: initial(terms)?,
+            top: keep,
+            threads,
+            pruning: early_stopping,
+            memory,
+        })
     }
 }
 
-/// What a search is given besides its lattice; `F` holds the known coefficients of one equation or of several.
-pub struct Given<F> {
+/// Data and options of a search without its order grid. `F` holds the fixed coefficients of one or several equations.
+pub struct SearchInputs<F> {
     records: Vec<Record>,
     pub inputs: Vec<bool>,
     pub fixed: F,
     pub options: Options,
 }
 
-impl<F> Given<F> {
+impl<F> SearchInputs<F> {
     pub fn new(
         runs: &[RecordArg<'_>],
         inputs: List<bool>,
@@ -99,7 +108,7 @@ impl<F> Given<F> {
         Ok(Self { records: records(runs)?, inputs: inputs.into(), fixed, options: settings.options(terms)? })
     }
 
-    /// Records, with the clean signals that the estimator asks for.
+    /// Records, with the low-noise signals that the estimator needs.
     pub fn records(&mut self, control: &Control) -> Result<Vec<Record>, Error> {
         let records = std::mem::take(&mut self.records);
         if !matches!(self.options.estimator, Estimator::InstrumentalVariables(_)) {
@@ -110,10 +119,10 @@ impl<F> Given<F> {
     }
 }
 
-/// (output, values of alpha, [(signal, values, interchangeable), …]).
+/// Order grid: (output, values of alpha, [(signal, values, interchangeable), …]).
 type OrdersTuple = (usize, List<f64>, List<(usize, List<f64>, bool)>);
 
-/// The axes of a lattice.
+/// Axes of an order grid.
 pub struct OrdersArg {
     output: usize,
     alphas: Vec<f64>,
@@ -131,17 +140,17 @@ impl<'py> FromPyObject<'_, 'py> for OrdersArg {
 }
 
 impl OrdersArg {
-    pub fn lattice(&self, inputs: &[bool]) -> Result<Lattice, Error> {
-        Lattice::new(self.output, &self.alphas, &self.axes, |s| inputs.get(s).copied().unwrap_or(false))
+    pub fn lattice(&self, inputs: &[bool]) -> Result<OrderGrid, Error> {
+        OrderGrid::new(self.output, &self.alphas, &self.axes, |s| inputs.get(s).copied().unwrap_or(false))
     }
 }
 
-/// (constant, weight of each free order).
+/// Affine order: (constant, weight of each free order).
 type AffineTuple = (f64, List<f64>);
-/// (output, alpha, [(signal, order), …]).
+/// Order laws: (output, alpha, [(signal, order), …]).
 type LawTuple = (usize, AffineTuple, List<(usize, AffineTuple)>);
 
-/// The order laws of one equation.
+/// Order laws of one equation.
 pub struct LawArg(LawEquation);
 
 impl<'py> FromPyObject<'_, 'py> for LawArg {
@@ -155,65 +164,82 @@ impl<'py> FromPyObject<'_, 'py> for LawArg {
     }
 }
 
-/// The lattice of a stage from the values of its free orders.
+/// Order grid of a coupled search from the values of its free orders.
 pub fn law_lattice(
     axes: &[Vec<f64>],
     laws: List<LawArg>,
     inputs: &[bool],
     fixed: &[Vec<Option<f64>>],
-) -> Result<LawLattice, Error> {
+) -> Result<OrderLawGrid, Error> {
     let equations: Vec<LawEquation> = laws.into_iter().map(|law| law.0).collect();
-    Ok(LawLattice::new(axes, &equations, inputs)?.with_known(fixed))
+    Ok(OrderLawGrid::new(axes, &equations, inputs)?.with_fixed_coefficients(fixed))
 }
 
-/// Counts under the names that people read.
-pub fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
+/// Counts under their public names.
+pub fn counts_to_dict<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("candidates", counts.candidates)?;
     dict.set_item("kept", counts.kept)?;
     dict.set_item("beaten", counts.beaten)?;
-    dict.set_item("bound", counts.bounded)?;
+    dict.set_item("bound", counts.excluded_by_bound)?;
     dict.set_item("stopped early", counts.stopped)?;
     dict.set_item("singular", counts.singular)?;
     dict.set_item("diverged", counts.diverged)?;
     Ok(dict)
 }
 
-/// A failure in a word.
-pub fn named(failure: Failure) -> &'static str {
+/// Name of a failure.
+pub fn failure_name(failure: Failure) -> &'static str {
     match failure {
         Failure::Singular => "singular",
         Failure::Diverged => "diverged",
     }
 }
 
-/// (index, raw score, coefficients, initial terms by record).
+/// Row of a result: (index, raw score, coefficients, initial terms by record).
 type RowArg = (u64, f64, List<f64>, List<List<f64>>);
-/// Candidates, kept, beaten, bounded, stopped, singular, diverged; how many of the bounded were in boxes, where any was.
+/// Counts: candidates, kept, beaten, bounded, stopped, singular, diverged. Then, if any, those of the bounded in boxes.
 #[derive(FromPyObject, IntoPyObject)]
 pub enum CountsArg {
     Plain((u64, u64, u64, u64, u64, u64, u64)),
     Boxed((u64, u64, u64, u64, u64, u64, u64, u64)),
 }
-/// Rows, counts, (index, whether diverged rather than singular) of failures.
+/// Part of a result: rows, counts, (index, whether diverged rather than singular) of failures.
 pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
-/// (round, followed, end, size, limit, order), whether the stretch was begun anew, and what it came to.
+/// Checkpoint: (batch, followed, end, size, limit, order), whether the block was restarted, and the part so far.
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
-/// What rounds came to, as Python keeps it.
+/// Result of batches as Python tuples.
 pub fn part_of(part: Part) -> PartArg {
     let c = part.counts;
     (
-        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), lists(r.initial))).collect(),
-        match c.boxed {
-            0 => CountsArg::Plain((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged)),
-            n => CountsArg::Boxed((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged, n)),
+        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), to_lists(r.initial))).collect(),
+        match c.excluded_by_box {
+            0 => CountsArg::Plain((
+                c.candidates,
+                c.kept,
+                c.beaten,
+                c.excluded_by_bound,
+                c.stopped,
+                c.singular,
+                c.diverged,
+            )),
+            n => CountsArg::Boxed((
+                c.candidates,
+                c.kept,
+                c.beaten,
+                c.excluded_by_bound,
+                c.stopped,
+                c.singular,
+                c.diverged,
+                n,
+            )),
         },
         part.failures.into_iter().map(|(index, f)| (index, f == Failure::Diverged)).collect(),
     )
 }
 
-/// What rounds came to, as they told.
+/// Result of batches from Python tuples.
 pub fn part((rows, counts, failures): PartArg) -> Part {
     let (candidates, kept, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
         CountsArg::Plain((a, b, c, d, e, f, g)) => (a, b, c, d, e, f, g, 0),
@@ -226,10 +252,19 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
                 index,
                 score,
                 coefficients: coefficients.into(),
-                initial: nested(initial),
+                initial: to_vectors(initial),
             })
             .collect(),
-        counts: Counts { candidates, kept, beaten, bounded, boxed, stopped, singular, diverged },
+        counts: Counts {
+            candidates,
+            kept,
+            beaten,
+            excluded_by_bound: bounded,
+            excluded_by_box: boxed,
+            stopped,
+            singular,
+            diverged,
+        },
         failures: failures
             .into_iter()
             .map(|(index, diverged)| (index, if diverged { Failure::Diverged } else { Failure::Singular }))
@@ -237,26 +272,34 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
     }
 }
 
-/// A checkpoint from what Python kept.
+/// Checkpoint from Python tuples.
 pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): CheckpointArg) -> Checkpoint {
-    Checkpoint { place: Place { round, followed, end, size, limit, order }, anew, part: part(found) }
+    Checkpoint {
+        place: BatchPosition { batch: round, evaluated_count: followed, end, size, limit, order },
+        replaces_previous: anew,
+        part: part(found),
+    }
 }
 
-/// A checkpoint as Python keeps it.
+/// Checkpoint as Python tuples.
 pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
     let p = checkpoint.place;
-    ((p.round, p.followed, p.end, p.size, p.limit, p.order), checkpoint.anew, part_of(checkpoint.part))
+    (
+        (p.batch, p.evaluated_count, p.end, p.size, p.limit, p.order),
+        checkpoint.replaces_previous,
+        part_of(checkpoint.part),
+    )
 }
 
-/// (equation, first candidate, the one behind the last, limit).
+/// Block of candidates: (equation, first, one past the last, limit).
 pub type SpanArg = (usize, usize, usize, f64);
 
-/// A stretch of candidates.
+/// Contiguous block of candidates.
 pub fn span((equation, first, last, limit): SpanArg) -> Span {
     Span { equation, first, last, limit }
 }
 
-/// What candidates came to: raw sums as little-endian doubles, and a byte each that says of what.
+/// Serialize verdicts: raw sums as little-endian doubles, and one byte each for the kind.
 pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     let pairs = verdicts.iter().map(|verdict| match *verdict {
         Verdict::Score(raw) => (raw, 0),
@@ -269,7 +312,7 @@ pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     (values.concat(), kinds)
 }
 
-/// The verdicts that [`verdicts_of`] wrote.
+/// Verdicts serialized by [`verdicts_of`].
 pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
     let known = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
         let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));
@@ -283,6 +326,6 @@ pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
         }
     });
     known.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
-        another(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
+        mismatch_error(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
     })
 }

@@ -1,10 +1,4 @@
-//! Searches over a lattice: at once, or in rounds that are done here or elsewhere.
-//!
-//! Certificates of equation errors over whole intervals of orders.
-//!
-//! Errors of candidates given as points, for a genetic algorithm.
-//!
-//! What tests turn and provoke: the instructions that kernels run with, and panics.
+//! Bindings of the order search: grid search, batches, certificates, given points, test hooks.
 
 use std::borrow::Cow;
 
@@ -13,25 +7,26 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::arguments::{
-    checkpoint, counted, named, part, part_of, CheckpointArg, Given, OrdersArg, PartArg, SettingsArg,
+    checkpoint, counts_to_dict, failure_name, part, part_of, CheckpointArg, OrdersArg, PartArg, SearchInputs,
+    SettingsArg,
 };
-use super::watch::{saved, watched};
+use super::watch::{run_checkpointed, run_watched};
 use crate::error::{check_length, Error};
 use crate::order_search::batches;
-use crate::order_search::certificate::{self, Asked, Range, Region};
-use crate::order_search::control::another;
+use crate::order_search::certificate::{self, CertificateOptions, Range, Region};
+use crate::order_search::control::mismatch_error;
 use crate::order_search::given_points::{Point, Points as PointsOf};
-use crate::order_search::grid::independent::Lattice;
+use crate::order_search::grid::independent::OrderGrid;
 use crate::order_search::options::Norm;
 use crate::order_search::result::{Counts, Outcome, Part, Row};
 use crate::parallel::pool;
 use crate::python::convert::{records, rows, InitialArg, List, RecordArg};
-use crate::python::errors::detached;
+use crate::python::errors::run_detached;
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn lattice_size(py: Python<'_>, orders: OrdersArg, inputs: List<bool>) -> PyResult<u64> {
-    detached(py, || Ok(orders.lattice(&inputs)?.count()))
+pub fn order_grid_size(py: Python<'_>, orders: OrdersArg, inputs: List<bool>) -> PyResult<u64> {
+    run_detached(py, || Ok(orders.lattice(&inputs)?.count()))
 }
 
 #[pyfunction]
@@ -46,27 +41,27 @@ pub fn search<'py>(
     settings: SettingsArg,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
-    let found = watched(py, progress.as_ref(), |control| {
+    let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+    let found = run_watched(py, progress.as_ref(), |control| {
         let lattice = orders.lattice(&given.inputs)?;
         let records = given.records(control)?;
-        Ok(Found::new(&lattice, batches::search(&records, &lattice, &given.fixed, &given.options, control)?))
+        Ok(OrderTable::new(&lattice, batches::search(&records, &lattice, &given.fixed, &given.options, control)?))
     })?;
     found.dict(py)
 }
 
-/// (index, score, α, orders, coefficients, initial terms by record).
+/// Row of a table: (index, score, α, orders, coefficients, initial terms by record).
 type FoundRow = (u64, f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
 
-/// A table, counts and failures with the orders of each index.
-struct Found {
+/// Result table with counts and failures, and the orders of each index.
+struct OrderTable {
     rows: Vec<FoundRow>,
     counts: Counts,
     failures: Vec<(u64, f64, Vec<f64>, &'static str)>,
 }
 
-impl Found {
-    fn new(lattice: &Lattice, outcome: Outcome) -> Self {
+impl OrderTable {
+    fn new(lattice: &OrderGrid, outcome: Outcome) -> Self {
         let orders = |index: u64| {
             let structure = lattice.structure(index);
             (structure.order, structure.terms.iter().map(|t| t.order).collect::<Vec<f64>>())
@@ -77,7 +72,7 @@ impl Found {
         };
         let failure = |&(index, failure): &_| {
             let (alpha, orders) = orders(index);
-            (index, alpha, orders, named(failure))
+            (index, alpha, orders, failure_name(failure))
         };
         Self {
             rows: outcome.rows.into_iter().map(row).collect(),
@@ -89,15 +84,14 @@ impl Found {
     fn dict(self, py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
         let dict = PyDict::new(py);
         dict.set_item("rows", self.rows)?;
-        dict.set_item("counts", counted(py, &self.counts)?)?;
-        dict.set_item("boxed", self.counts.boxed)?;
+        dict.set_item("counts", counts_to_dict(py, &self.counts)?)?;
+        dict.set_item("boxed", self.counts.excluded_by_box)?;
         dict.set_item("failures", self.failures)?;
         Ok(dict)
     }
 }
 
-/// Candidates of a search, where each wave of its rounds ends by this algorithm or the present one, and whose number that
-/// is.
+/// Plan of a search: number of candidates, ends of its generations, and number of the present algorithm.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_plan(
@@ -109,15 +103,15 @@ pub fn search_plan(
     algorithm: Option<u64>,
 ) -> PyResult<(u64, Vec<u64>, u64)> {
     let options = settings.options(terms)?;
-    detached(py, || {
+    run_detached(py, || {
         let count = orders.lattice(&inputs)?.count();
-        let present = batches::algorithm(count, &options);
-        let all = batches::rounds_by(algorithm.unwrap_or(present).min(present), count, &options);
-        Ok((count, batches::waves(all), present))
+        let present = batches::algorithm_version(count, &options);
+        let all = batches::batch_count_by_version(algorithm.unwrap_or(present).min(present), count, &options);
+        Ok((count, batches::generation_ends(all), present))
     })
 }
 
-/// The result of a search from the parts that its rounds came to, over records of so many samples.
+/// Result of a search from the parts of its batches, for records of so many samples.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_join<'py>(
@@ -130,33 +124,39 @@ pub fn search_join<'py>(
     parts: List<PartArg>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let options = settings.options(terms)?;
-    let found = detached(py, || {
+    let found = run_detached(py, || {
         let lattice = orders.lattice(&inputs)?;
         let mut all = Part::default();
         for argument in parts {
             let part = part(argument);
             let index = part.rows.iter().map(|r| r.index).chain(part.failures.iter().map(|f| f.0)).max();
             if let Some(index) = index.filter(|&i| i >= lattice.count()) {
-                return Err(another(format!("a row has index {index} among {} candidates", lattice.count())));
+                return Err(mismatch_error(format!("a row has index {index} among {} candidates", lattice.count())));
             }
-            all.join(part, options.keep);
+            all.join(part, options.top);
         }
-        if all.counts.candidates != lattice.count() || all.counts.done() != lattice.count() {
-            return Err(another(format!("parts account for {} of {} candidates", all.counts.done(), lattice.count())));
+        if all.counts.candidates != lattice.count() || all.counts.processed_count() != lattice.count() {
+            return Err(mismatch_error(format!(
+                "parts account for {} of {} candidates",
+                all.counts.processed_count(),
+                lattice.count()
+            )));
         }
-        if all.counts.boxed > all.counts.bounded {
-            let Counts { boxed, bounded, .. } = all.counts;
-            return Err(another(format!("parts have {boxed} candidates in boxes among {bounded} excluded ones")));
+        if all.counts.excluded_by_box > all.counts.excluded_by_bound {
+            let Counts { excluded_by_box, excluded_by_bound, .. } = all.counts;
+            return Err(mismatch_error(format!(
+                "parts have {excluded_by_box} candidates in boxes among {excluded_by_bound} excluded ones"
+            )));
         }
-        Ok(Found::new(&lattice, all.outcome(options.norm, samples)))
+        Ok(OrderTable::new(&lattice, all.outcome(options.norm, samples)))
     })?;
     found.dict(py)
 }
 
-/// A search made ready for its rounds: on this machine, or on one of many.
+/// Search prepared for its batches, on this machine or on several.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct OrderSearch {
-    ready: batches::Search<'static>,
+    ready: batches::BatchEvaluator<'static>,
 }
 
 #[pymethods]
@@ -172,17 +172,17 @@ impl OrderSearch {
         terms: InitialArg,
         settings: SettingsArg,
     ) -> PyResult<Self> {
-        let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
-        let ready = watched(py, None, |control| {
+        let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+        let ready = run_watched(py, None, |control| {
             let lattice = orders.lattice(&given.inputs)?;
             let records = given.records(control)?;
             let pool = pool(given.options.threads)?;
-            batches::Search::new(&records, Cow::Owned(lattice), &given.fixed, &given.options, &pool, control)
+            batches::BatchEvaluator::new(&records, Cow::Owned(lattice), &given.fixed, &given.options, &pool, control)
         })?;
         Ok(Self { ready })
     }
 
-    /// Rounds `first … last − 1` of one wave: the part they come to.
+    /// Evaluate batches `first … last − 1` of one generation.
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn rounds(
         &self,
@@ -195,18 +195,18 @@ impl OrderSearch {
         progress: Option<Py<PyAny>>,
         save: Option<Py<PyAny>>,
     ) -> PyResult<PartArg> {
-        let found = saved(py, progress.as_ref(), save.as_ref(), |control| {
+        let found = run_checkpointed(py, progress.as_ref(), save.as_ref(), |control| {
             let pool = pool(threads)?;
-            self.ready.rounds(first, last, &seed, start.map(checkpoint), &pool, control)
+            self.ready.evaluate_batches(first, last, &seed, start.map(checkpoint), &pool, control)
         })?;
         Ok(part_of(found))
     }
 }
 
-/// (output, interval of alpha, [(signal, lowest, highest), …], apart).
+/// Search region: (output, interval of alpha, [(signal, lowest, highest), …], smallest separation).
 type RegionTuple = (usize, (f64, f64), List<(usize, f64, f64)>, f64);
 
-/// (within, largest, cells, threads, bytes of memory).
+/// Settings: (tolerance, largest coefficient, cells, threads, bytes of memory).
 type AskedTuple = (f64, f64, u64, usize, u64);
 
 #[pyfunction]
@@ -219,23 +219,23 @@ pub fn certify<'py>(
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let records = records(&runs)?;
-    let (output, alpha, terms, apart) = region;
+    let (output, alpha, terms, min_separation) = region;
     let terms = terms.iter().map(|&(signal, lowest, highest)| Range { signal, lowest, highest }).collect();
-    let region = Region { output, alpha, terms, apart };
-    let (within, largest, cells, threads, memory) = asked;
-    let asked = Asked { within, largest, cells, threads, memory };
-    let found = watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &asked, control))?;
+    let region = Region { output, alpha, terms, min_separation };
+    let (tolerance, max_coefficient, max_cells, threads, memory) = asked;
+    let asked = CertificateOptions { tolerance, max_coefficient, max_cells, threads, memory };
+    let found = run_watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &asked, control))?;
     let dict = PyDict::new(py);
-    dict.set_item("at_least", found.at_least)?;
+    dict.set_item("at_least", found.lower_bound)?;
     dict.set_item("best", found.best)?;
     dict.set_item("alpha", found.order)?;
     dict.set_item("orders", found.orders)?;
     dict.set_item("cells", found.cells)?;
-    dict.set_item("open", found.open)?;
+    dict.set_item("open", found.open_cells)?;
     Ok(dict)
 }
 
-/// Errors of candidates at orders and coefficients of their own.
+/// Errors of candidates with given orders and coefficients.
 #[pyclass(module = "ftlm._core")]
 pub struct Points {
     inner: PointsOf,
@@ -257,10 +257,10 @@ impl Points {
         let width = signals.len();
         let norm = if squares { Norm::L2 } else { Norm::L1 };
         let (records, signals, inputs) = (records(&runs)?, signals.into(), inputs.into());
-        Ok(Self { inner: detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
+        Ok(Self { inner: run_detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
     }
 
-    /// Errors of candidates given as rows (alpha, orders, coefficients); infinite beyond the limit.
+    /// Errors of candidates in rows (alpha, orders, coefficients). Infinite above the limit.
     #[allow(clippy::needless_pass_by_value)]
     fn scores<'py>(
         &mut self,
@@ -270,7 +270,7 @@ impl Points {
         threads: usize,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let (rows, Self { inner, width }) = (rows(&candidates)?, self);
-        let found = watched(py, None, |control| {
+        let found = run_watched(py, None, |control| {
             let point = |row: Vec<f64>| {
                 check_length("a candidate", 1 + 2 * *width, row.len())?;
                 let (orders, coefficients) = row[1..].split_at(*width);
@@ -283,21 +283,20 @@ impl Points {
     }
 }
 
-/// Panics where it is told to, so that a test can see what becomes of a panic: in a call, in the thread that a search
-/// runs on, or in one of its workers.
+/// Panic at a requested place: in the call, in the search thread, or in one of its workers.
 #[pyfunction]
 #[allow(clippy::panic)]
 pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
     let fault = || std::panic::panic_any("on purpose");
     match place {
-        "call" => detached(py, fault),
-        "search" => watched(py, None, |_| fault()),
-        _ => watched(py, None, |_| pool(2)?.install(|| rayon::join(fault, || ()).0)),
+        "call" => run_detached(py, fault),
+        "search" => run_watched(py, None, |_| fault()),
+        _ => run_watched(py, None, |_| pool(2)?.install(|| rayon::join(fault, || ()).0)),
     }
 }
 
-/// Whether kernels run as they are compiled for the oldest machine.
+/// Make kernels run as compiled for the oldest machine.
 #[pyfunction]
-pub fn portable(on: bool) {
-    crate::simd::portable(on);
+pub fn force_portable(on: bool) {
+    crate::simd::force_portable(on);
 }

@@ -1,4 +1,4 @@
-//! Order searches for Python: over a lattice, over a stage, at points; watched for Ctrl-C while they run.
+//! Bindings of the order search: order grid, coupled search, given points. Ctrl-C is watched during a search.
 
 mod arguments;
 mod grid_search;
@@ -6,6 +6,6 @@ mod stage;
 pub(crate) mod watch;
 
 pub use grid_search::{
-    certify, lattice_size, panic_on_purpose, portable, search, search_join, search_plan, OrderSearch, Points,
+    certify, force_portable, order_grid_size, panic_on_purpose, search, search_join, search_plan, OrderSearch, Points,
 };
 pub use stage::{search_stage, StageSearch};

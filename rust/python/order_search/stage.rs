@@ -1,4 +1,4 @@
-//! Searches over the free orders of a stage: at once, or followed here and elsewhere.
+//! Bindings of the coupled search over the free orders of a joint: in one call, or block by block.
 
 use std::borrow::Cow;
 use std::sync::{Mutex, PoisonError};
@@ -6,15 +6,17 @@ use std::sync::{Mutex, PoisonError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
-use super::arguments::{counted, law_lattice, named, span, verdicts, verdicts_of, Given, LawArg, SettingsArg, SpanArg};
-use super::watch::watched;
+use super::arguments::{
+    counts_to_dict, failure_name, law_lattice, span, verdicts, verdicts_of, LawArg, SearchInputs, SettingsArg, SpanArg,
+};
+use super::watch::run_watched;
 use crate::error::Error;
-use crate::order_search::grid::order_law::LawLattice;
+use crate::order_search::grid::order_law::OrderLawGrid;
 use crate::order_search::result::Counts;
-use crate::order_search::stage_join::{self, Course, Stage, StageOutcome, StageRow};
+use crate::order_search::stage_join::{self, SearchState, Stage, StageOutcome, StageRow};
 use crate::parallel::pool;
-use crate::python::convert::{nested, InitialArg, List, RecordArg};
-use crate::python::errors::detached;
+use crate::python::convert::{to_vectors, InitialArg, List, RecordArg};
+use crate::python::errors::run_detached;
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
@@ -30,30 +32,30 @@ pub fn search_stage<'py>(
     settings: SettingsArg,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let (axes, fixed) = (nested(axes), nested(fixed));
-    let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
-    let found = watched(py, progress.as_ref(), |control| {
+    let (axes, fixed) = (to_vectors(axes), to_vectors(fixed));
+    let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+    let found = run_watched(py, progress.as_ref(), |control| {
         let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
         let records = given.records(control)?;
         let outcome = stage_join::search(&records, &lattice, &given.fixed, &scales, &given.options, control)?;
-        Ok(Found::new(&lattice, outcome))
+        Ok(StageTable::new(&lattice, outcome))
     })?;
     found.dict(py)
 }
 
-/// (score, α, orders, coefficients, initial terms by record) of one equation.
+/// Result of one equation: (score, α, orders, coefficients, initial terms by record).
 type FoundEquation = (f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
 
-/// A table, counts and failures with the free orders of each index.
-struct Found {
+/// Result table with counts and failures, and the free orders of each index.
+struct StageTable {
     rows: Vec<(u64, f64, Vec<f64>, Vec<FoundEquation>)>,
     counts: Counts,
     failures: Vec<(u64, Vec<f64>, &'static str)>,
     distinct: Vec<u64>,
 }
 
-impl Found {
-    fn new(lattice: &LawLattice, outcome: StageOutcome) -> Self {
+impl StageTable {
+    fn new(lattice: &OrderLawGrid, outcome: StageOutcome) -> Self {
         let row = |row: StageRow| {
             let equations = row.structures.iter().zip(row.rows).map(|(structure, part)| {
                 let orders = structure.terms.iter().map(|t| t.order).collect();
@@ -61,7 +63,7 @@ impl Found {
             });
             (row.index, row.score, row.free, equations.collect())
         };
-        let failure = |&(index, failure): &_| (index, lattice.free(index), named(failure));
+        let failure = |&(index, failure): &_| (index, lattice.free(index), failure_name(failure));
         Self {
             rows: outcome.rows.into_iter().map(row).collect(),
             counts: outcome.counts,
@@ -73,24 +75,24 @@ impl Found {
     fn dict(self, py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
         let dict = PyDict::new(py);
         dict.set_item("rows", self.rows)?;
-        dict.set_item("counts", counted(py, &self.counts)?)?;
+        dict.set_item("counts", counts_to_dict(py, &self.counts)?)?;
         dict.set_item("failures", self.failures)?;
         dict.set_item("distinct", self.distinct)?;
         Ok(dict)
     }
 }
 
-/// The search of a stage made ready: its candidates are followed here or elsewhere, and taken in where its course is
-/// kept.
+/// Search over coupled equations, prepared for evaluation here or elsewhere. The instance that keeps the search state
+/// collects results.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct StageSearch {
     stage: Stage<'static>,
-    course: Mutex<Option<Course>>,
+    course: Mutex<Option<SearchState>>,
 }
 
 impl StageSearch {
-    /// Works on the course.
-    fn course<T>(&self, work: impl FnOnce(&mut Course) -> Result<T, Error>) -> Result<T, Error> {
+    /// Run `work` on the search state.
+    fn course<T>(&self, work: impl FnOnce(&mut SearchState) -> Result<T, Error>) -> Result<T, Error> {
         let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
         let found = course.as_mut().ok_or_else(|| Error::Structure {
             what: "this search only follows candidates".into(),
@@ -116,9 +118,9 @@ impl StageSearch {
         settings: SettingsArg,
         keeps_course: bool,
     ) -> PyResult<Self> {
-        let (axes, fixed) = (nested(axes), nested(fixed));
-        let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
-        let (stage, course) = watched(py, None, |control| {
+        let (axes, fixed) = (to_vectors(axes), to_vectors(fixed));
+        let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+        let (stage, course) = run_watched(py, None, |control| {
             let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
             let records = given.records(control)?;
             let pool = pool(given.options.threads)?;
@@ -127,19 +129,19 @@ impl StageSearch {
         Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
     }
 
-    /// Candidates to follow next; none at the end.
-    fn wanted(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
-        detached(py, || {
-            self.course(|c| Ok(c.wanted().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
+    /// Candidates to evaluate next. Empty at the end.
+    fn pending_spans(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
+        run_detached(py, || {
+            self.course(|c| Ok(c.pending_spans().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
         })
     }
 
-    /// Candidates to follow in all, as far as is known, and the best score so far.
+    /// Number of candidates to evaluate as far as known, and the best score so far.
     fn state(&self, py: Python<'_>) -> PyResult<(u64, Option<f64>)> {
-        detached(py, || self.course(|c| Ok((c.total(), c.best()))))
+        run_detached(py, || self.course(|c| Ok((c.total(), c.best()))))
     }
 
-    /// What these candidates come to.
+    /// Evaluate candidates.
     #[allow(clippy::needless_pass_by_value)]
     fn follow<'py>(
         &self,
@@ -149,25 +151,25 @@ impl StageSearch {
         progress: Option<Py<PyAny>>,
     ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)> {
         let wanted: Vec<_> = spans.into_iter().map(span).collect();
-        let (values, kinds) = watched(py, progress.as_ref(), |control| {
+        let (values, kinds) = run_watched(py, progress.as_ref(), |control| {
             Ok(verdicts_of(&self.stage.evaluate(&wanted, &pool(threads)?, control)?))
         })?;
         Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
     }
 
-    /// Takes in what the wanted candidates came to, in their order.
+    /// Add the results of the pending candidates, in their order.
     fn take(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
-        watched(py, None, |control| {
+        run_watched(py, None, |control| {
             let found = verdicts(values, kinds)?;
-            self.course(|course| course.take(&self.stage, &found, &pool(threads)?, control))
+            self.course(|course| course.record_verdicts(&self.stage, &found, &pool(threads)?, control))
         })
     }
 
-    /// The result, once nothing is wanted.
+    /// Result, once no candidates are pending.
     fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let found = watched(py, None, |control| {
+        let found = run_watched(py, None, |control| {
             let outcome = self.course(|course| self.stage.outcome(course, control))?;
-            Ok(Found::new(self.stage.lattice(), outcome))
+            Ok(StageTable::new(self.stage.lattice(), outcome))
         })?;
         found.dict(py)
     }

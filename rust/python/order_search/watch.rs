@@ -1,4 +1,4 @@
-//! Runs a computation on a thread of its own, so that Python can stop it and see how far it is.
+//! Interruptible computation: work on a separate thread, polling of Python signals, progress and checkpoints.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{channel, Receiver, RecvTimeoutError, Sender};
@@ -10,22 +10,22 @@ use super::arguments::checkpoint_of;
 use crate::error::Error;
 use crate::order_search::control::Control;
 use crate::parallel;
-use crate::python::errors::{attached, caught, detached};
+use crate::python::errors::{catch_panic, run_attached, run_detached};
 
-/// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
-const LOOK: Duration = Duration::from_millis(50);
+/// Polling interval of Python signals, well below the half second within which Ctrl-C must end a search.
+const SIGNAL_POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Runs `work` on a thread of its own, so that this one can watch for signals and report progress.
-pub fn watched<T: Send>(
+/// Run `work` on a separate thread, and watch signals and report progress on this one.
+pub fn run_watched<T: Send>(
     py: Python<'_>,
     progress: Option<&Py<PyAny>>,
     work: impl FnOnce(&Control) -> Result<T, Error> + Send,
 ) -> PyResult<T> {
-    saved(py, progress, None, work)
+    run_checkpointed(py, progress, None, work)
 }
 
-/// As [`watched`]; whenever Python is asked for signals, `save` is called with the latest checkpoint, or with None.
-pub fn saved<T: Send>(
+/// As [`run_watched`], with calls of `save` with the latest checkpoint or None at every poll of the signals.
+pub fn run_checkpointed<T: Send>(
     py: Python<'_>,
     progress: Option<&Py<PyAny>>,
     save: Option<&Py<PyAny>>,
@@ -37,19 +37,19 @@ pub fn saved<T: Send>(
         std::thread::scope(|scope| {
             let (finished, wait) = channel::<()>();
             let worker = scope.spawn(|| {
-                let result = caught(|| work(&control));
+                let result = catch_panic(|| work(&control));
                 drop(finished);
                 result
             });
             let mut raised: Option<PyErr> = None;
-            while let Err(RecvTimeoutError::Timeout) = wait.recv_timeout(LOOK) {
+            while let Err(RecvTimeoutError::Timeout) = wait.recv_timeout(SIGNAL_POLL_INTERVAL) {
                 let look = Python::attach(|py| {
                     py.check_signals()?;
                     if let Some(progress) = progress {
                         progress.call1(py, state(&control))?;
                     }
                     if let Some(save) = save {
-                        save.call1(py, (control.take().map(checkpoint_of),))?;
+                        save.call1(py, (control.take_checkpoint().map(checkpoint_of),))?;
                     }
                     Ok::<_, PyErr>(())
                 });
@@ -73,11 +73,11 @@ pub fn saved<T: Send>(
     Ok(result)
 }
 
-/// Work on fewer points, each as often as it is gone through, takes less time than Python's signals are asked for, and no
-/// thread.
-const SHORT: usize = 1 << 17;
+/// Most points of work, counted once a pass, that runs without a separate thread. It takes less time than one polling
+/// interval.
+const MAX_INLINE_POINTS: usize = 1 << 17;
 
-/// A flag that ends what was given it: [`leavable`] work on other threads than the one that Ctrl-C interrupts.
+/// Cancellation flag for [`run_interruptible`] work on other threads than the one that Ctrl-C interrupts.
 #[pyclass(module = "ftlm._core", frozen)]
 #[derive(Clone, Default)]
 pub struct Stop(parallel::Stop);
@@ -86,44 +86,45 @@ pub struct Stop(parallel::Stop);
 impl Stop {
     #[new]
     fn new() -> PyResult<Self> {
-        attached(|| Ok(Self::default()))
+        run_attached(|| Ok(Self::default()))
     }
 
-    /// Ends what was given this flag, now and later.
+    /// Cancel all work with this flag, now and later.
     fn set(&self) -> PyResult<()> {
-        attached(|| {
+        run_attached(|| {
             self.0.set();
             Ok(())
         })
     }
 
-    /// Whether it was set.
+    /// Whether the flag is set.
     #[getter]
     fn is_set(&self) -> PyResult<bool> {
-        attached(|| Ok(self.0.is_set()))
+        run_attached(|| Ok(self.0.is_set()))
     }
 }
 
-/// Runs `work` on `points` values so that Ctrl-C, or a flag that is set, returns at once: transforms of millions of points
-/// cannot be stopped, so their thread is left behind. It ends where `work` next looks at whether it was told to stop, and
-/// touches no Python.
-pub fn leavable<T: Send + 'static>(
+/// Run `work` on `points` values such that Ctrl-C or a set flag returns at once.
+///
+/// Transforms of millions of points cannot be stopped, so their thread is abandoned. It ends at the next check of
+/// `work` for cancellation and does not access Python.
+pub fn run_interruptible<T: Send + 'static>(
     py: Python<'_>,
     points: usize,
     flag: Option<&Stop>,
     work: impl FnOnce(&parallel::Stop) -> Result<T, Error> + Send + 'static,
 ) -> PyResult<T> {
     let stop = flag.cloned().unwrap_or_default().0;
-    if points < SHORT {
-        return detached(py, || work(&stop));
+    if points < MAX_INLINE_POINTS {
+        return run_detached(py, || work(&stop));
     }
     py.detach(|| {
         let (send, receive) = channel();
         let told = stop.clone();
-        // One that is left behind has nobody to send to.
-        std::thread::spawn(move || drop(send.send(caught(|| work(&told)))));
+        // An abandoned thread has no receiver.
+        std::thread::spawn(move || drop(send.send(catch_panic(|| work(&told)))));
         loop {
-            match receive.recv_timeout(LOOK) {
+            match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
                 Ok(result) => return result.map_err(PyErr::from),
                 Err(RecvTimeoutError::Timeout) => {
                     if let Err(error) = Python::attach(|py| py.check_signals()) {
@@ -141,52 +142,54 @@ pub fn leavable<T: Send + 'static>(
     })
 }
 
-/// What a computing thread asks of Python while it computes: questions go out, answers come in.
-pub struct Desk<Q, A, T> {
-    tell: Sender<Told<Q, T>>,
+/// Channel through which a computing thread sends requests to Python and receives responses.
+pub struct RequestChannel<Q, A, T> {
+    tell: Sender<WorkerMessage<Q, T>>,
     answers: Receiver<Result<A, Error>>,
 }
 
-enum Told<Q, T> {
+enum WorkerMessage<Q, T> {
     Asks(Q),
     Ends(Result<T, Error>),
 }
 
-impl<Q, A, T> Desk<Q, A, T> {
-    /// Asks, and waits for the answer.
+impl<Q, A, T> RequestChannel<Q, A, T> {
+    /// Send a request and wait for the response.
     ///
     /// # Errors
-    /// [`Error::Source`] where Python raised an error of ftlm's own, [`Error::Interrupted`] where it raised another one, or
-    /// nobody is left to answer.
+    /// [`Error::Source`] if Python raised an exception of ftlm, [`Error::Interrupted`] if it raised another one or the
+    /// caller is gone.
     pub fn ask(&self, question: Q) -> Result<A, Error> {
-        self.tell.send(Told::Asks(question)).map_err(|_| Error::Interrupted)?;
+        self.tell.send(WorkerMessage::Asks(question)).map_err(|_| Error::Interrupted)?;
         self.answers.recv().unwrap_or(Err(Error::Interrupted))
     }
 }
 
-/// As [`leavable`], but on a thread of its own whatever it takes, which may ask Python: answers are given on the thread
-/// that called, so that one that is left behind touches no Python. What Python raised comes out where `work` ends by it.
-pub fn served<T: Send + 'static, Q: Send + 'static, A: Send + 'static>(
+/// As [`run_interruptible`], always on a separate thread, which may send requests to Python.
+///
+/// Requests are served on the calling thread, so that an abandoned thread does not access Python. An exception of
+/// Python is raised again if `work` ends with it.
+pub fn run_with_requests<T: Send + 'static, Q: Send + 'static, A: Send + 'static>(
     py: Python<'_>,
     flag: Option<&Stop>,
     answer: impl Fn(Python<'_>, Q) -> PyResult<A> + Send + Sync,
-    work: impl FnOnce(&parallel::Stop, &Desk<Q, A, T>) -> Result<T, Error> + Send + 'static,
+    work: impl FnOnce(&parallel::Stop, &RequestChannel<Q, A, T>) -> Result<T, Error> + Send + 'static,
 ) -> PyResult<T> {
     let stop = flag.cloned().unwrap_or_default().0;
     py.detach(|| {
         let (tell, hear) = channel();
         let (reply, answers) = channel();
-        let (told, desk) = (stop.clone(), Desk { tell: tell.clone(), answers });
-        // One that is left behind has nobody to send to.
-        std::thread::spawn(move || drop(tell.send(Told::Ends(caught(|| work(&told, &desk))))));
+        let (told, desk) = (stop.clone(), RequestChannel { tell: tell.clone(), answers });
+        // An abandoned thread has no receiver.
+        std::thread::spawn(move || drop(tell.send(WorkerMessage::Ends(catch_panic(|| work(&told, &desk))))));
         let mut raised: Option<PyErr> = None;
         loop {
-            match hear.recv_timeout(LOOK) {
-                Ok(Told::Ends(Err(Error::Source { why }))) => {
+            match hear.recv_timeout(SIGNAL_POLL_INTERVAL) {
+                Ok(WorkerMessage::Ends(Err(Error::Source { why }))) => {
                     return Err(raised.unwrap_or_else(|| Error::Source { why }.into()));
                 }
-                Ok(Told::Ends(result)) => return result.map_err(PyErr::from),
-                Ok(Told::Asks(question)) => {
+                Ok(WorkerMessage::Ends(result)) => return result.map_err(PyErr::from),
+                Ok(WorkerMessage::Asks(question)) => {
                     let answered = Python::attach(|py| match answer(py, question) {
                         Err(error) if own(py, &error)? => {
                             let why = error.value(py).to_string();
@@ -219,12 +222,12 @@ pub fn served<T: Send + 'static, Q: Send + 'static, A: Send + 'static>(
     })
 }
 
-/// Whether an exception is one of ftlm's own, which a computation may go round.
+/// Whether an exception is one of ftlm's, which a computation may handle.
 fn own(py: Python<'_>, error: &PyErr) -> PyResult<bool> {
     Ok(error.is_instance(py, &py.import("ftlm.errors")?.getattr("FtlmError")?))
 }
 
-/// Candidates done, in all, and left before the end of the record.
+/// Progress: candidates done, total, and pruned.
 fn state(control: &Control) -> (u64, u64, u64) {
     let read = |x: &AtomicU64| x.load(Ordering::Relaxed);
     (read(&control.done), read(&control.total), read(&control.pruned))

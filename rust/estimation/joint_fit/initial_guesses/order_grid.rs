@@ -1,52 +1,46 @@
-//! Rows of coarse lattices.
-//!
-//! Starts from coarse lattices.
-//!
-//! Coarse lattices of free orders.
-//!
-//! What an order search takes one by one.
+//! Coarse order grids and the least-squares coefficients at their best points.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::equation::Initial;
 use crate::error::{Error, Result};
-use crate::estimation::joint_fit::format::short;
-use crate::estimation::joint_fit::parameter_set::{Free, ALPHA_BOUNDS, SEARCHED_ORDER};
-use crate::estimation::joint_fit::problem::{Place, Runner};
+use crate::estimation::joint_fit::format::format_general;
+use crate::estimation::joint_fit::parameter_set::{ParameterSet, ALPHA_BOUNDS, SEARCHED_ORDER};
+use crate::estimation::joint_fit::problem::{Candidate, Iterate};
 use crate::estimation::joint_fit::structure::{Equation, Law, Order, Structure, Term};
 use crate::estimation::output_error::Point;
 use crate::order_search::batches;
 use crate::order_search::control::Control;
-use crate::order_search::grid::{Lattice, LawEquation, LawLattice, TermAxis};
+use crate::order_search::grid::{LawEquation, OrderGrid, OrderLawGrid, TermAxis};
 use crate::order_search::options::Options;
 use crate::order_search::stage_join;
 use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::signal::statistics::mean;
 
-/// A row of a lattice: its orders, and the coefficients freely estimated there, by name.
+/// Row of an order grid: orders and unconstrained coefficient estimates, by name.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Row {
-    /// Orders, in the order of their axes.
+pub(super) struct GridRow {
+    /// Orders, in the sequence of the axes.
     pub orders: Vec<(String, f64)>,
     /// Coefficients.
     pub coefficients: BTreeMap<String, f64>,
 }
 
-impl Row {
-    /// Values of these orders.
+impl GridRow {
+    /// Values of the named orders.
     pub(super) fn values(&self, names: &[String]) -> Vec<f64> {
         let value = |name: &String| self.orders.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, value)| *value);
         names.iter().map(value).collect()
     }
 
-    /// Whether another one has the same orders, in whatever order they stand.
-    pub(super) fn is_at(&self, other: &Self) -> bool {
+    /// True if another row has the same orders, in any sequence.
+    pub(super) fn has_same_orders(&self, other: &Self) -> bool {
         self.orders.len() == other.orders.len() && self.orders.iter().all(|pair| other.orders.contains(pair))
     }
 
-    /// Takes in the orders and coefficients of another one.
-    fn take(&mut self, other: &Self) {
+    /// Merge the orders and coefficients of another row into this one.
+    fn merge(&mut self, other: &Self) {
         for (name, value) in &other.orders {
             match self.orders.iter_mut().find(|(n, _)| n == name) {
                 Some((_, here)) => *here = *value,
@@ -57,61 +51,61 @@ impl Row {
     }
 }
 
-/// How coarse lattices are searched: by least squares, in time, on so many threads, within so many bytes.
+/// Settings of the least-squares search of coarse order grids.
 #[derive(Clone, Copy)]
-pub(super) struct Coarse<'a> {
-    /// What they are searched on.
+pub(super) struct GridSearch<'a> {
+    /// Records of the search.
     pub records: &'a [Record],
-    /// Which signals are inputs.
+    /// True for signals that are inputs.
     pub inputs: &'a [bool],
     /// Initial terms of each record.
     pub initial: &'a Initial,
-    /// Threads.
+    /// Number of threads.
     pub threads: usize,
-    /// Bytes.
+    /// Memory budget in bytes.
     pub memory: u64,
-    /// Ends a search.
+    /// Cancellation flag.
     pub stop: &'a Stop,
 }
 
-impl Coarse<'_> {
-    /// The same on other records.
-    pub(super) fn on<'b>(&'b self, records: &'b [Record]) -> Coarse<'b> {
-        Coarse { records, ..*self }
+impl GridSearch<'_> {
+    /// Search on other records.
+    pub(super) fn with_records<'b>(&'b self, records: &'b [Record]) -> GridSearch<'b> {
+        GridSearch { records, ..*self }
     }
 
-    /// So many best rows of a coarse lattice, by least squares.
-    pub(super) fn rows(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
+    /// Best rows of a coarse order grid by least squares, at most `keep`.
+    pub(super) fn best_rows(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
         if !structure.has_order_law() {
             let tables: Result<Vec<_>> =
-                structure.equations.iter().map(|e| self.of_equation(structure, e, axes, keep)).collect();
-            return Ok(side_by_side(&tables?, structure));
+                structure.equations.iter().map(|e| self.search_equation(structure, e, axes, keep)).collect();
+            return Ok(merge_tables(&tables?, structure));
         }
-        let stages = parts(structure);
+        let stages = independent_groups(structure);
         if stages.len() <= 1 {
-            return self.of_stage(structure, axes, keep);
+            return self.search_coupled(structure, axes, keep);
         }
-        // Stages that share no order are searched one by one; the best of each belong together.
+        // Groups of equations without common orders are searched separately; their best rows are combined.
         let table = |stage: &Structure| {
             let names = stage.order_names();
             let own: Axes = axes.iter().filter(|(name, _)| names.contains(name)).cloned().collect();
-            self.rows(stage, &own, keep)
+            self.best_rows(stage, &own, keep)
         };
-        Ok(side_by_side(&stages.iter().map(table).collect::<Result<Vec<_>>>()?, structure))
+        Ok(merge_tables(&stages.iter().map(table).collect::<Result<Vec<_>>>()?, structure))
     }
 
     fn options(&self, keep: usize) -> Options {
         let (initial, threads, memory) = (self.initial.clone(), self.threads, self.memory);
-        Options { initial, keep, threads, memory, ..Options::default() }
+        Options { initial, top: keep, threads, memory, ..Options::default() }
     }
 
     fn control(&self) -> Control {
         Control { stop: self.stop.clone(), ..Control::default() }
     }
 
-    /// Best rows of equations under their order law.
+    /// Best rows of coupled equations with an order law.
     #[allow(clippy::cast_precision_loss)]
-    fn of_stage(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
+    fn search_coupled(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
         let (names, along): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
         let law = |e: &Equation| LawEquation {
             output: e.output,
@@ -120,72 +114,80 @@ impl Coarse<'_> {
         };
         let equations = &structure.equations;
         let laws: Vec<LawEquation> = equations.iter().map(law).collect();
-        let fixed: Vec<Vec<Option<f64>>> = equations.iter().map(known).collect();
-        let size = |e: &Equation| self.records.iter().map(|r| deviation(r.signal(e.output)) * r.m() as f64).sum();
+        let fixed: Vec<Vec<Option<f64>>> = equations.iter().map(fixed_coefficients).collect();
+        let size =
+            |e: &Equation| self.records.iter().map(|r| standard_deviation(r.signal(e.output)) * r.m() as f64).sum();
         let scales: Vec<f64> = equations.iter().map(size).collect();
-        let lattice = LawLattice::new(&along, &laws, self.inputs)?.with_known(&fixed);
+        let lattice = OrderLawGrid::new(&along, &laws, self.inputs)?.with_fixed_coefficients(&fixed);
         let found = stage_join::search(self.records, &lattice, &fixed, &scales, &self.options(keep), &self.control())?;
         let row = |found: stage_join::StageRow| {
             let pairs = equations.iter().zip(&found.rows);
             let coefficients = pairs.flat_map(|(item, part)| named_coefficients(item, &part.coefficients)).collect();
-            Row { orders: names.iter().cloned().zip(found.free).collect(), coefficients }
+            GridRow { orders: names.iter().cloned().zip(found.free).collect(), coefficients }
         };
         Ok(found.rows.into_iter().map(row).collect())
     }
 
-    /// Best rows of one equation whose orders are free by themselves.
-    fn of_equation(&self, structure: &Structure, item: &Equation, axes: &Axes, keep: usize) -> Result<Vec<Row>> {
+    /// Best rows of one equation with independent free orders.
+    fn search_equation(
+        &self,
+        structure: &Structure,
+        item: &Equation,
+        axes: &Axes,
+        keep: usize,
+    ) -> Result<Vec<GridRow>> {
         check_linear(structure, item, "an order search")?;
         let axis = |order: &Order| match order.names().next() {
-            Some(name) => values(axes, name).to_vec(),
+            Some(name) => axis_values(axes, name).to_vec(),
             None => vec![order.constant],
         };
         let term = |t: &Term| TermAxis {
             signal: t.signal,
             values: axis(&t.order),
-            interchangeable: t.order.is_free() && t.fixed().is_none(),
+            interchangeable: t.order.is_free() && t.fixed_coefficient().is_none(),
         };
         let terms: Vec<TermAxis> = item.terms.iter().map(term).collect();
         let is_input = |signal: usize| self.inputs.get(signal).copied().unwrap_or(false);
-        let named = |error| named_signals(error, &structure.signals);
-        let lattice = Lattice::new(item.output, &axis(&item.order), &terms, is_input).map_err(named)?;
+        let named = |error| name_signals(error, &structure.signals);
+        let lattice = OrderGrid::new(item.output, &axis(&item.order), &terms, is_input).map_err(named)?;
         let (options, control) = (self.options(keep), self.control());
-        let found = batches::search(self.records, &lattice, &known(item), &options, &control).map_err(named)?;
+        let found =
+            batches::search(self.records, &lattice, &fixed_coefficients(item), &options, &control).map_err(named)?;
         let row = |found: crate::order_search::result::Row| {
             let at = lattice.structure(found.index);
             let there = std::iter::once(at.order).chain(at.terms.iter().map(|term| term.order));
             let pairs = item.orders().zip(there);
             let orders = pairs.filter_map(|(order, value)| Some((order.names().next()?.clone(), value))).collect();
-            Row { orders, coefficients: named_coefficients(item, &found.coefficients).collect() }
+            GridRow { orders, coefficients: named_coefficients(item, &found.coefficients).collect() }
         };
         Ok(found.rows.into_iter().map(row).collect())
     }
 }
 
-/// Rows of independent tables side by side, rank by rank; a table that ends goes on with its last row.
-pub(super) fn side_by_side(tables: &[Vec<Row>], structure: &Structure) -> Vec<Row> {
+/// Combine rows of independent tables rank by rank; a shorter table repeats its last row.
+pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &Structure) -> Vec<GridRow> {
     let wanted = structure.coefficient_names().len();
     let merged = |rank: usize| {
-        let mut merged = Row::default();
-        tables.iter().filter_map(|table| table.get(rank).or(table.last())).for_each(|row| merged.take(row));
+        let mut merged = GridRow::default();
+        tables.iter().filter_map(|table| table.get(rank).or(table.last())).for_each(|row| merged.merge(row));
         merged
     };
     let ranks = tables.iter().map(Vec::len).max().unwrap_or(0);
     (0..ranks).map(merged).filter(|row| row.coefficients.len() == wanted).collect()
 }
 
-/// Free coefficients by name from the core's products of factor and coefficient.
+/// Free coefficients by name, from products of factor and coefficient.
 pub(super) fn named_coefficients<'a>(item: &'a Equation, raw: &'a [f64]) -> impl Iterator<Item = (String, f64)> + 'a {
     let pairs = item.terms.iter().zip(raw);
     pairs.filter_map(|(term, c)| Some((term.coefficient.name()?.clone(), c / term.factor)))
 }
 
-/// Products of factor and coefficient where they are known.
-pub(super) fn known(item: &Equation) -> Vec<Option<f64>> {
-    item.terms.iter().map(Term::fixed).collect()
+/// Products of factor and coefficient of the fixed terms; None for free ones.
+pub(super) fn fixed_coefficients(item: &Equation) -> Vec<Option<f64>> {
+    item.terms.iter().map(Term::fixed_coefficient).collect()
 }
 
-/// Refuses friction where nothing knows it.
+/// Reject friction in methods that are linear in the coefficients.
 pub(super) fn check_linear(structure: &Structure, item: &Equation, what: &str) -> Result<()> {
     if item.friction.is_none() {
         return Ok(());
@@ -197,66 +199,66 @@ pub(super) fn check_linear(structure: &Structure, item: &Equation, what: &str) -
     })
 }
 
-/// The core knows signals by number; people know them by name.
-fn named_signals(error: Error, signals: &[String]) -> Error {
+/// Replace signal numbers by names in error messages.
+fn name_signals(error: Error, signals: &[String]) -> Error {
     let named = |mut text: String| {
-        // From the last on, so that no number is the beginning of another.
+        // Descending, so that no number is a prefix of another.
         for (i, signal) in signals.iter().enumerate().rev() {
             text = text.replace(&format!("signal {i}"), &format!("signal '{signal}'"));
         }
         text
     };
     match error {
-        Error::EmptyLattice { why } => Error::EmptyLattice { why: named(why) },
+        Error::EmptyOrderGrid { why } => Error::EmptyOrderGrid { why: named(why) },
         Error::Structure { what, remedy } => Error::Structure { what: named(what), remedy },
         other => other,
     }
 }
 
 /// Standard deviation of values.
-fn deviation(values: &[f64]) -> f64 {
+fn standard_deviation(values: &[f64]) -> f64 {
     let centre = mean(values);
     let squares: Vec<f64> = values.iter().map(|v| (v - centre) * (v - centre)).collect();
     mean(&squares).sqrt()
 }
 
-/// Steps of the lattices on which a row is followed downhill, and how often it may move on each.
-const ZOOM_STEPS: [f64; 2] = [0.1, 0.05];
-const ZOOM_ROUNDS: usize = 8;
-/// Rows of each prefilter's table that are looked at, all where the first few do not do, and how many of them become
-/// starts: the first, then those that differ by APART in some order.
+/// Increments of the local refinement of a grid point, and maximum number of moves with each.
+const LOCAL_INCREMENTS: [f64; 2] = [0.1, 0.05];
+const MAX_LOCAL_MOVES: usize = 8;
+/// Best rows of the table of each prefilter to examine first, then at most, and maximum number of initial guesses: the
+/// best row, then rows that differ sufficiently in some order.
 const FIRST_ROWS: usize = 25;
 const ROWS_PER_FILTER: usize = 400;
 const STARTS_PER_FILTER: usize = 4;
-/// Ratios of a coefficient law at which a start takes one equation's coefficients from another's.
+/// Ratios of a coefficient law at which the coefficients of one equation follow from those of another.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
-/// Orders are one where they differ by less than these shares of 1 and of themselves.
-const CLOSE: (f64, f64) = (1e-9, 1e-5);
+/// Absolute and relative difference below which two orders are equal.
+const ORDER_TOLERANCES: (f64, f64) = (1e-9, 1e-5);
 
-/// A start.
-pub(super) fn runner(orders: Vec<f64>, coefficients: Vec<f64>, origin: &str) -> Runner {
-    Runner::at(Place { point: Point { orders, coefficients, inputs: Vec::new() }, states: Vec::new() }, origin)
+/// Candidate from orders and coefficients.
+pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &str) -> Candidate {
+    Candidate::at(Iterate { point: Point { orders, coefficients, inputs: Vec::new() }, states: Vec::new() }, origin)
 }
 
-/// Starts from the rows of a lattice that lie apart, the best one followed downhill; none that stood before.
-pub(super) fn lattice_attempts(
-    free: &Free,
-    coarse: &Coarse<'_>,
+/// Candidates from separated rows of an order grid, the best one refined locally, without earlier candidates.
+pub(super) fn grid_candidates(
+    free: &ParameterSet,
+    coarse: &GridSearch<'_>,
     (axes, apart): &(Axes, f64),
     origin: &str,
-    before: &[Runner],
-) -> Result<Vec<Runner>> {
-    let mut attempts: Vec<Runner> = Vec::new();
-    let mut rows = LyingApart::new(free, coarse, axes, *apart);
+    before: &[Candidate],
+) -> Result<Vec<Candidate>> {
+    let mut attempts: Vec<Candidate> = Vec::new();
+    let mut rows = SeparatedRows::new(free, coarse, axes, *apart);
     let mut rank = 0;
     while let Some(row) = rows.next()? {
-        let start = if rank == 0 { zoom(free, coarse, row)? } else { row };
+        let start = if rank == 0 { refine_locally(free, coarse, row)? } else { row };
         rank += 1;
         let values = start.values(&free.orders);
-        if before.iter().chain(&attempts).any(|other| close(&values, &other.attempt.place.point.orders)) {
+        if before.iter().chain(&attempts).any(|other| are_orders_close(&values, &other.result.iterate.point.orders)) {
             continue;
         }
-        attempts.push(runner(values, free.free_from(&start.coefficients), origin));
+        attempts.push(new_candidate(values, free.free_from(&start.coefficients), origin));
         if rank >= STARTS_PER_FILTER {
             break;
         }
@@ -264,30 +266,30 @@ pub(super) fn lattice_attempts(
     Ok(attempts)
 }
 
-fn close(values: &[f64], others: &[f64]) -> bool {
-    values.iter().zip(others).all(|(a, b)| (a - b).abs() <= CLOSE.0 + CLOSE.1 * b.abs())
+fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
+    values.iter().zip(others).all(|(a, b)| (a - b).abs() <= ORDER_TOLERANCES.0 + ORDER_TOLERANCES.1 * b.abs())
 }
 
-/// The rows of a lattice, best first, that each differ from all before in some order; many are asked for late.
-struct LyingApart<'a> {
-    free: &'a Free,
-    coarse: &'a Coarse<'a>,
+/// Iterator over the best rows of an order grid that differ from all previous ones in some order.
+struct SeparatedRows<'a> {
+    free: &'a ParameterSet,
+    coarse: &'a GridSearch<'a>,
     axes: &'a Axes,
     apart: f64,
     picked: Vec<Vec<f64>>,
-    rows: std::vec::IntoIter<Row>,
+    rows: std::vec::IntoIter<GridRow>,
     seen: usize,
-    /// How many are asked for next; none where no more are there.
+    /// Table sizes still to request; empty if there are no more rows.
     wanted: Vec<usize>,
 }
 
-impl<'a> LyingApart<'a> {
-    fn new(free: &'a Free, coarse: &'a Coarse<'a>, axes: &'a Axes, apart: f64) -> Self {
+impl<'a> SeparatedRows<'a> {
+    fn new(free: &'a ParameterSet, coarse: &'a GridSearch<'a>, axes: &'a Axes, apart: f64) -> Self {
         let (picked, rows, wanted) = (Vec::new(), Vec::new().into_iter(), vec![ROWS_PER_FILTER, FIRST_ROWS]);
         Self { free, coarse, axes, apart, picked, rows, seen: 0, wanted }
     }
 
-    fn next(&mut self) -> Result<Option<Row>> {
+    fn next(&mut self) -> Result<Option<GridRow>> {
         loop {
             for row in self.rows.by_ref() {
                 let values = row.values(&self.free.orders);
@@ -298,7 +300,7 @@ impl<'a> LyingApart<'a> {
                 }
             }
             let Some(keep) = self.wanted.pop() else { return Ok(None) };
-            let mut rows = self.coarse.rows(&self.free.structure, self.axes, keep)?;
+            let mut rows = self.coarse.best_rows(&self.free.structure, self.axes, keep)?;
             let found = rows.len();
             rows.drain(..self.seen.min(found));
             (self.rows, self.seen) = (rows.into_iter(), found);
@@ -309,11 +311,17 @@ impl<'a> LyingApart<'a> {
     }
 }
 
-/// Starts with one equation's coefficients from another's by the law, the rest of it by least squares.
+/// Candidates with the coefficients of one equation from another by the law, the rest by least squares.
 ///
-/// The hub of an arm is overdamped: current and friction nearly cancel, and what is left of the hub's acceleration is told
-/// as well by the link's own equation. Freely estimated, the hub's becomes the link's, stiffness reversed.
-pub(super) fn lawful_attempts(free: &Free, coarse: &Coarse<'_>, axes: &Axes, origin: &str) -> Result<Vec<Runner>> {
+/// The motor hub of a flexible arm is overdamped: current and friction nearly cancel, and the link equation explains
+/// the rest of the acceleration equally well. An unconstrained estimate of the hub equation then converges to the link
+/// equation with the sign of the stiffness reversed.
+pub(super) fn law_candidates(
+    free: &ParameterSet,
+    coarse: &GridSearch<'_>,
+    axes: &Axes,
+    origin: &str,
+) -> Result<Vec<Candidate>> {
     let (structure, signs) = (&free.structure, &free.structure.hints.positive);
     let tied: Vec<(&Law, &String, usize)> = (free.products.iter())
         .filter_map(|law| law.factors.split_first().map(|(first, others)| (law, first, others.len())))
@@ -324,7 +332,7 @@ pub(super) fn lawful_attempts(free: &Free, coarse: &Coarse<'_>, axes: &Axes, ori
     }
     let named = structure.coefficient_names();
     let mut attempts = Vec::new();
-    for row in coarse.rows(structure, axes, STARTS_PER_FILTER)? {
+    for row in coarse.best_rows(structure, axes, STARTS_PER_FILTER)? {
         let point: Axes = row.orders.iter().map(|(name, value)| (name.clone(), vec![*value])).collect();
         for ratio in LAW_RATIOS {
             let value = |(law, first, others): &(&Law, &String, usize)| {
@@ -339,37 +347,37 @@ pub(super) fn lawful_attempts(free: &Free, coarse: &Coarse<'_>, axes: &Axes, ori
                 let what = format!("no free coefficient {lost}");
                 return Err(Error::Structure { what, remedy: "name one of the equations'".into() });
             }
-            for rest in coarse.rows(&structure.with_coefficients(&known), &point, 1)? {
+            for rest in coarse.best_rows(&structure.with_coefficients(&known), &point, 1)? {
                 let found = |name: &String| known.get(name).or(rest.coefficients.get(name)).copied().unwrap_or(ratio);
                 let coefficients = free.coefficients.iter().map(found).collect();
-                let words = format!("{origin}, by the law at {}", short(ratio, 6));
-                attempts.push(runner(row.values(&free.orders), coefficients, &words));
+                let words = format!("{origin}, by the law at {}", format_general(ratio, 6));
+                attempts.push(new_candidate(row.values(&free.orders), coefficients, &words));
             }
         }
     }
     Ok(attempts)
 }
 
-/// Follow a row downhill on ever finer lattices around it.
-fn zoom(free: &Free, coarse: &Coarse<'_>, mut row: Row) -> Result<Row> {
+/// Refine a row locally on finer grids around it.
+fn refine_locally(free: &ParameterSet, coarse: &GridSearch<'_>, mut row: GridRow) -> Result<GridRow> {
     if row.orders.is_empty() {
         return Ok(row);
     }
-    for step in ZOOM_STEPS {
-        for _ in 0..ZOOM_ROUNDS {
+    for step in LOCAL_INCREMENTS {
+        for _ in 0..MAX_LOCAL_MOVES {
             let axis = |(name, value): &(String, f64)| {
                 let place = free.orders.iter().position(|n| n == name);
                 let (low, high) = place.map_or((*value, *value), |at| free.bounds()[at]);
                 let around = [value - step, *value, value + step];
-                let mut values: Vec<f64> = around.iter().map(|v| to_nine(v.max(low).min(high))).collect();
+                let mut values: Vec<f64> = around.iter().map(|v| round_nine_decimals(v.max(low).min(high))).collect();
                 values.sort_by(f64::total_cmp);
                 values.dedup();
                 (name.clone(), values)
             };
             let axes: Axes = row.orders.iter().map(axis).collect();
-            let found = coarse.rows(&free.structure, &axes, 1)?.into_iter().next();
+            let found = coarse.best_rows(&free.structure, &axes, 1)?.into_iter().next();
             match found {
-                Some(best) if !best.is_at(&row) => row = best,
+                Some(best) if !best.has_same_orders(&row) => row = best,
                 _ => break,
             }
         }
@@ -377,55 +385,55 @@ fn zoom(free: &Free, coarse: &Coarse<'_>, mut row: Row) -> Result<Row> {
     Ok(row)
 }
 
-/// A number to nine decimals, the nearest of them that there is.
-fn to_nine(value: f64) -> f64 {
+/// Round a value to nine decimals.
+fn round_nine_decimals(value: f64) -> f64 {
     format!("{value:.9}").parse().unwrap_or(value)
 }
 
-/// Step of the lattice on which starts are searched; a start within half of it leads to the optimum.
-const START_STEP: f64 = 0.2;
-/// Candidates of the start's lattice beyond which orders of other signals get fewer values.
-const START_CANDIDATES: u128 = 200_000;
-/// The lowest of the intervals that are usual for highest orders where nothing is known of them.
-const LOWEST: f64 = 0.2;
-/// Highest order that any term but the highest is started from.
-const BELOW: f64 = 2.0;
-/// Orders are kept to one in so many.
-const GRAINS: f64 = 1e9;
+/// Increment of the order grid of the initial guesses; a start within half of it leads to the optimum.
+const START_INCREMENT: f64 = 0.2;
+/// Number of grid points above which the orders of other signals get fewer values.
+const MAX_START_CANDIDATES: u128 = 200_000;
+/// Lower end of the typical interval of highest orders without prior knowledge.
+const MIN_TYPICAL_ORDER: f64 = 0.2;
+/// Largest initial guess of the order of a term below the highest derivative.
+const MAX_LOWER_TERM_ORDER: f64 = 2.0;
+/// Inverse of the resolution to which orders are rounded.
+const ROUNDING_STEPS_PER_ORDER: f64 = 1e9;
 
 /// Values of free orders, by name.
 pub(super) type Axes = Vec<(String, Vec<f64>)>;
 
-/// A coarse lattice of the free orders within their bounds.
+/// Coarse grid of the free orders within their bounds.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn start_axes(free: &Free) -> Axes {
+pub(super) fn start_axes(free: &ParameterSet) -> Axes {
     let equations = &free.structure.equations;
     let alone = equations.iter().filter(|e| e.order.is_single());
     let highest: BTreeSet<&String> = alone.flat_map(|e| e.order.names()).collect();
-    let usual = free.structure.hints.highest.unwrap_or((LOWEST, SEARCHED_ORDER));
+    let usual = free.structure.hints.highest.unwrap_or((MIN_TYPICAL_ORDER, SEARCHED_ORDER));
     let axis = |(name, &bounds): (&String, &(f64, f64))| {
         let above = highest.contains(name);
         let (low, mut high) = if above && bounds == ALPHA_BOUNDS { usual } else { bounds };
         if !above {
-            high = high.min(BELOW);
+            high = high.min(MAX_LOWER_TERM_ORDER);
         }
         if high <= low {
             return (name.clone(), vec![low]);
         }
-        let count = ((high - low) / START_STEP).round_ties_even() as usize;
-        let tidied = |v: &f64| (v * GRAINS).round_ties_even() / GRAINS;
-        let values = between(low, high, count + 1).iter().map(tidied).collect();
+        let count = ((high - low) / START_INCREMENT).round_ties_even() as usize;
+        let tidied = |v: &f64| (v * ROUNDING_STEPS_PER_ORDER).round_ties_even() / ROUNDING_STEPS_PER_ORDER;
+        let values = linspace(low, high, count + 1).iter().map(tidied).collect();
         (name.clone(), values)
     };
     let mut axes: Axes = free.orders.iter().zip(free.bounds()).map(axis).collect();
-    // Orders at which other signals enter matter less for where the optimum is than the output's own.
+    // The orders of other signals affect the location of the optimum less than the autoregressive orders.
     let driving: BTreeSet<&String> = equations
         .iter()
-        .flat_map(|e| e.driving().flat_map(|term| term.order.names()))
+        .flat_map(|e| e.input_terms().flat_map(|term| term.order.names()))
         .filter(|name| !highest.contains(name))
         .collect();
     for kept in [&[0.0, 1.0][..], &[0.0]] {
-        if equations.iter().all(|e| size(e, &axes) <= START_CANDIDATES) {
+        if equations.iter().all(|e| candidate_count(e, &axes) <= MAX_START_CANDIDATES) {
             break;
         }
         for (_, values) in axes.iter_mut().filter(|(name, _)| driving.contains(name)) {
@@ -437,8 +445,8 @@ pub(super) fn start_axes(free: &Free) -> Axes {
     axes
 }
 
-/// A small lattice beside the whole orders of a structure's physics, or none where it knows of none.
-pub(super) fn natural_axes(free: &Free) -> Option<Axes> {
+/// Small grid of the typical orders of a structure; None if there are none.
+pub(super) fn natural_axes(free: &ParameterSet) -> Option<Axes> {
     let natural = &free.structure.hints.natural;
     let axis = |(name, &(low, high)): (&String, &(f64, f64))| {
         let values: Vec<f64> =
@@ -449,31 +457,30 @@ pub(super) fn natural_axes(free: &Free) -> Option<Axes> {
     (!natural.is_empty()).then_some(axes)
 }
 
-/// Evenly spaced values from one to another, both ends as they are.
+/// Evenly spaced values including both exact ends.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn between(low: f64, high: f64, count: usize) -> Vec<f64> {
+pub(super) fn linspace(low: f64, high: f64, count: usize) -> Vec<f64> {
     let intervals = count.saturating_sub(1);
     let step = (high - low) / intervals.max(1) as f64;
     let value = |k: usize| if k == intervals && k > 0 { high } else { k as f64 * step + low };
     (0..count).map(value).collect()
 }
 
-/// The values of an order; none where it is not among them.
-pub(super) fn values<'a>(axes: &'a Axes, name: &str) -> &'a [f64] {
+/// Values of an order; empty if it is not in the grid.
+pub(super) fn axis_values<'a>(axes: &'a Axes, name: &str) -> &'a [f64] {
     axes.iter().find(|(n, _)| n == name).map_or(&[], |(_, values)| values)
 }
 
-/// Candidates of an equation's lattice, whether they make an equation or not.
-fn size(equation: &Equation, axes: &Axes) -> u128 {
+/// Number of grid points of an equation, including invalid ones.
+fn candidate_count(equation: &Equation, axes: &Axes) -> u128 {
     let names: BTreeSet<&String> = equation.orders().flat_map(Order::names).collect();
-    names.iter().fold(1, |size, name| size.saturating_mul(values(axes, name).len() as u128))
+    names.iter().fold(1, |size, name| size.saturating_mul(axis_values(axes, name).len() as u128))
 }
 
-/// What an order search takes one by one: equations that share no free order do not wait for one another.
+/// Groups of equations that share no free order, so that an order search can treat them separately.
 ///
-/// Equations that an order law ties stay together; any other equation is by itself. Equations without free orders are
-/// left out.
-pub(super) fn parts(structure: &Structure) -> Vec<Structure> {
+/// Equations tied by an order law form one group. Equations without free orders are omitted.
+pub(super) fn independent_groups(structure: &Structure) -> Vec<Structure> {
     let mut groups: Vec<(BTreeSet<&String>, Vec<&Equation>)> = Vec::new();
     for item in &structure.equations {
         let own: BTreeSet<&String> = item.orders().flat_map(Order::names).collect();
@@ -500,14 +507,14 @@ pub(super) fn parts(structure: &Structure) -> Vec<Structure> {
 
 #[cfg(test)]
 mod tests {
-    use super::{between, start_axes, values};
+    use super::{axis_values, linspace, start_axes};
     use crate::equation::Initial;
     use crate::error::Result;
-    use crate::estimation::joint_fit::parameter_set::Free;
+    use crate::estimation::joint_fit::parameter_set::ParameterSet;
     use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Order, Structure, Term};
 
     #[test]
-    fn orders_lie_on_a_coarse_lattice_within_their_bounds() -> Result<()> {
+    fn order_grid_is_within_bounds() -> Result<()> {
         let term = |signal, order| {
             let coefficient = Coefficient::Free(format!("c_{order}"));
             Term { signal, order: Order::free(order), coefficient, factor: 1.0 }
@@ -526,12 +533,12 @@ mod tests {
             laws: Vec::new(),
             hints: Hints::default(),
         };
-        let axes = start_axes(&Free::of(structure)?);
-        let alphas = values(&axes, "alpha");
+        let axes = start_axes(&ParameterSet::from_structure(structure)?);
+        let alphas = axis_values(&axes, "alpha");
         assert_eq!((alphas.len(), alphas[0], alphas[1], alphas[14]), (15, 0.2, 0.4, 3.0));
-        assert_eq!((values(&axes, "nu").len(), values(&axes, "nu")[10]), (11, 2.0));
-        assert_eq!(values(&axes, "beta"), [0.5]);
-        assert_eq!(between(1.0, 2.0, 1), [1.0]);
+        assert_eq!((axis_values(&axes, "nu").len(), axis_values(&axes, "nu")[10]), (11, 2.0));
+        assert_eq!(axis_values(&axes, "beta"), [0.5]);
+        assert_eq!(linspace(1.0, 2.0, 1), [1.0]);
         Ok(())
     }
 }

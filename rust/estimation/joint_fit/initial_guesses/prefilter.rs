@@ -1,6 +1,4 @@
-//! Low-passes before coarse lattices.
-//!
-//! How fast a signal is.
+//! Signal bandwidth and low-pass prefilters.
 
 use std::f64::consts::PI;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,32 +10,32 @@ use crate::regressors::Record;
 use crate::series;
 use crate::signal::statistics::{mean, sum};
 
-/// Series of prefilters that are kept: those of a few runs.
-const KEPT_LOW_PASSES: usize = 32;
+/// Maximum number of cached prefilter series.
+const MAX_CACHED_LOW_PASSES: usize = 32;
 
-/// What a low-pass hangs on: the bits of its corner, the pulses, the bits of their width.
-type Key = (u64, usize, u64);
+/// Key of a cached low-pass: bits of the cutoff frequency, number of pulses, bits of the pulse width.
+type LowPassKey = (u64, usize, u64);
 
-/// The series of second-order low-passes: the same ones for every problem inside a race.
+/// Cache of second-order low-pass series, shared by all problems of a multistart.
 #[derive(Debug, Default)]
-pub(super) struct LowPasses(Mutex<Vec<(Key, Arc<Vec<f64>>)>>);
+pub(super) struct LowPassCache(Mutex<Vec<(LowPassKey, Arc<Vec<f64>>)>>);
 
-impl LowPasses {
-    /// All signals and the initial terms of a record through the low-pass of this corner \[rad/s\]; as it is without one.
-    pub(super) fn through(&self, record: &Record, corner: Option<f64>) -> Result<Record> {
+impl LowPassCache {
+    /// Filter all signals and the initial terms of a record by a low-pass with the cutoff frequency `corner` \[rad/s\].
+    pub(super) fn filter_record(&self, record: &Record, corner: Option<f64>) -> Result<Record> {
         let m = record.m();
-        let low_pass = corner.map(|corner| self.series(corner, m, record.step())).transpose()?;
+        let low_pass = corner.map(|corner| self.low_pass_series(corner, m, record.step())).transpose()?;
         let signals = (0..record.len()).map(|i| record.signal(i));
         let Some(low_pass) = low_pass else {
-            // Equations are taken from what was measured, wherever it began.
+            // Without a cutoff frequency the record is copied.
             return Record::new(record.step(), signals.map(<[f64]>::to_vec).collect(), record.filter().map(Into::into));
         };
         let filter = record.filter().map_or_else(|| low_pass.to_vec(), |f| series::multiply(&low_pass, f, m));
         Record::new(record.step(), signals.map(|s| series::multiply(&low_pass, s, m)).collect(), Some(filter))
     }
 
-    /// The series of a second-order low-pass of this corner \[rad/s\].
-    fn series(&self, omega: f64, m: usize, step: f64) -> Result<Arc<Vec<f64>>> {
+    /// Series of a second-order low-pass of cutoff frequency `omega` \[rad/s\].
+    fn low_pass_series(&self, omega: f64, m: usize, step: f64) -> Result<Arc<Vec<f64>>> {
         let key = (omega.to_bits(), m, step.to_bits());
         {
             let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -53,18 +51,17 @@ impl LowPasses {
         let made = Arc::new(Filter { numerator: vec![(square, 0.0)], denominator }.series(m, step)?);
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         kept.push((key, made.clone()));
-        if kept.len() > KEPT_LOW_PASSES {
+        if kept.len() > MAX_CACHED_LOW_PASSES {
             kept.remove(0);
         }
         Ok(made)
     }
 }
 
-/// Share of the power that lies below a signal's frequency.
-const SHARE: f64 = 0.9;
+/// Share of the power below the bandwidth of a signal.
+const POWER_SHARE: f64 = 0.9;
 
-/// Frequency \[rad/s\] below which 90 % of the power of samples lies, `step` \[s\] apart; not a number where nothing was
-/// read. O(N log N).
+/// Bandwidth \[rad/s\] that contains 90 % of the power of samples, `step` \[s\] apart; NaN without samples. O(N log N).
 ///
 /// ```
 /// use ftlm::estimation::joint_fit::initial_guesses::power_frequency;
@@ -79,7 +76,7 @@ pub fn power_frequency(samples: &[f64], step: f64) -> f64 {
     if count == 0 {
         return f64::NAN;
     }
-    let samples = bridged(samples);
+    let samples = interpolate_gaps(samples);
     let centre = mean(&samples);
     let (last, plan) = (count as f64 - 1.0, plan(count));
     let window = |k: usize| match count {
@@ -88,21 +85,21 @@ pub fn power_frequency(samples: &[f64], step: f64) -> f64 {
     };
     let mut time: Vec<f64> = samples.iter().enumerate().map(|(k, v)| (v - centre) * window(k)).collect();
     let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-    plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+    plan.transform(&mut time, &mut spectrum, &mut Workspace::new());
     let power: Vec<f64> = spectrum.iter().map(Bin::norm_sqr).collect();
     let (whole, mut below) = (sum(&power), 0.0);
-    // What never moves has no share to reach, and counts as slow as a run can tell.
+    // A constant signal has no power; its bandwidth is the lowest frequency of the run.
     let reached = |power: &f64| {
         below += power;
-        below / whole >= SHARE || (below / whole).is_nan()
+        below / whole >= POWER_SHARE || (below / whole).is_nan()
     };
     let at = power.iter().position(reached).unwrap_or(power.len());
     2.0 * PI * at.max(1) as f64 / (count as f64 * step)
 }
 
-/// Samples with straight lines over what is missing, the nearest value at the ends; what is whole stays as it is.
+/// Interpolate missing samples linearly, with the nearest value at the ends.
 #[allow(clippy::cast_precision_loss)]
-fn bridged(samples: &[f64]) -> Vec<f64> {
+fn interpolate_gaps(samples: &[f64]) -> Vec<f64> {
     let mut out = samples.to_vec();
     let there: Vec<usize> = (0..samples.len()).filter(|&k| !samples[k].is_nan()).collect();
     let (Some(&first), Some(&last)) = (there.first(), there.last()) else { return out };

@@ -1,23 +1,24 @@
-//! Starts from a scan of resonances: with the own terms of an equation fixed, its output error is linear in the rest.
+//! Initial guesses from a scan of resonances: for fixed autoregressive terms the output error is linear in the rest.
 //!
-//! Where signals feed back on each other or residuals are coloured, least squares on the equation error says nothing about
-//! the own terms. Here they are put on a grid of frequencies and damping ratios; all other coefficients, and the initial
-//! terms, follow by linear least squares on the output error itself.
+//! With feedback between signals or autocorrelated residuals, equation-error least squares does not identify the
+//! autoregressive terms. Here they are placed on a grid of frequencies and damping ratios. All other coefficients and
+//! the initial terms follow by linear least squares on the output error.
 
 use std::collections::BTreeMap;
 
-use super::order_grid::{check_linear, known, named_coefficients, runner, side_by_side, Coarse, Row};
+use super::order_grid::{
+    check_linear, fixed_coefficients, merge_tables, named_coefficients, new_candidate, GridRow, GridSearch,
+};
 use crate::equation::{Initial, Structure as Bare, Term as BareTerm};
 use crate::error::Result;
-use crate::estimation::joint_fit::parameter_set::Free;
-use crate::estimation::joint_fit::problem::Runner;
+use crate::estimation::joint_fit::parameter_set::ParameterSet;
+use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::structure::{Equation, Structure, Term};
-use crate::estimation::resonance_scan::projected;
+use crate::estimation::resonance_scan::fit_with_fixed_poles;
 use crate::signal::statistics::median;
 
-/// Frequencies of the scan in units of the frequency below which 90 % of the output's power lies: evenly from 0.15 to 8 in
-/// logarithms.
-const FREQUENCIES: [f64; 14] = [
+/// Frequencies of the scan relative to the bandwidth of the output, logarithmically spaced from 0.15 to 8.
+const FREQUENCY_RATIOS: [f64; 14] = [
     0.15,
     0.203_674_807_750_629_52,
     0.276_556_182_081_705_9,
@@ -33,61 +34,61 @@ const FREQUENCIES: [f64; 14] = [
     5.891_744_851_769_920_5,
     8.0,
 ];
-/// Damping ratios.
-const DAMPINGS: [f64; 4] = [0.03, 0.15, 0.5, 1.0];
-/// Points of a scan of resonances that become starts.
-const SCANNED: usize = 4;
-/// Powers of t closer than this are one.
-const GRAIN: f64 = 1e-9;
+/// Damping ratios of the scan.
+const DAMPING_RATIOS: [f64; 4] = [0.03, 0.15, 0.5, 1.0];
+/// Maximum number of points of a scan that become candidates.
+const MAX_SCAN_CANDIDATES: usize = 4;
+/// Difference below which two exponents of t are equal.
+const EXPONENT_TOLERANCE: f64 = 1e-9;
 
-/// Starts whose own terms are scanned over frequency and damping, at whole orders and at the lattice's best ones.
+/// Candidates from a scan over frequency and damping, at integer orders and at the best orders of the grid.
 ///
-/// Of each equation the frequencies of its output on each run are given.
-pub(super) fn scanned_attempts(
-    free: &Free,
-    coarse: &Coarse<'_>,
+/// `frequencies` are the bandwidths of the output of each equation, by run.
+pub(super) fn scan_candidates(
+    free: &ParameterSet,
+    coarse: &GridSearch<'_>,
     frequencies: &[Vec<f64>],
-    attempts: &[Runner],
-) -> Result<Vec<Runner>> {
+    attempts: &[Candidate],
+) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     if structure.has_order_law() || !free.products.is_empty() {
         return Ok(Vec::new());
     }
     let best = attempts.iter().take(usize::from(!free.orders.is_empty()));
-    let points = std::iter::once(free.whole_orders()).chain(best.map(|a| a.attempt.place.point.orders.clone()));
+    let points = std::iter::once(free.integer_orders()).chain(best.map(|a| a.result.iterate.point.orders.clone()));
     let mut out = Vec::new();
     for values in points {
         let point: BTreeMap<String, f64> = free.orders.iter().cloned().zip(values.iter().copied()).collect();
-        // Whole orders that the bounds moved together make no equation.
+        // Integer orders that coincide at the bounds give no valid equation.
         let Ok(fixed) = structure.with_orders(&point) else { continue };
-        if doubles(&fixed) {
+        if has_duplicate_offset(&fixed) {
             continue;
         }
         let scan = |(item, of): (&Equation, &Vec<f64>)| scan_equation(&fixed, item, coarse, median(of.clone()));
         let scans = fixed.equations.iter().zip(frequencies).map(scan).collect::<Result<Vec<_>>>()?;
-        let rows = side_by_side(&scans, structure);
+        let rows = merge_tables(&scans, structure);
         out.extend(
-            rows.iter().map(|row| runner(values.clone(), free.free_from(&row.coefficients), "scan of resonances")),
+            rows.iter()
+                .map(|row| new_candidate(values.clone(), free.free_from(&row.coefficients), "scan of resonances")),
         );
     }
     Ok(out)
 }
 
-/// Whether an offset is one of the initial terms that were given: they cannot be told apart.
-fn doubles(fixed: &Structure) -> bool {
+/// True if an offset coincides with a given initial term: they are not separately identifiable.
+fn has_duplicate_offset(fixed: &Structure) -> bool {
     let given = match fixed.initial.under() {
         Initial::Powers(powers) if !fixed.history => powers,
         _ => return false,
     };
     let offsets = |e: &Equation| fixed.initial.offset_exponents(e.order.constant);
-    fixed.equations.iter().flat_map(offsets).any(|power| given.iter().any(|e| (power - e).abs() < GRAIN))
+    fixed.equations.iter().flat_map(offsets).any(|power| given.iter().any(|e| (power - e).abs() < EXPONENT_TOLERANCE))
 }
 
-/// Coefficients of the own terms of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y, one a term; none where all are
-/// known, or some.
+/// Autoregressive coefficients of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y; None if any is fixed.
 #[allow(clippy::cast_precision_loss)]
-fn own_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
-    let mut own: Vec<(usize, &Term)> = item.own().enumerate().collect();
+fn resonance_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
+    let mut own: Vec<(usize, &Term)> = item.autoregressive_terms().enumerate().collect();
     own.sort_by(|(_, a), (_, b)| a.order.constant.total_cmp(&b.order.constant));
     let mut out = vec![(String::new(), 0.0); own.len()];
     let others = own.len().saturating_sub(1) as f64;
@@ -99,21 +100,28 @@ fn own_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<Vec<(St
     Some(out).filter(|out| !out.is_empty())
 }
 
-/// Best points of the scan of one equation whose orders are numbers, of each frequency only the best damping.
+/// Best points of the scan of one equation with fixed orders, with the best damping of each frequency.
 ///
-/// The frequency \[rad/s\] is the unit of the scan's. Points come in the order of their root mean square output error.
-fn scan_equation(structure: &Structure, item: &Equation, coarse: &Coarse<'_>, frequency: f64) -> Result<Vec<Row>> {
-    let others: Vec<Term> = item.driving().cloned().collect();
-    let own: Vec<&Term> = item.own().collect();
+/// The scan is relative to `frequency` \[rad/s\]. Points are sorted by their root mean square output error.
+fn scan_equation(
+    structure: &Structure,
+    item: &Equation,
+    coarse: &GridSearch<'_>,
+    frequency: f64,
+) -> Result<Vec<GridRow>> {
+    let others: Vec<Term> = item.input_terms().cloned().collect();
+    let own: Vec<&Term> = item.autoregressive_terms().collect();
     if others.is_empty() || own.is_empty() {
         return Ok(Vec::new());
     }
-    let grid = FREQUENCIES.iter().flat_map(|share| DAMPINGS.iter().map(move |damping| (share * frequency, *damping)));
-    let tried: Option<Vec<_>> = grid.map(|(omega, damping)| own_coefficients(item, omega, damping)).collect();
+    let grid = FREQUENCY_RATIOS
+        .iter()
+        .flat_map(|share| DAMPING_RATIOS.iter().map(move |damping| (share * frequency, *damping)));
+    let tried: Option<Vec<_>> = grid.map(|(omega, damping)| resonance_coefficients(item, omega, damping)).collect();
     let Some(tried) = tried else { return Ok(Vec::new()) };
     check_linear(structure, item, "what is linear in its coefficients")?;
     coarse.stop.check()?;
-    // Caputo's powers of the whole equation: the rest alone would not know those of the own terms.
+    // The Caputo exponents must be those of the full equation, including the autoregressive terms.
     let rest = Equation { terms: others, ..item.clone() };
     let bare = Bare {
         output: rest.output,
@@ -124,17 +132,18 @@ fn scan_equation(structure: &Structure, item: &Equation, coarse: &Coarse<'_>, fr
     let etas: Vec<f64> = own.iter().map(|t| item.order.constant - t.order.constant).collect();
     let point = |values: &Vec<(String, f64)>| values.iter().zip(&own).map(|((_, v), t)| v * t.factor).collect();
     let points: Vec<Vec<f64>> = tried.iter().map(point).collect();
-    let found = projected(coarse.records, &bare, &known(&rest), coarse.initial, &etas, &points)?;
-    let mut best: Vec<(f64, Row)> = Vec::new();
-    for (found, tried) in found.chunks(DAMPINGS.len()).zip(tried.chunks(DAMPINGS.len())) {
-        // What is not there is too fast for the step, or has regressors that this filter makes alike.
+    let found =
+        fit_with_fixed_poles(coarse.records, &bare, &fixed_coefficients(&rest), coarse.initial, &etas, &points)?;
+    let mut best: Vec<(f64, GridRow)> = Vec::new();
+    for (found, tried) in found.chunks(DAMPING_RATIOS.len()).zip(tried.chunks(DAMPING_RATIOS.len())) {
+        // Missing points are too fast for the step, or have collinear regressors.
         let there = found.iter().zip(tried).filter_map(|(at, values)| Some((at.as_ref()?, values)));
         let there = there.filter(|(at, _)| at.error.is_finite());
         if let Some((at, values)) = there.min_by(|(a, _), (b, _)| a.error.total_cmp(&b.error)) {
             let coefficients = values.iter().cloned().chain(named_coefficients(&rest, &at.coefficients)).collect();
-            best.push((at.error, Row { orders: Vec::new(), coefficients }));
+            best.push((at.error, GridRow { orders: Vec::new(), coefficients }));
         }
     }
     best.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-    Ok(best.into_iter().take(SCANNED).map(|(_, row)| row).collect())
+    Ok(best.into_iter().take(MAX_SCAN_CANDIDATES).map(|(_, row)| row).collect())
 }

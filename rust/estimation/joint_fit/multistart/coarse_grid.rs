@@ -1,54 +1,62 @@
-//! A grid on which starts may compete.
-//!
-//! As many samples as starts compete on.
+//! Coarse grid of the multistart: subsampled records on which candidates compete.
 
-use super::halving::{distinct, near, same_optimum, same_place, Laps, FIRST_LAP, GLANCE};
+use super::halving::{
+    are_all_close, is_same_iterate, is_same_optimum, merge_duplicates, RungExecutor, FIRST_BUDGET_EVALUATIONS,
+    PRESCREEN_EVALUATIONS,
+};
 use crate::error::Result;
 use crate::estimation::joint_fit::initial_guesses::power_frequency;
-use crate::estimation::joint_fit::objective::{Grid, FINEST};
-use crate::estimation::joint_fit::parameter_set::Free;
-use crate::estimation::joint_fit::problem::Runner;
+use crate::estimation::joint_fit::objective::{Objective, MAX_PULSES_PER_SAMPLE};
+use crate::estimation::joint_fit::parameter_set::ParameterSet;
+use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::source::{Recordings, Sampling};
 use crate::signal::statistics::mean;
 
-/// Starts that tell how fine the grid must be on which all compete.
-const PIONEERS: usize = 3;
-/// A coarse grid tells where starts lead if a finer one moves no number of the best by more than this share.
-const MOVED: f64 = 0.1;
+/// Number of candidates that determine the step of the coarse grid.
+const PILOT_CANDIDATES: usize = 3;
+/// Largest relative change of a parameter of the best candidate on a finer grid for which the ranking is stable.
+const MAX_PARAMETER_CHANGE_RATIO: f64 = 0.1;
 
-/// A grid on which starts may compete.
-pub(super) struct Chosen<'a> {
-    pub grid: Grid<'a>,
-    /// The same on half the step, where it was made.
-    pub half: Option<Grid<'a>>,
-    /// Where the others are after a glance.
-    pub glanced: Vec<Runner>,
-    /// Where a few are after a lap.
-    pub ran: Vec<Runner>,
+/// Coarse grid and the candidates optimized on it so far.
+pub(super) struct CoarseGrid<'a> {
+    pub grid: Objective<'a>,
+    /// The grid of half the step, if it was computed.
+    pub half: Option<Objective<'a>>,
+    /// Remaining candidates after the prescreening.
+    pub prescreened_candidates: Vec<Candidate>,
+    /// Pilot candidates after the first budget.
+    pub pilots: Vec<Candidate>,
 }
 
-/// A grid on which starts may compete, as far as a few tell.
+/// Choose the coarse grid by a few pilot candidates.
 ///
-/// A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its own:
-/// all start anew on the grid on which those few no longer move.
-pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, starts: &[Runner]) -> Result<Chosen<'a>> {
-    let glance = |grid: &Grid<'_>, starts: &[Runner]| Ok(distinct(&laps.run(free, grid, starts, GLANCE)?, same_place));
-    let mut glanced: Vec<Runner> = glance(&coarse, starts)?;
-    if starts.len() <= PIONEERS || coarse.sampling.every >= FINEST {
-        return Ok(Chosen { grid: coarse, half: None, glanced, ran: Vec::new() });
+/// A stiff equation may have no stable scheme on a coarse grid, and a coarse grid has spurious optima. The step is
+/// halved until the pilot candidates no longer change; then all candidates start on that grid.
+pub(super) fn choose_coarse_grid<'a>(
+    laps: RungExecutor<'_>,
+    free: &ParameterSet,
+    coarse: Objective<'a>,
+    starts: &[Candidate],
+) -> Result<CoarseGrid<'a>> {
+    let glance = |grid: &Objective<'_>, starts: &[Candidate]| {
+        Ok(merge_duplicates(&laps.run(free, grid, starts, PRESCREEN_EVALUATIONS)?, is_same_iterate))
+    };
+    let mut glanced: Vec<Candidate> = glance(&coarse, starts)?;
+    if starts.len() <= PILOT_CANDIDATES || coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
+        return Ok(CoarseGrid { grid: coarse, half: None, prescreened_candidates: glanced, pilots: Vec::new() });
     }
-    let (first, mut coarse) = (coarse.sampling.every, coarse);
-    let mut before: Vec<(Grid<'a>, Runner)> = Vec::new();
-    let mut pioneers: Vec<Runner> = glanced.iter().take(PIONEERS).cloned().collect();
+    let (first, mut coarse) = (coarse.sampling.pulses_per_sample, coarse);
+    let mut before: Vec<(Objective<'a>, Candidate)> = Vec::new();
+    let mut pioneers: Vec<Candidate> = glanced.iter().take(PILOT_CANDIDATES).cloned().collect();
     let mut half = None;
     let reached = loop {
-        if coarse.sampling.every >= FINEST {
+        if coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
             break pioneers;
         }
-        let reached = laps.run(free, &coarse, &pioneers, FIRST_LAP)?;
+        let reached = laps.run(free, &coarse, &pioneers, FIRST_BUDGET_EVALUATIONS)?;
         let finer = coarse.finer()?;
         if let Some(best) = reached.first() {
-            if !coarse.noticed(&best.attempt.place, &finer)? {
+            if !coarse.is_refinement_significant(&best.result.iterate, &finer)? {
                 half = Some(finer);
                 break reached;
             }
@@ -56,55 +64,55 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
         }
         (coarse, pioneers) = (finer, reached);
         if pioneers.is_empty() {
-            // Where none has a scheme, others may on half the step.
+            // If no pilot has a stable scheme, other candidates may have one on half the step.
             pioneers = glance(&coarse, starts)?;
-            pioneers.truncate(PIONEERS);
+            pioneers.truncate(PILOT_CANDIDATES);
         }
     };
-    if coarse.sampling.every == first {
-        glanced.drain(..PIONEERS.min(glanced.len()));
-        return Ok(Chosen { grid: coarse, half, glanced, ran: reached });
+    if coarse.sampling.pulses_per_sample == first {
+        glanced.drain(..PILOT_CANDIDATES.min(glanced.len()));
+        return Ok(CoarseGrid { grid: coarse, half, prescreened_candidates: glanced, pilots: reached });
     }
-    let told = reached.first().map(|best| best.attempt.values());
-    let alike = |(_, best): &&(Grid<'a>, Runner)| {
-        told.as_ref().is_some_and(|told| near(&best.attempt.values(), told, MOVED, 0.0))
+    let told = reached.first().map(|best| best.result.values());
+    let alike = |(_, best): &&(Objective<'a>, Candidate)| {
+        told.as_ref().is_some_and(|told| are_all_close(&best.result.values(), told, MAX_PARAMETER_CHANGE_RATIO, 0.0))
     };
     let mut starts = starts.to_vec();
     if let Some((grid, _)) = before.iter().find(alike) {
         let glanced = glance(grid, &starts)?;
-        if glanced.iter().map(|runner| 1 + runner.alike.len()).sum::<usize>() == starts.len() {
-            // This coarser grid has the same optimum, a little moved: of those that come to one place there one goes on.
-            starts = distinct(&laps.run(free, grid, &glanced, FIRST_LAP)?, same_optimum);
+        if glanced.iter().map(|runner| 1 + runner.duplicates.len()).sum::<usize>() == starts.len() {
+            // This coarser grid has nearly the same optimum: one candidate per optimum found there continues.
+            starts = merge_duplicates(&laps.run(free, grid, &glanced, FIRST_BUDGET_EVALUATIONS)?, is_same_optimum);
         }
     }
     let glanced = glance(&coarse, &starts)?;
-    Ok(Chosen { grid: coarse, half, glanced, ran: Vec::new() })
+    Ok(CoarseGrid { grid: coarse, half, prescreened_candidates: glanced, pilots: Vec::new() })
 }
 
-/// Samples of the coarse fits that compare starts, of all runs together, and of each at least; the best ones continue on all
-/// samples.
-const COARSE_SAMPLES: usize = 1200;
-const LEAST_SAMPLES: usize = 400;
-/// So many samples become one without asking what that shows; half a turn of what holds 90 % of the power is to be as many
-/// at least; a part of a record stands for it if its outputs deviate by this share of the whole's.
-const THINNEST: usize = 10;
-const SHOWN: f64 = 1.0;
-const AS_LIVELY: f64 = 0.7;
+/// Samples of the coarse fits over all runs; each run has at least [`MIN_RUN_SAMPLES`].
+const MAX_COARSE_SAMPLES: usize = 1200;
+const MIN_RUN_SAMPLES: usize = 400;
+/// Largest decimation without a check of the bandwidth. Above it, half a period of the frequency that contains 90 % of
+/// the power needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]. The first part of a record can represent it if its outputs
+/// have at least [`MIN_DEVIATION_RATIO`] of the standard deviation of the whole.
+const MAX_UNCHECKED_DECIMATION: usize = 10;
+const MIN_SAMPLES_PER_HALF_PERIOD: f64 = 1.0;
+const MIN_DEVIATION_RATIO: f64 = 0.7;
 
-/// A sampling of as many samples as starts compete on: what one run does not tell of where they lead, another does.
+/// Sampling of the runs for the multistart.
 ///
-/// Thinned until they no longer show the motion, the samples of a long record tell no start from another: then its first
-/// part is taken, if that moves as the whole does.
+/// Decimation must not alias the motion. If a long record needs a larger decimation, its first part is used instead,
+/// provided that it varies like the whole record.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn thinned(free: &Free, source: &dyn Recordings) -> Result<Sampling> {
+pub(super) fn coarse_sampling(free: &ParameterSet, source: &dyn Recordings) -> Result<Sampling> {
     let spans = source.spans();
-    let each = (COARSE_SAMPLES / spans.len().max(1)).max(LEAST_SAMPLES);
+    let each = (MAX_COARSE_SAMPLES / spans.len().max(1)).max(MIN_RUN_SAMPLES);
     let outputs = free.structure.equations.iter().map(|equation| source.samples(equation.output));
     let outputs = outputs.collect::<Result<Vec<_>>>()?;
     let shortest = outputs.iter().flatten().map(|samples| samples.len().saturating_sub(1)).min().unwrap_or(0);
     let decimation = ((shortest as f64 / each as f64).round_ties_even() as usize).max(1);
     let all = Sampling { decimation, ..Sampling::default() };
-    if decimation <= THINNEST {
+    if decimation <= MAX_UNCHECKED_DECIMATION {
         return Ok(all);
     }
     let turns = |runs: &Vec<Vec<f64>>| {
@@ -112,21 +120,24 @@ pub(super) fn thinned(free: &Free, source: &dyn Recordings) -> Result<Sampling> 
         pairs.map(|(samples, &(step, _))| power_frequency(samples, step) * step).fold(f64::NEG_INFINITY, f64::max)
     };
     let fastest = outputs.iter().map(turns).fold(f64::NEG_INFINITY, f64::max);
-    let carried = THINNEST.max((std::f64::consts::PI / (SHOWN * fastest)) as usize);
+    let carried =
+        MAX_UNCHECKED_DECIMATION.max((std::f64::consts::PI / (MIN_SAMPLES_PER_HALF_PERIOD * fastest)) as usize);
     if carried >= decimation {
         return Ok(all);
     }
     let first = each * carried;
-    let as_lively =
-        |samples: &Vec<f64>| deviation(&samples[..=first.min(samples.len() - 1)]) >= AS_LIVELY * deviation(samples);
+    let as_lively = |samples: &Vec<f64>| {
+        standard_deviation(&samples[..=first.min(samples.len() - 1)])
+            >= MIN_DEVIATION_RATIO * standard_deviation(samples)
+    };
     if !outputs.iter().flatten().all(as_lively) {
         return Ok(all);
     }
-    Ok(Sampling { decimation: carried, first: Some(first), ..all })
+    Ok(Sampling { decimation: carried, leading_intervals: Some(first), ..all })
 }
 
-/// Standard deviation of what was read.
-fn deviation(samples: &[f64]) -> f64 {
+/// Standard deviation of the present samples.
+fn standard_deviation(samples: &[f64]) -> f64 {
     let known: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
     let middle = mean(&known);
     mean(&known.iter().map(|v| (v - middle) * (v - middle)).collect::<Vec<_>>()).sqrt()

@@ -1,66 +1,73 @@
-//! Laps of runners on a grid, and which of those that ended go on.
+//! Successive halving: evaluation budgets, survivors and distinct optima.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::channel;
 
 use crate::error::{Error, Result};
-use crate::estimation::joint_fit::objective::{Grid, TOLERANCE};
-use crate::estimation::joint_fit::parameter_set::Free;
-use crate::estimation::joint_fit::problem::Runner;
-use crate::estimation::joint_fit::progress::Listener;
+use crate::estimation::joint_fit::objective::{Objective, RELATIVE_COST_TOLERANCE};
+use crate::estimation::joint_fit::parameter_set::ParameterSet;
+use crate::estimation::joint_fit::problem::Candidate;
+use crate::estimation::joint_fit::progress::ProgressListener;
 use crate::estimation::output_error::{Experiment, Settings};
 use crate::parallel::Stop;
 
-/// Evaluations of every coarse fit, then of those that are ahead: one in [`RUNNERS`], but not fewer than [`FEWEST`].
-pub(super) const FIRST_LAP: usize = 15;
-pub(super) const SECOND_LAP: usize = 60;
-pub(super) const RUNNERS: usize = 3;
-pub(super) const FEWEST: usize = 8;
-/// Evaluations by which those are chosen that run ahead.
-pub(super) const GLANCE: usize = 2;
-/// Coarse fits that continue on all samples.
-pub(super) const FINALISTS: usize = 3;
-/// ... unless their coarse cost exceeds the best one's by this factor; on few samples nobody as far behind goes on.
-pub(super) const CONTENDER: f64 = 3.0;
-/// Share of its start below which a coefficient is as good as 0: a descent that keeps its sign ends at e^-20.
-const VANISHED: f64 = 1e-8;
-/// Two costs closer than this share are the same optimum.
-const SAME_COST: f64 = 1e-3;
-/// Starts whose numbers are all as near as this share are in the same place, optima if their orders are as near as this.
-const SAME_PLACE: f64 = 0.02;
-/// ... and by this share of themselves: orders are of any size.
-const SAME_ORDER: f64 = 1e-5;
+/// Evaluations of every candidate. Then the best get [`SECOND_BUDGET_EVALUATIONS`]: one in [`CANDIDATES_PER_SURVIVOR`],
+/// but at least [`MIN_SURVIVORS`].
+pub(super) const FIRST_BUDGET_EVALUATIONS: usize = 15;
+pub(super) const SECOND_BUDGET_EVALUATIONS: usize = 60;
+pub(super) const CANDIDATES_PER_SURVIVOR: usize = 3;
+pub(super) const MIN_SURVIVORS: usize = 8;
+/// Evaluations of the prescreening.
+pub(super) const PRESCREEN_EVALUATIONS: usize = 2;
+/// Maximum number of candidates that continue on all samples.
+pub(super) const MAX_FINAL_SURVIVORS: usize = 3;
+/// Ratio to the best coarse cost above which a candidate does not continue.
+pub(super) const MAX_SURVIVOR_COST_RATIO: f64 = 3.0;
+/// Ratio to its initial guess below which a coefficient counts as 0: in logarithms an optimization stops at e^-20.
+const ZERO_COEFFICIENT_RATIO: f64 = 1e-8;
+/// Relative difference of two costs below which they can belong to the same optimum.
+const SAME_COST_TOLERANCE: f64 = 1e-3;
+/// Relative difference of all parameters below which candidates coincide; absolute one of the orders of an optimum.
+const SAME_PARAMETER_TOLERANCE: f64 = 0.02;
+/// Relative difference of the orders of the same optimum, added to the absolute one.
+const SAME_ORDER_RELATIVE_TOLERANCE: f64 = 1e-5;
 
-/// Who runs how many laps at a time, and who is told.
+/// Executor of budgets: number of starts for the progress, threads, progress callback.
 #[derive(Clone, Copy)]
-pub(super) struct Laps<'a> {
+pub(super) struct RungExecutor<'a> {
     pub starts: usize,
     pub threads: usize,
-    pub told: Option<&'a Listener<'a>>,
+    pub told: Option<&'a ProgressListener<'a>>,
 }
 
-impl Laps<'_> {
-    /// Where the runners get with so many evaluations of a problem, best first.
+impl RungExecutor<'_> {
+    /// Optimize candidates with a budget of evaluations; return them best first.
     pub(super) fn run(
         &self,
-        free: &Free,
-        grid: &Grid<'_>,
-        runners: &[Runner],
+        free: &ParameterSet,
+        grid: &Objective<'_>,
+        runners: &[Candidate],
         evaluations: usize,
-    ) -> Result<Vec<Runner>> {
-        let ended = self.each(free, grid, runners, evaluations)?;
-        Ok(sorted(ended.into_iter().flatten().collect()))
+    ) -> Result<Vec<Candidate>> {
+        let ended = self.run_each(free, grid, runners, evaluations)?;
+        Ok(sort_by_cost(ended.into_iter().flatten().collect()))
     }
 
-    /// Where each of the runners gets; none of those whose free run is not finite.
-    pub(super) fn each(
+    /// Optimize each candidate with a budget of evaluations; None if its simulation is not finite.
+    pub(super) fn run_each(
         &self,
-        free: &Free,
-        grid: &Grid<'_>,
-        runners: &[Runner],
+        free: &ParameterSet,
+        grid: &Objective<'_>,
+        runners: &[Candidate],
         evaluations: usize,
-    ) -> Result<Vec<Option<Runner>>> {
-        let lap = Lap { free, experiments: grid.experiments(), steady: grid.steady, evaluations, stop: grid.stop() };
+    ) -> Result<Vec<Option<Candidate>>> {
+        let lap = Rung {
+            free,
+            experiments: grid.experiments(),
+            steady: grid.requires_stability,
+            evaluations,
+            stop: grid.stop(),
+        };
         let mut done = 0;
         let mut heard = || {
             let so_far = done.min(self.starts.saturating_sub(1));
@@ -69,13 +76,13 @@ impl Laps<'_> {
         };
         if self.threads.min(runners.len()) <= 1 {
             let each = runners.iter().map(|runner| {
-                let ended = lap.tried(runner)?;
+                let ended = lap.optimize(runner)?;
                 heard()?;
                 Ok(ended)
             });
             return each.collect();
         }
-        let mut ended: Vec<Option<Runner>> = vec![None; runners.len()];
+        let mut ended: Vec<Option<Candidate>> = vec![None; runners.len()];
         let (next, left) = (AtomicUsize::new(0), Stop::default());
         let (send, receive) = channel();
         let (lap, next, left) = (&lap, &next, &left);
@@ -88,7 +95,7 @@ impl Laps<'_> {
                     while !left.is_set() {
                         let k = next.fetch_add(1, Ordering::Relaxed);
                         let Some(runner) = runners.get(k) else { return };
-                        if send.send((k, lap.tried(runner))).is_err() {
+                        if send.send((k, lap.optimize(runner))).is_err() {
                             return;
                         }
                     }
@@ -115,37 +122,35 @@ impl Laps<'_> {
     }
 }
 
-/// What all runners of a lap share.
-struct Lap<'a> {
-    free: &'a Free,
+/// Common settings of the candidates of one budget.
+struct Rung<'a> {
+    free: &'a ParameterSet,
     experiments: &'a [Experiment],
     steady: bool,
     evaluations: usize,
     stop: &'a Stop,
 }
 
-impl Lap<'_> {
-    /// Where a runner gets; a start whose free run is not finite is no start, and if none is left, the fit says so.
-    fn tried(&self, runner: &Runner) -> Result<Option<Runner>> {
-        let settings = Settings { evaluations: self.evaluations, tolerance: TOLERANCE };
-        let place = &runner.attempt.place;
-        let turned = self.free.turned(place, false, &[]);
-        match turned.descend(self.experiments, place, settings, self.steady, self.stop) {
-            Ok(attempt) => Ok(Some(without_vanished(self.free, runner, runner.moved(attempt)))),
+impl Rung<'_> {
+    /// Optimize one candidate; None if its simulation is not finite.
+    fn optimize(&self, runner: &Candidate) -> Result<Option<Candidate>> {
+        let settings = Settings { evaluations: self.evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        let place = &runner.result.iterate;
+        let turned = self.free.problem_at(place, false, &[]);
+        match turned.minimize(self.experiments, place, settings, self.steady, self.stop) {
+            Ok(attempt) => Ok(Some(zero_vanishing_coefficients(self.free, runner, runner.with_result(attempt)))),
             Err(Error::Interrupted) => Err(Error::Interrupted),
             Err(_) => Ok(None),
         }
     }
 }
 
-/// A runner with coefficients at 0 that fell towards it as far as a sign that is kept lets them.
-///
-/// From there they may take the other sign.
-fn without_vanished(free: &Free, start: &Runner, mut ended: Runner) -> Runner {
+/// Set coefficients to 0 that vanished in logarithmic coordinates, so that they can change their sign.
+fn zero_vanishing_coefficients(free: &ParameterSet, start: &Candidate, mut ended: Candidate) -> Candidate {
     if free.products.is_empty() && !free.has_friction() {
-        let before = &start.attempt.place.point.coefficients;
-        for (value, before) in ended.attempt.place.point.coefficients.iter_mut().zip(before) {
-            if value.abs() < VANISHED * before.abs() {
+        let before = &start.result.iterate.point.coefficients;
+        for (value, before) in ended.result.iterate.point.coefficients.iter_mut().zip(before) {
+            if value.abs() < ZERO_COEFFICIENT_RATIO * before.abs() {
                 *value = 0.0;
             }
         }
@@ -153,56 +158,56 @@ fn without_vanished(free: &Free, start: &Runner, mut ended: Runner) -> Runner {
     ended
 }
 
-/// Best first; those that cost the same as they stood.
-pub(super) fn sorted(mut runners: Vec<Runner>) -> Vec<Runner> {
-    runners.sort_by(|a, b| a.level().total_cmp(&b.level()));
+/// Sort candidates by cost, stable for ties.
+pub(super) fn sort_by_cost(mut runners: Vec<Candidate>) -> Vec<Candidate> {
+    runners.sort_by(|a, b| a.cost_per_residual().total_cmp(&b.cost_per_residual()));
     runners
 }
 
-/// Those that go on on all samples: the best of different optima, unless they are far behind.
+/// Survivors that continue on all samples: the best distinct optima within the cost ratio.
 #[must_use]
-pub fn finalists(reached: &[Runner]) -> Vec<Runner> {
-    let mut first = distinct(reached, same_optimum);
-    first.truncate(FINALISTS);
-    in_reach(&first)
+pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
+    let mut first = merge_duplicates(reached, is_same_optimum);
+    first.truncate(MAX_FINAL_SURVIVORS);
+    competitive_candidates(&first)
 }
 
-/// Those of runners, best first, that are not far behind the best; on a finer grid one that is may come before another.
+/// Candidates with a cost within a fixed ratio (`MAX_SURVIVOR_COST_RATIO`) of the best; the input need not be sorted after the first.
 #[must_use]
-pub fn in_reach(reached: &[Runner]) -> Vec<Runner> {
-    let limit = reached.first().map_or(0.0, |best| CONTENDER * best.level());
-    reached.iter().filter(|runner| runner.level() <= limit).cloned().collect()
+pub fn competitive_candidates(reached: &[Candidate]) -> Vec<Candidate> {
+    let limit = reached.first().map_or(0.0, |best| MAX_SURVIVOR_COST_RATIO * best.cost_per_residual());
+    reached.iter().filter(|runner| runner.cost_per_residual() <= limit).cloned().collect()
 }
 
-/// Whether two that ended cost the same at orders that are as near.
+/// True if two candidates agree in cost and orders.
 #[must_use]
-pub fn same_optimum(one: &Runner, other: &Runner) -> bool {
-    let orders = |runner: &Runner| runner.attempt.place.point.orders.clone();
-    (one.level() - other.level()).abs() <= SAME_COST * one.level()
-        && near(&orders(other), &orders(one), SAME_ORDER, SAME_PLACE)
+pub fn is_same_optimum(one: &Candidate, other: &Candidate) -> bool {
+    let orders = |runner: &Candidate| runner.result.iterate.point.orders.clone();
+    (one.cost_per_residual() - other.cost_per_residual()).abs() <= SAME_COST_TOLERANCE * one.cost_per_residual()
+        && are_all_close(&orders(other), &orders(one), SAME_ORDER_RELATIVE_TOLERANCE, SAME_PARAMETER_TOLERANCE)
 }
 
-/// Whether two are at the same numbers, each as near as a share of itself: several lattices have the same rows.
+/// True if two candidates agree in all parameters. Several order grids contain the same points.
 #[must_use]
-pub fn same_place(one: &Runner, other: &Runner) -> bool {
-    near(&other.attempt.values(), &one.attempt.values(), SAME_PLACE, 0.0)
+pub fn is_same_iterate(one: &Candidate, other: &Candidate) -> bool {
+    are_all_close(&other.result.values(), &one.result.values(), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
-/// Whether each number is as near to another as a share of that and a distance.
-pub(super) fn near(numbers: &[f64], others: &[f64], share: f64, distance: f64) -> bool {
+/// True if all values agree within a relative and an absolute tolerance.
+pub(super) fn are_all_close(numbers: &[f64], others: &[f64], share: f64, distance: f64) -> bool {
     numbers.iter().zip(others).all(|(a, b)| (a - b).abs() <= distance + share * b.abs())
 }
 
-/// Runners, best first; those that are the same as an earlier one are alike to it.
+/// Merge candidates that duplicate an earlier one; their origins are added to it.
 #[must_use]
-pub fn distinct(runners: &[Runner], same: impl Fn(&Runner, &Runner) -> bool) -> Vec<Runner> {
-    let mut kept: Vec<Runner> = Vec::new();
+pub fn merge_duplicates(runners: &[Candidate], same: impl Fn(&Candidate, &Candidate) -> bool) -> Vec<Candidate> {
+    let mut kept: Vec<Candidate> = Vec::new();
     for runner in runners {
         match kept.iter_mut().find(|kept| same(kept, runner)) {
             None => kept.push(runner.clone()),
             Some(first) => {
-                first.alike.push(runner.origin.clone());
-                first.alike.extend(runner.alike.iter().cloned());
+                first.duplicates.push(runner.origin.clone());
+                first.duplicates.extend(runner.duplicates.iter().cloned());
             }
         }
     }
@@ -212,25 +217,25 @@ pub fn distinct(runners: &[Runner], same: impl Fn(&Runner, &Runner) -> bool) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimation::joint_fit::problem::{Attempt, Place};
+    use crate::estimation::joint_fit::problem::{Iterate, OptimizationResult};
     use crate::estimation::output_error::Point;
 
-    fn ended(level: f64, order: f64) -> Runner {
+    fn candidate_at(level: f64, order: f64) -> Candidate {
         let point = Point { orders: vec![order], coefficients: vec![1.0], inputs: Vec::new() };
-        let attempt = Attempt::unrun(Place { point, states: Vec::new() });
-        Runner {
-            attempt: Attempt { cost: level, residuals: vec![0.0; 2], ..attempt },
+        let attempt = OptimizationResult::initial_result(Iterate { point, states: Vec::new() });
+        Candidate {
+            result: OptimizationResult { cost: level, residuals: vec![0.0; 2], ..attempt },
             origin: String::new(),
-            alike: Vec::new(),
+            duplicates: Vec::new(),
         }
     }
 
     #[test]
-    fn one_too_far_behind_hides_nobody_behind_it() {
-        // On a finer grid the last one was last: its own level is in reach all the same.
-        let reached = [ended(1.0, 0.5), ended(3.5, 1.0), ended(2.0, 1.5)];
-        let orders: Vec<f64> = finalists(&reached).iter().map(|r| r.attempt.place.point.orders[0]).collect();
+    fn candidate_beyond_the_limit_hides_no_later_one() {
+        // The order comes from a finer grid; the cost of the last one is within the ratio nevertheless.
+        let reached = [candidate_at(1.0, 0.5), candidate_at(3.5, 1.0), candidate_at(2.0, 1.5)];
+        let orders: Vec<f64> = select_survivors(&reached).iter().map(|r| r.result.iterate.point.orders[0]).collect();
         assert_eq!(orders, [0.5, 1.5]);
-        assert!(in_reach(&[ended(0.0, 1.0), ended(1e-9, 2.0)]).len() == 1);
+        assert!(competitive_candidates(&[candidate_at(0.0, 1.0), candidate_at(1e-9, 2.0)]).len() == 1);
     }
 }

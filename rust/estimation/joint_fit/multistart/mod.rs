@@ -1,14 +1,18 @@
-//! The race of starts: short fits on thinned samples, of which the best go on.
+//! Multistart with successive halving: short fits on subsampled records, of which the best continue.
 //!
-//! [`race`] sends starts over laps, from a glance to those few that go on on all samples. Beside them run the problems
-//! inside a problem, whose optima it reaches, too: a term less ([`Simpler`]), an order less ([`LowerOrder`]), orders known
-//! ([`Held`]) or whole ([`Whole`]).
+//! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
+//! samples. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
+//! term less ([`ReducedProblem`]), a lower order ([`LowerOrderProblem`]), one fixed order ([`FixedOrderProblem`]) or
+//! integer orders ([`IntegerOrderProblem`]).
 
 mod coarse_grid;
 mod halving;
 mod nested_models;
 mod search;
 
-pub use halving::{distinct, finalists, in_reach, same_optimum, same_place};
-pub use nested_models::{held, lower_order, simpler, unlike, whole, Held, LowerOrder, Simpler, Whole};
-pub use search::{on_coarse_grids, race, Course, Starts};
+pub use halving::{competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors};
+pub use nested_models::{
+    distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
+    FixedOrderProblem, IntegerOrderProblem, LowerOrderProblem, ReducedProblem,
+};
+pub use search::{optimize_on_coarse_grids, run_multistart, InitialGuessSource, MultistartContext};

@@ -1,342 +1,374 @@
-//! The race itself: who runs how far, and the problems inside a problem.
-//!
-//! Those that are behind: who is still on the way goes on.
-//!
-//! Starts of bodies with friction on coarse grids.
+//! Multistart with successive halving: candidates, budgets, promotion and submodels.
 
-use super::coarse_grid::{fine_enough, thinned};
+use super::coarse_grid::{choose_coarse_grid, coarse_sampling};
 use super::halving::{
-    distinct, finalists, in_reach, same_optimum, same_place, sorted, Laps, CONTENDER, FEWEST, FINALISTS, FIRST_LAP,
-    GLANCE, RUNNERS, SECOND_LAP,
+    competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors, sort_by_cost,
+    RungExecutor, CANDIDATES_PER_SURVIVOR, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO,
+    MIN_SURVIVORS, PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS,
 };
-use super::nested_models::{held, lower_order, simpler, unlike, whole, Held, LowerOrder, Simpler, Whole};
+use super::nested_models::{
+    distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
+    FixedOrderProblem, IntegerOrderProblem, LowerOrderProblem, ReducedProblem,
+};
 use crate::equation::Initial;
 use crate::error::{Error, Kind, Result};
-use crate::estimation::joint_fit::objective::{Grid, Weights, FINEST};
-use crate::estimation::joint_fit::parameter_set::{Clock, Free};
-use crate::estimation::joint_fit::problem::Runner;
-use crate::estimation::joint_fit::progress::Listener;
+use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
+use crate::estimation::joint_fit::parameter_set::{ParameterSet, TimeScaling};
+use crate::estimation::joint_fit::problem::Candidate;
+use crate::estimation::joint_fit::progress::ProgressListener;
 use crate::estimation::joint_fit::source::Recordings;
 use crate::estimation::joint_fit::structure::{Equation, Structure};
 use crate::parallel::Stop;
 
-/// All get as many evaluations as those ahead where the best is above the noise by this factor; of those further behind than
-/// contenders are, by no more than the second factor, who falls by a share in a few evaluations.
-const ABOVE_FLOOR: f64 = 2.0;
-const FAR_BEHIND: f64 = 100.0;
+/// Ratio of the best cost to the noise floor above which candidates behind the best are promoted, too. Candidates up to
+/// [`MAX_PROMOTION_COST_RATIO`] are promoted if they improve in a few evaluations.
+const NOISE_FLOOR_FACTOR: f64 = 2.0;
+const MAX_PROMOTION_COST_RATIO: f64 = 100.0;
 
-/// Where a race starts.
-pub trait Starts {
-    /// Starts of a problem on the runs.
+/// Source of initial guesses.
+pub trait InitialGuessSource {
+    /// Initial guesses of a problem on the runs.
     ///
     /// # Errors
-    /// Where its equations cannot be searched, [`Error::Interrupted`].
-    fn of(&self, free: &Free) -> Result<Vec<Runner>>;
+    /// If its equations cannot be searched; [`Error::Interrupted`].
+    fn initial_guesses(&self, free: &ParameterSet) -> Result<Vec<Candidate>>;
 }
 
-/// What the races of a problem and of those inside it share.
+/// Common data of the multistarts of a problem and of its submodels.
 #[derive(Clone, Copy)]
-pub struct Course<'a> {
+pub struct MultistartContext<'a> {
     /// The runs.
     pub source: &'a dyn Recordings,
-    /// Where races start.
-    pub starts: &'a dyn Starts,
-    /// Whom to ask whether to go on.
+    /// Source of initial guesses.
+    pub starts: &'a dyn InitialGuessSource,
+    /// Cancellation flag.
     pub stop: &'a Stop,
-    /// What each output weighs: alike, for noise decides where the optimum is, not how to get near it.
+    /// Weights of the outputs, equal relative to their standard deviations.
     pub weights: &'a [f64],
-    /// What noise alone leaves per residual.
+    /// Noise floor of the cost per residual.
     pub floor: f64,
-    /// Threads; no number depends on them.
+    /// Number of threads; results do not depend on it.
     pub threads: usize,
-    /// Who is told (starts done, starts in all); nobody of a race inside another.
-    pub told: Option<&'a Listener<'a>>,
+    /// Progress callback of (starts done, all starts); None in a nested multistart.
+    pub told: Option<&'a ProgressListener<'a>>,
 }
 
-impl<'a> Course<'a> {
-    /// That of a race inside this one.
-    fn inside(self) -> Self {
+impl<'a> MultistartContext<'a> {
+    /// Context of a nested multistart.
+    fn for_submodel(self) -> Self {
         Self { told: None, ..self }
     }
 
-    fn clock(self, free: &Free) -> Clock {
-        Clock::of(&free.problem, &self.source.spans())
+    fn time_scaling(self, free: &ParameterSet) -> TimeScaling {
+        TimeScaling::from_runs(&free.problem, &self.source.spans())
     }
 
-    fn step(self) -> f64 {
+    fn largest_step(self) -> f64 {
         self.source.spans().iter().fold(0.0, |step, span| span.0.max(step))
     }
 }
 
-/// Coarse fits from all starts, best first.
+/// Run the multistart on subsampled records; return the candidates best first.
 ///
 /// # Errors
-/// Those of the source and of the starts, what whoever is told ends with, [`Error::Interrupted`].
-pub fn race(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
+/// As the source, the initial guesses and the callback; [`Error::Interrupted`].
+pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     if free.structure.history {
-        return with_history(free, course);
+        return multistart_with_history(free, course);
     }
-    Ok(without_history(free, course)?.0)
+    Ok(multistart_without_history(free, course)?.0)
 }
 
-/// What a computation found; nothing where it made no equation.
-fn made<T>(found: Result<T>) -> Result<Option<T>> {
+/// Convert the error of an invalid model to None.
+fn none_if_invalid_model<T>(found: Result<T>) -> Result<Option<T>> {
     match found {
         Err(error) if error.kind() == Kind::Model => Ok(None),
         found => found.map(Some),
     }
 }
 
-/// A race under way.
-struct Run<'a> {
-    free: &'a Free,
-    course: Course<'a>,
-    laps: Laps<'a>,
-    coarse: Grid<'a>,
-    /// The same on half the step, where it was made.
-    half: Option<Grid<'a>>,
-    starts: Vec<Runner>,
-    /// Where the first lap of the whole problem ended.
-    first: Vec<Runner>,
-    /// What whole orders reached.
-    wholes: Vec<Runner>,
-    reached: Vec<Runner>,
+/// State of a multistart.
+struct MultistartState<'a> {
+    free: &'a ParameterSet,
+    course: MultistartContext<'a>,
+    laps: RungExecutor<'a>,
+    coarse: Objective<'a>,
+    /// The grid of half the step, if it was computed.
+    half: Option<Objective<'a>>,
+    starts: Vec<Candidate>,
+    /// Candidates of the full problem after the first budget.
+    first: Vec<Candidate>,
+    /// Optima with integer orders.
+    integer_order_optima: Vec<Candidate>,
+    reached: Vec<Candidate>,
 }
 
-/// The race of a problem whose initial terms are few, and the grid on which it was.
-fn without_history<'a>(free: &'a Free, course: Course<'a>) -> Result<(Vec<Runner>, Grid<'a>)> {
-    let starts = course.starts.of(free)?;
-    let laps = Laps { starts: starts.len(), threads: course.threads, told: course.told };
-    let weights = Weights { outputs: course.weights.to_vec(), shares: None };
-    let sampling = thinned(free, course.source)?;
-    let grid = Grid::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
-    let chosen = fine_enough(laps, free, grid, &starts)?;
+/// Multistart of a problem with few initial terms; return the candidates and their grid.
+fn multistart_without_history<'a>(
+    free: &'a ParameterSet,
+    course: MultistartContext<'a>,
+) -> Result<(Vec<Candidate>, Objective<'a>)> {
+    let starts = course.starts.initial_guesses(free)?;
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
+    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
+    let sampling = coarse_sampling(free, course.source)?;
+    let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
+    let chosen = choose_coarse_grid(laps, free, grid, &starts)?;
     let (mut coarse, mut half) = (chosen.grid, chosen.half);
-    let mut reached = chosen.ran;
-    reached.extend(laps.run(free, &coarse, &chosen.glanced, FIRST_LAP)?);
-    reached = sorted(reached);
-    while coarse.sampling.every < FINEST {
+    let mut reached = chosen.pilots;
+    reached.extend(laps.run(free, &coarse, &chosen.prescreened_candidates, FIRST_BUDGET_EVALUATIONS)?);
+    reached = sort_by_cost(reached);
+    while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         let finer = half.take().map_or_else(|| coarse.finer(), Ok)?;
         if let Some(best) = reached.first() {
-            if !coarse.noticed(&best.attempt.place, &finer)? {
+            if !coarse.is_refinement_significant(&best.result.iterate, &finer)? {
                 half = Some(finer);
                 break;
             }
         }
         coarse = finer;
-        reached = laps.run(free, &coarse, &starts, FIRST_LAP)?;
+        reached = laps.run(free, &coarse, &starts, FIRST_BUDGET_EVALUATIONS)?;
     }
     let (first, wholes) = (reached.clone(), Vec::new());
-    let mut run = Run { free, course, laps, coarse, half, starts, first, wholes, reached };
-    run.inside()?;
+    let mut run =
+        MultistartState { free, course, laps, coarse, half, starts, first, integer_order_optima: wholes, reached };
+    run.add_nested_models()?;
     let told = run.laps.starts;
-    let found = run.ended()?;
+    let found = run.promote_survivors()?;
     if let Some(heard) = course.told {
         heard(told, told)?;
     }
     Ok(found)
 }
 
-impl<'a> Run<'a> {
-    /// Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0, or with
-    /// a pole too fast to see.
-    fn inside(&mut self) -> Result<()> {
+impl<'a> MultistartState<'a> {
+    /// Add the optima of submodels as candidates: a coefficient at 0, fixed orders, or an additional fast pole.
+    fn add_nested_models(&mut self) -> Result<()> {
         let Some(best) = self.reached.first() else { return Ok(()) };
-        let orders = best.attempt.place.point.orders.clone();
-        for less in unlike(simpler(self.free)) {
-            self.simpler(&less)?;
+        let orders = best.result.iterate.point.orders.clone();
+        for less in distinct_problems(reduced_problems(self.free)) {
+            self.add_reduced_model(&less)?;
         }
-        if let Some(less) = lower_order(self.free, self.course.step()) {
-            self.lower(&less)?;
+        if let Some(less) = lower_order_problem(self.free, self.course.largest_step()) {
+            self.add_lower_order_model(&less)?;
         }
-        for less in whole(self.free, &orders) {
-            self.whole(&less)?;
+        for less in integer_order_problems(self.free, &orders) {
+            self.add_integer_order_model(&less)?;
         }
-        let unit = self.course.clock(self.free);
-        for one in held(self.free) {
-            self.known(&one, &unit)?;
+        let unit = self.course.time_scaling(self.free);
+        for one in fixed_order_problems(self.free) {
+            self.add_fixed_order_model(&one, &unit)?;
         }
-        self.plain()
+        self.add_model_without_offset()
     }
 
-    fn add(&mut self, runners: Vec<Runner>) {
+    fn add(&mut self, runners: Vec<Candidate>) {
         self.reached.extend(runners);
-        self.reached = sorted(std::mem::take(&mut self.reached));
+        self.reached = sort_by_cost(std::mem::take(&mut self.reached));
     }
 
-    /// Adds runners where they are on this problem's grid.
-    fn join(&mut self, runners: &[Runner]) -> Result<()> {
+    /// Evaluate candidates on the grid of this problem and add them.
+    fn evaluate_and_add(&mut self, runners: &[Candidate]) -> Result<()> {
         let there = self.laps.run(self.free, &self.coarse, runners, 1)?;
         self.add(there);
         Ok(())
     }
 
-    fn simpler(&mut self, less: &Simpler) -> Result<()> {
-        if less.driven {
-            // What drives is solved for at every point, with a term less as well: own terms alone are told apart, so where
-            // the whole problem starts and ends will do, and the way goes on in the whole problem.
-            let first = distinct(&self.first, same_optimum);
-            let from = first.iter().take(FINALISTS).chain(&self.starts);
-            let runners: Vec<Runner> = from.map(|runner| less.without(runner, self.free)).collect();
-            let mut runners = self.laps.run(&less.free, &self.coarse, &runners, GLANCE)?;
-            runners.truncate(FINALISTS);
-            let ended = self.laps.run(&less.free, &self.coarse, &runners, FIRST_LAP)?;
-            return self.join(&ended.iter().take(1).map(|r| less.embedded(r, self.free)).collect::<Vec<_>>());
+    fn add_reduced_model(&mut self, less: &ReducedProblem) -> Result<()> {
+        if less.keeps_signals {
+            // Input coefficients are eliminated at every iterate, also with one term less. Candidates differ in the
+            // autoregressive terms only, so those of the full problem suffice.
+            let first = merge_duplicates(&self.first, is_same_optimum);
+            let from = first.iter().take(MAX_FINAL_SURVIVORS).chain(&self.starts);
+            let runners: Vec<Candidate> = from.map(|runner| less.restrict(runner, self.free)).collect();
+            let mut runners = self.laps.run(&less.free, &self.coarse, &runners, PRESCREEN_EVALUATIONS)?;
+            runners.truncate(MAX_FINAL_SURVIVORS);
+            let ended = self.laps.run(&less.free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
+            return self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>());
         }
         if is_rich(self.free) && less.free.orders.len() < self.free.orders.len() {
-            // One of several terms of free orders less is still an equation of many optima: searched like the whole.
-            let ended = without_history(&less.free, self.course.inside())?.0;
-            // Which of its optima is the lowest, a history may turn round.
-            let there = in_reach(&ended).into_iter().take(FEWEST).map(|runner| less.embedded(&runner, self.free));
-            return self.join(&there.collect::<Vec<_>>());
+            // With several terms of free order, the reduced problem still has many optima and gets its own multistart.
+            let ended = multistart_without_history(&less.free, self.course.for_submodel())?.0;
+            // Initial terms can change which of its optima is the best.
+            let there = competitive_candidates(&ended)
+                .into_iter()
+                .take(MIN_SURVIVORS)
+                .map(|runner| less.embed(&runner, self.free));
+            return self.evaluate_and_add(&there.collect::<Vec<_>>());
         }
-        let ended = self.of(&less.free, FEWEST)?;
-        self.add(ended.iter().take(1).map(|runner| less.embedded(runner, self.free)).collect());
+        let ended = self.optimize_nested_model(&less.free, MIN_SURVIVORS)?;
+        self.add(ended.iter().take(1).map(|runner| less.embed(runner, self.free)).collect());
         Ok(())
     }
 
-    fn lower(&mut self, less: &LowerOrder) -> Result<()> {
-        let ended = self.of(&less.free, FEWEST)?;
-        self.add(ended.iter().take(1).map(|runner| less.embedded(runner, self.free)).collect());
+    fn add_lower_order_model(&mut self, less: &LowerOrderProblem) -> Result<()> {
+        let ended = self.optimize_nested_model(&less.free, MIN_SURVIVORS)?;
+        self.add(ended.iter().take(1).map(|runner| less.embed(runner, self.free)).collect());
         Ok(())
     }
 
-    fn whole(&mut self, less: &Whole) -> Result<()> {
-        // At given orders most starts lead to one optimum.
-        let ended = self.of(&less.free, FINALISTS)?;
-        let there: Vec<Runner> = ended.iter().take(1).map(|runner| less.embedded(runner)).collect();
-        self.wholes.extend(there.iter().cloned());
+    fn add_integer_order_model(&mut self, less: &IntegerOrderProblem) -> Result<()> {
+        // With fixed orders most initial guesses lead to the same optimum.
+        let ended = self.optimize_nested_model(&less.free, MAX_FINAL_SURVIVORS)?;
+        let there: Vec<Candidate> = ended.iter().take(1).map(|runner| less.embed(runner)).collect();
+        self.integer_order_optima.extend(there.iter().cloned());
         self.add(there);
         Ok(())
     }
 
-    /// Where a problem inside this one ends from starts of its own, so many of which go on.
-    fn of(&self, free: &Free, going: usize) -> Result<Vec<Runner>> {
-        // At whole orders two of its terms may have become one.
-        let Some(starts) = made(self.course.starts.of(free))? else { return Ok(Vec::new()) };
-        let mut runners = distinct(&self.laps.run(free, &self.coarse, &starts, GLANCE)?, same_place);
+    /// Optimize a submodel from its own initial guesses; `going` of them continue.
+    fn optimize_nested_model(&self, free: &ParameterSet, going: usize) -> Result<Vec<Candidate>> {
+        // With integer orders two of its terms may coincide.
+        let Some(starts) = none_if_invalid_model(self.course.starts.initial_guesses(free))? else {
+            return Ok(Vec::new());
+        };
+        let mut runners =
+            merge_duplicates(&self.laps.run(free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
         runners.truncate(going);
-        let ended = self.laps.run(free, &self.coarse, &runners, FIRST_LAP)?;
-        self.laps.run(free, &self.coarse, &finalists(&ended), SECOND_LAP)
+        let ended = self.laps.run(free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
+        self.laps.run(free, &self.coarse, &select_survivors(&ended), SECOND_BUDGET_EVALUATIONS)
     }
 
-    /// Nor is it to end above what it reaches with one order known.
-    fn known(&mut self, one: &Held, unit: &Clock) -> Result<()> {
-        let level = self.reached.first().map_or(0.0, Runner::level);
-        if one.free.orders.len() == 1 && level > ABOVE_FLOOR * self.course.floor {
-            // A race of one free order costs little where noise alone would leave less; bounds may leave it no lattice.
-            if let Some((ended, _)) = made(without_history(&one.free, self.course.inside()))? {
-                let there = in_reach(&ended).into_iter().take(FINALISTS).map(|runner| one.embedded(&runner, self.free));
-                return self.join(&there.collect::<Vec<_>>());
+    /// Add the optimum with one order fixed: the full problem must not fit worse.
+    fn add_fixed_order_model(&mut self, one: &FixedOrderProblem, unit: &TimeScaling) -> Result<()> {
+        let level = self.reached.first().map_or(0.0, Candidate::cost_per_residual);
+        if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.course.floor {
+            // Above the noise floor a multistart with one free order is worth its cost. Bounds may leave no order grid.
+            if let Some((ended, _)) =
+                none_if_invalid_model(multistart_without_history(&one.free, self.course.for_submodel()))?
+            {
+                let there = competitive_candidates(&ended)
+                    .into_iter()
+                    .take(MAX_FINAL_SURVIVORS)
+                    .map(|runner| one.embed(&runner, self.free));
+                return self.evaluate_and_add(&there.collect::<Vec<_>>());
             }
         }
-        // From where it is, and from whole orders.
-        let (reached, first) = (distinct(&self.reached, same_optimum), distinct(&self.first, same_optimum));
-        let near = reached.iter().take(FINALISTS).chain(first.iter().take(FINALISTS)).chain(&self.wholes);
-        let runners: Vec<Runner> = near.map(|runner| one.without(runner, unit)).collect();
-        let mut runners = distinct(&self.laps.run(&one.free, &self.coarse, &runners, GLANCE)?, same_place);
-        runners.truncate(FINALISTS);
-        let ended = self.laps.run(&one.free, &self.coarse, &runners, FIRST_LAP)?;
-        self.join(&ended.iter().take(1).map(|runner| one.embedded(runner, self.free)).collect::<Vec<_>>())
+        // Start from the optima found so far and from those with integer orders.
+        let (reached, first) =
+            (merge_duplicates(&self.reached, is_same_optimum), merge_duplicates(&self.first, is_same_optimum));
+        let near = reached
+            .iter()
+            .take(MAX_FINAL_SURVIVORS)
+            .chain(first.iter().take(MAX_FINAL_SURVIVORS))
+            .chain(&self.integer_order_optima);
+        let runners: Vec<Candidate> = near.map(|runner| one.restrict(runner, unit)).collect();
+        let mut runners = merge_duplicates(
+            &self.laps.run(&one.free, &self.coarse, &runners, PRESCREEN_EVALUATIONS)?,
+            is_same_iterate,
+        );
+        runners.truncate(MAX_FINAL_SURVIVORS);
+        let ended = self.laps.run(&one.free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
+        self.evaluate_and_add(&ended.iter().take(1).map(|runner| one.embed(runner, self.free)).collect::<Vec<_>>())
     }
 
-    /// An offset of each run hides which of the measured signals drives: also from where it ends without.
-    fn plain(&mut self) -> Result<()> {
+    /// Add the optima without offsets: offsets of the runs can hide which measured signal is the input.
+    fn add_model_without_offset(&mut self) -> Result<()> {
         let structure = &self.free.structure;
         let plain = structure.initial.without_offset();
         if structure.coupled || plain == structure.initial {
             return Ok(());
         }
-        let plain = Free::of(Structure { initial: plain, ..structure.clone() })?;
-        let mut ended = race(&plain, self.course.inside())?;
-        ended.truncate(FINALISTS);
+        let plain = ParameterSet::from_structure(Structure { initial: plain, ..structure.clone() })?;
+        let mut ended = run_multistart(&plain, self.course.for_submodel())?;
+        ended.truncate(MAX_FINAL_SURVIVORS);
         self.add(ended);
         Ok(())
     }
 
-    /// Who is ahead goes on; those that came to the same optimum as one, and those that are far behind not at all.
-    fn ended(self) -> Result<(Vec<Runner>, Grid<'a>)> {
+    /// Promote the survivors to the second budget; duplicates and candidates far behind do not continue.
+    fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
         let (laps, free, coarse) = (self.laps, self.free, self.coarse);
-        let reached = distinct(&self.reached, same_optimum);
-        let (contenders, lost) = reached.split_at(in_reach(&reached).len());
-        let (ahead, rest) = contenders.split_at(contenders.len().min(FEWEST.max(reached.len() / RUNNERS)));
+        let reached = merge_duplicates(&self.reached, is_same_optimum);
+        let (contenders, lost) = reached.split_at(competitive_candidates(&reached).len());
+        let (ahead, rest) =
+            contenders.split_at(contenders.len().min(MIN_SURVIVORS.max(reached.len() / CANDIDATES_PER_SURVIVOR)));
         let (mut rest, mut lost) = (rest.to_vec(), lost.to_vec());
-        let mut found = laps.run(free, &coarse, ahead, SECOND_LAP)?;
-        let level = found.first().map_or(0.0, Runner::level);
-        if level > ABOVE_FLOOR * self.course.floor {
-            // Noise alone would leave less: those behind may yet be on the way to where it does.
-            rest = on_the_way(laps, free, &coarse, &rest)?;
-            let farthest = FAR_BEHIND * contenders[0].level();
+        let mut found = laps.run(free, &coarse, ahead, SECOND_BUDGET_EVALUATIONS)?;
+        let level = found.first().map_or(0.0, Candidate::cost_per_residual);
+        if level > NOISE_FLOOR_FACTOR * self.course.floor {
+            // The best cost is above the noise floor: candidates behind may still lead to a better optimum.
+            rest = continue_improving(laps, free, &coarse, &rest)?;
+            let farthest = MAX_PROMOTION_COST_RATIO * contenders[0].cost_per_residual();
             let stirring;
-            (stirring, lost) = stirred(laps, free, &coarse, &lost, farthest)?;
-            rest.extend(on_the_way(laps, free, &coarse, &stirring)?);
+            (stirring, lost) = promote_improving(laps, free, &coarse, &lost, farthest)?;
+            rest.extend(continue_improving(laps, free, &coarse, &stirring)?);
         }
         found.extend(rest);
-        let mut found = ranked(&coarse, self.half, found)?;
+        let mut found = rank_candidates(&coarse, self.half, found)?;
         found.extend(lost);
         Ok((found, coarse))
     }
 }
 
-/// Runners in the order of their cost on a grid or on half its step, whichever is the larger; where that cannot be made, on
-/// the grid.
-fn ranked(coarse: &Grid<'_>, half: Option<Grid<'_>>, runners: Vec<Runner>) -> Result<Vec<Runner>> {
+/// Sort candidates by the larger of their costs on a grid and on half its step; by the former if the latter fails.
+fn rank_candidates(
+    coarse: &Objective<'_>,
+    half: Option<Objective<'_>>,
+    runners: Vec<Candidate>,
+) -> Result<Vec<Candidate>> {
     if runners.is_empty() {
         return Ok(runners);
     }
     let half = match half.map_or_else(|| coarse.finer(), Ok) {
         Err(Error::Interrupted) => return Err(Error::Interrupted),
-        Err(_) => return Ok(sorted(runners)),
+        Err(_) => return Ok(sort_by_cost(runners)),
         Ok(half) => half,
     };
-    let order = half.ranked(&runners.iter().map(|runner| &runner.attempt).collect::<Vec<_>>())?;
-    let mut runners: Vec<Option<Runner>> = runners.into_iter().map(Some).collect();
+    let order = half.rank_results(&runners.iter().map(|runner| &runner.result).collect::<Vec<_>>())?;
+    let mut runners: Vec<Option<Candidate>> = runners.into_iter().map(Some).collect();
     Ok(order.into_iter().filter_map(|i| runners[i].take()).collect())
 }
 
-/// Whether an equation has several own terms of free order.
-fn is_rich(free: &Free) -> bool {
-    let several = |e: &Equation| e.own().filter(|term| term.order.is_free()).count() > 1;
+/// True if an equation has several autoregressive terms of free order.
+fn is_rich(free: &ParameterSet) -> bool {
+    let several = |e: &Equation| e.autoregressive_terms().filter(|term| term.order.is_free()).count() > 1;
     free.structure.equations.iter().any(several)
 }
 
-/// The same of runs in motion: the terms of their history, many a run, wait for those that go on.
+/// Multistart of a problem with many initial terms per run, which are added for the survivors only.
 ///
-/// What a run remembers moves most optima by less than lies between two; where it does not, the order among them is that of
-/// a lap with it.
-fn with_history(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
-    let few = free.starting(free.structure.initial.with_under(Initial::Caputo), false)?;
-    let (reached, coarse) = without_history(&few, course)?;
-    let (reached, coarse) = (distinct(&reached, same_optimum), coarse.of(&free.problem));
-    let laps = Laps { starts: reached.len(), threads: course.threads, told: None };
-    let ends = laps.each(free, &coarse, &reached, 0)?;
-    let levels: Vec<f64> = ends.iter().map(|end| end.as_ref().map_or(f64::INFINITY, Runner::level)).collect();
+/// The initial terms move most optima by less than their distance. The survivors are ranked again after a budget with
+/// all initial terms.
+fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    let few = free.with_initial_terms(free.structure.initial.with_under(Initial::Caputo), false)?;
+    let (reached, coarse) = multistart_without_history(&few, course)?;
+    let (reached, coarse) = (merge_duplicates(&reached, is_same_optimum), coarse.with_problem(&free.problem));
+    let laps = RungExecutor { starts: reached.len(), threads: course.threads, told: None };
+    let ends = laps.run_each(free, &coarse, &reached, 0)?;
+    let levels: Vec<f64> =
+        ends.iter().map(|end| end.as_ref().map_or(f64::INFINITY, Candidate::cost_per_residual)).collect();
     let mut order: Vec<usize> = (0..reached.len()).collect();
     order.sort_by(|&i, &j| levels[i].total_cmp(&levels[j]));
-    let limit = order.first().map_or(0.0, |&i| CONTENDER * levels[i]);
-    let going: Vec<Runner> =
-        order.iter().take(FEWEST).filter(|&&i| levels[i] <= limit).map(|&i| reached[i].clone()).collect();
+    let limit = order.first().map_or(0.0, |&i| MAX_SURVIVOR_COST_RATIO * levels[i]);
+    let going: Vec<Candidate> =
+        order.iter().take(MIN_SURVIVORS).filter(|&&i| levels[i] <= limit).map(|&i| reached[i].clone()).collect();
     let mut rest = order[going.len()..].to_vec();
     rest.sort_unstable();
-    let mut ahead = ranked(&coarse, None, laps.run(free, &coarse, &going, FIRST_LAP)?)?;
+    let mut ahead = rank_candidates(&coarse, None, laps.run(free, &coarse, &going, FIRST_BUDGET_EVALUATIONS)?)?;
     ahead.extend(rest.into_iter().map(|i| reached[i].clone()));
-    Ok(distinct(&ahead, same_optimum))
+    Ok(merge_duplicates(&ahead, is_same_optimum))
 }
 
-/// Behind the first, a start goes on while a lap lowers its cost by this share: what has come to rest overtakes nobody.
-const ON_THE_WAY: f64 = 0.05;
-/// Of those further behind than contenders are, who falls by a share in a few evaluations.
-const STIR: usize = 5;
-const STIRS: f64 = 0.1;
+/// Relative cost decrease per first budget below which a candidate behind the best has converged and is stopped.
+const MIN_COST_DECREASE_RATIO: f64 = 0.05;
+/// Evaluations in which a candidate far behind must lower its cost by [`MIN_PROMOTION_DECREASE_RATIO`] to be promoted.
+const PROMOTION_EVALUATIONS: usize = 5;
+const MIN_PROMOTION_DECREASE_RATIO: f64 = 0.1;
 
-/// Where those behind end, each for as long as it is getting on, but no longer than a second lap.
-pub(super) fn on_the_way(laps: Laps<'_>, free: &Free, coarse: &Grid<'_>, behind: &[Runner]) -> Result<Vec<Runner>> {
+/// Optimize candidates while they improve, for at most the second budget.
+pub(super) fn continue_improving(
+    laps: RungExecutor<'_>,
+    free: &ParameterSet,
+    coarse: &Objective<'_>,
+    behind: &[Candidate],
+) -> Result<Vec<Candidate>> {
     let (mut ended, mut going) = (Vec::new(), behind.to_vec());
-    for _ in 0..SECOND_LAP / FIRST_LAP {
+    for _ in 0..SECOND_BUDGET_EVALUATIONS / FIRST_BUDGET_EVALUATIONS {
         let mut further = Vec::new();
-        for (runner, at) in going.iter().zip(laps.each(free, coarse, &going, FIRST_LAP)?) {
+        for (runner, at) in going.iter().zip(laps.run_each(free, coarse, &going, FIRST_BUDGET_EVALUATIONS)?) {
             let Some(at) = at else { continue };
-            let gets_on = at.level() < (1.0 - ON_THE_WAY) * runner.level();
+            let gets_on = at.cost_per_residual() < (1.0 - MIN_COST_DECREASE_RATIO) * runner.cost_per_residual();
             if gets_on { &mut further } else { &mut ended }.push(at);
         }
         going = further;
@@ -345,19 +377,21 @@ pub(super) fn on_the_way(laps: Laps<'_>, free: &Free, coarse: &Grid<'_>, behind:
     Ok(ended)
 }
 
-/// Where those no further behind are after a few evaluations that lower their cost by a share; and the others.
-pub(super) fn stirred(
-    laps: Laps<'_>,
-    free: &Free,
-    coarse: &Grid<'_>,
-    lost: &[Runner],
+/// Split candidates up to a cost limit into those that improve in a few evaluations, and the others.
+pub(super) fn promote_improving(
+    laps: RungExecutor<'_>,
+    free: &ParameterSet,
+    coarse: &Objective<'_>,
+    lost: &[Candidate],
     farthest: f64,
-) -> Result<(Vec<Runner>, Vec<Runner>)> {
-    let (near, mut still): (Vec<Runner>, Vec<Runner>) = lost.iter().cloned().partition(|r| r.level() <= farthest);
+) -> Result<(Vec<Candidate>, Vec<Candidate>)> {
+    let (near, mut still): (Vec<Candidate>, Vec<Candidate>) =
+        lost.iter().cloned().partition(|r| r.cost_per_residual() <= farthest);
     let mut moving = Vec::new();
-    let ends = laps.each(free, coarse, &near, STIR)?;
+    let ends = laps.run_each(free, coarse, &near, PROMOTION_EVALUATIONS)?;
     for (runner, at) in near.into_iter().zip(ends) {
-        match at.filter(|at| at.level() < (1.0 - STIRS) * runner.level()) {
+        match at.filter(|at| at.cost_per_residual() < (1.0 - MIN_PROMOTION_DECREASE_RATIO) * runner.cost_per_residual())
+        {
             Some(at) => moving.push(at),
             None => still.push(runner),
         }
@@ -365,18 +399,23 @@ pub(super) fn stirred(
     Ok((moving, still))
 }
 
-/// Where starts get on coarse grids, best first.
+/// Optimize candidates on coarse grids; return them best first.
 ///
 /// # Errors
-/// Those of the source, [`crate::error::Error::Interrupted`].
-pub fn on_coarse_grids(free: &Free, coarse: &Grid<'_>, starts: &[Runner], threads: usize) -> Result<Vec<Runner>> {
-    let laps = Laps { starts: starts.len(), threads, told: None };
+/// As the source, [`crate::error::Error::Interrupted`].
+pub fn optimize_on_coarse_grids(
+    free: &ParameterSet,
+    coarse: &Objective<'_>,
+    starts: &[Candidate],
+    threads: usize,
+) -> Result<Vec<Candidate>> {
+    let laps = RungExecutor { starts: starts.len(), threads, told: None };
     let mut coarse = coarse.clone();
-    let mut ended = laps.run(free, &coarse, starts, FIRST_LAP)?;
-    while coarse.sampling.every < FINEST && ended.is_empty() {
+    let mut ended = laps.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
+    while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && ended.is_empty() {
         coarse = coarse.finer()?;
-        ended = laps.run(free, &coarse, starts, FIRST_LAP)?;
+        ended = laps.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
     }
-    ended.truncate(2 * FINALISTS);
-    laps.run(free, &coarse, &ended, SECOND_LAP)
+    ended.truncate(2 * MAX_FINAL_SURVIVORS);
+    laps.run(free, &coarse, &ended, SECOND_BUDGET_EVALUATIONS)
 }
