@@ -713,7 +713,11 @@ TOO_MANY = "candidates, more than the limit of"
         ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"increment": 0.002}, TOO_MANY),
         # Refused from the lengths of the axes: to go through them would take minutes.
         (EQUATION, {"increment": 0.001}, TOO_MANY),
-        (EQUATION, {"increment": 1e-4}, ": up to 11.7 years of one core at 10 ns each, as fast as searches are at best;"),
+        (
+            EQUATION,
+            {"increment": 1e-4},
+            ": up to 11.7 years of one core at 10 ns each, as fast as searches are at best;",
+        ),
         ("D^alpha y = a D^(alpha+0.1) y + b u", {}, "the lattice holds no candidate"),
         ("D^alpha y = a D^(alpha-beta) y + b D^mu u + c D^nu u", {"increment": 0.002}, TOO_MANY),
         ("D^1.5 y = a y + b u", {}, "every order is a number, so there is nothing to search"),

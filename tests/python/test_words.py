@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm.cli.main import app
 from ftlm.data.units import TIME_UNITS
-from ftlm.estimation.methods import METHODS
+from ftlm.estimation.methods import METHOD_BY_NAME
 from ftlm.report.typesetting import equation_html
 from ftlm.structure.equation import format_equation
 from ftlm.utils.parameters import (
@@ -394,7 +394,7 @@ def functions_behind():
     return {
         "open": reading, "inspect": reading, "doctor": (),
         "record": (run, Streaming, ftlm.equation),
-        "identify": (*estimation, ftlm.identify, ftlm.order_grid, *METHODS.values()),
+        "identify": (*estimation, ftlm.identify, ftlm.order_grid, *METHOD_BY_NAME.values()),
         "search": (*estimation, ftlm.identify, ftlm.search_orders, ftlm.order_grid),
         "certify": (*estimation, ftlm.identify, ftlm.certify_orders, ftlm.order_grid),
         "resume": (ftlm.resume_search,), "status": (),
