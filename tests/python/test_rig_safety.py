@@ -15,7 +15,7 @@ import pytest
 
 import ftlm
 from ftlm import rig
-from ftlm.cli import main as app
+from ftlm.cli.main import app
 from ftlm.rig import quanser, watchdog
 from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.rig import shut_down

@@ -362,7 +362,7 @@ def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, e
     path.write_bytes(damaged)
     end = read_store(path).end
     for again in (lambda: search(run, path), lambda: ftlm.resume_search(path)):
-        with pytest.raises(ftlm.DataError, match=f"is damaged: the frame at byte {end} .*--recover"):
+        with pytest.raises(ftlm.DataError, match=f"is damaged: the frame at byte {end} .*recover=True"):
             again()
     assert path.read_bytes() == damaged
     assert "damaged" in str(ftlm.search_status(path)["y"])

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.estimation.methods import METHOD_BY_NAME
+from ftlm.estimation.methods import METHODS_BY_NAME
 from ftlm.utils.validation import available_threads, check_threads
 
 WORDS = "D^1.5 y = a y + b u"
@@ -78,7 +78,7 @@ def test_the_environment_gives_the_threads_of_what_does_not_say_its_own(monkeypa
         ("identify --meth", {"--method"}),
         (
             "identify --method ",
-            set(METHOD_BY_NAME),
+            set(METHODS_BY_NAME),
         ),
         ("identify-frequency --weights ", {"auto", "relative", "uniform", "deviation"}),
     ],

@@ -126,7 +126,7 @@ class FitRequest:
         }[self.way]
 
     def settings(self) -> dict[str, str]:
-        """Options given for the fit besides runs and structure."""
+        """Options of the fit that the user gave, other than runs and structure."""
         given = {"method": self.method, "offset": self.offset, "loss": self.loss}
         return {name: value for name, value in given.items() if value}
 

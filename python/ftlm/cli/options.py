@@ -14,7 +14,7 @@ from ftlm.arm.flexible_link import Law, flexible_link
 from ftlm.cli.framework import announce_reading, interval, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation.methods import METHOD_BY_NAME
+from ftlm.estimation.methods import METHODS_BY_NAME
 from ftlm.io.dialect import Layout
 from ftlm.io.load import load
 from ftlm.io.preview import OpenedFile, open_file
@@ -103,7 +103,7 @@ def layout_options(record: object) -> dict[str, Any]:
 
 def methods_with(*options: str) -> tuple[str, ...]:
     """Return the names of the methods of estimation that have these options."""
-    return tuple(name for name, method in METHOD_BY_NAME.items() if set(options) <= {f.name for f in fields(method)})
+    return tuple(name for name, method in METHODS_BY_NAME.items() if set(options) <= {f.name for f in fields(method)})
 
 
 @dataclass(frozen=True)
