@@ -369,7 +369,7 @@ class Sound:
     def joint_fit(self):
         problem, runs, values = self.sampled()
         near, start = self.one((values, [1.0], 1), None), self.one(values, None)
-        raced = self.one(None, _core.joint_grids(problem, runs, [1.0], 1, [(values, "here")], 1))
+        raced = self.one(None, _core.refine_candidates(problem, runs, [1.0], 1, [(values, "here")], 1))
         return (
             problem,
             runs,
@@ -386,7 +386,7 @@ class Sound:
 
     def joint_race_values(self):
         problem, runs, values = self.sampled()
-        return _core.joint_grids(problem, runs, [1.0], 1, [(values, "here")], 1), ()
+        return _core.refine_candidates(problem, runs, [1.0], 1, [(values, "here")], 1), ()
 
     joint_race_len = joint_race_origins = joint_race_values
 
@@ -397,7 +397,7 @@ class Sound:
     def clocked(self):
         """A clock, and values of what it tells."""
         problem, (_, spans, *_), values = self.sampled()
-        return problem.clock(spans), np.array(values)
+        return problem.time_scaling(spans), np.array(values)
 
     def joint_clock_unit(self):
         return self.clocked()[0], ()

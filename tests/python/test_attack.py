@@ -35,7 +35,7 @@ def test_sound_arguments_are_answered():
         for name in HOSTILE["entries"]():
             call, given, named = sound.call(name)
             call(*given, **named)
-    _core.portable(False)
+    _core.force_portable(False)
 
 
 def test_hostile_values_leave_no_number_untouched():
