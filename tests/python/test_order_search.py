@@ -687,11 +687,11 @@ def test_settings_that_mean_nothing_are_refused(run, options, message):
         (lambda: values(ftlm.order_grid(beta=(2, 1))), "order beta: interval 2:1 is empty"),
         (
             lambda: values(ftlm.order_grid(gama=1)),
-            "lattice order 'gama' is no free order; free are alpha, beta, mu, nu",
+            "order 'gama' of order_grid= is no free order; free are alpha, beta, mu, nu",
         ),
         (
             lambda: values(ftlm.order_grid(beta=1), "D^1.5 y = a y"),
-            "lattice order 'beta' is no free order; free are none",
+            "order 'beta' of order_grid= is no free order; free are none",
         ),
         (lambda: values(ftlm.OrderGrid(increment=1e-7)), "has 9.5e+06 values, more than 1000000"),
     ],
@@ -733,7 +733,7 @@ def test_nothing_or_too_much_to_search_is_refused(run, text, order_grid, message
 def test_what_is_no_structure_no_lattice_and_no_run_is_refused(run):
     with pytest.raises(ftlm.ModelError, match="equation is str, not a structure; use"):
         ftlm.search_orders(run, EQUATION)
-    with pytest.raises(ftlm.ModelError, match="lattice is dict, not a Lattice"):
+    with pytest.raises(ftlm.ModelError, match="order_grid is dict, not an OrderGrid"):
         ftlm.search_orders(run, ftlm.equation(EQUATION), GRID)
     with pytest.raises(ftlm.DataError, match="no run is given"):
         ftlm.search_orders([], ftlm.equation(EQUATION))

@@ -49,7 +49,7 @@ def test_the_log_tells_files_fits_and_doubts(run, tmp_path, caplog):
 
 def test_a_program_that_does_not_listen_hears_nothing():
     script = (
-        "import logging, ftlm, numpy as np; from ftlm.base.log import LOG; LOG.warning('loud'); "
+        "import logging, ftlm, numpy as np; from ftlm.utils.files import PACKAGE_LOGGER as log; log.warning('loud'); "
         "print([type(h).__name__ for h in logging.getLogger('ftlm').handlers], logging.getLogger().handlers)"
     )
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
