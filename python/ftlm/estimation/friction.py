@@ -324,7 +324,8 @@ def run_frictionless_multistart(
 ) -> _core.JointMultistart:
     """Run the multistart of a problem without friction, with equal weight for every output."""
     runs = RunSampler(alike.problem, alike.runs).core_arguments(progress)
-    return _core.joint_multistart(alike.problem.core, runs, alike.weights, floor, (threads, memory_limit()), stop_flag())
+    limits = (threads, memory_limit())
+    return _core.joint_multistart(alike.problem.core, runs, alike.weights, floor, limits, stop_flag())
 
 
 def fit_on_coarse_grids(coarse: Objective, starts: Sequence[Iterate], threads: int) -> _core.JointMultistart:
