@@ -135,7 +135,7 @@ def test_options_of_a_search_need_a_free_order(option, value, noisy, tmp_path, m
 
 def test_an_order_grid_names_free_orders(noisy):
     for kind in (*OrderSearchMethod.__subclasses__(), ftlm.GeneticAlgorithm):
-        with pytest.raises(ftlm.ModelError, match="'beta' is no free order; free are alpha"):
+        with pytest.raises(ftlm.ModelError, match="'beta' of order_grid= is no free order; free are"):
             ftlm.identify(noisy, ftlm.equation(FREE), method=kind(order_grid=ftlm.order_grid(beta=0.1)))
 
 
@@ -227,7 +227,7 @@ def test_options_by_name():
     ("method", "words"),
     [
         ("output-error", ["--norm", "l1"]),
-        ("output-error", ["--seed", "0"]),
+        ("output-error", ["--seeds", "0"]),
         ("least-squares", ["--loss", "squares"]),
         ("least-squares", ["--reference", "r"]),
         ("genetic", ["--store", "s.ftlm"]),

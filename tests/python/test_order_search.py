@@ -138,9 +138,9 @@ def test_table_is_that_of_enumeration(run, criterion, norm, coefficients, rows):
 
 @pytest.mark.parametrize(("p", "k0"), [(1, 0.01), (3, 100.0), (200, 1e6)])
 def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
-    options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation", "row_basis": "haar"}
+    options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation"}
     found = search(run, innovation_length=p, prior_covariance=k0, **options)
-    assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, **options))
+    assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, rows="haar", **options))
     assert found.settings["innovation_length"] == p
     assert found.settings["prior_covariance"] == k0
 
@@ -150,7 +150,7 @@ def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
 def test_several_runs_are_one_fit(run, second, norm, coefficients):
     options = {"criterion": "output-error", "norm": norm, "coefficients": coefficients}
     found = search([run, second], **options)
-    assert_is_table(found, enumerate_all([Record(run), Record(second)], row_basis="haar", **options))
+    assert_is_table(found, enumerate_all([Record(run), Record(second)], rows="haar", **options))
     assert found.model.about["runs"] == f"{run.name}, {second.name}"
     assert found.table != search(run, **options).table
 
@@ -160,7 +160,7 @@ def test_initial_terms_belong_to_each_run(run, second):
     options = {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
     structure = ftlm.equation(EQUATION, initial=(0.0, 1.0))
     found = ftlm.search_orders(moved, structure, ftlm.OrderGrid(orders=GRID), m=M, **options)
-    expected = enumerate_all([Record(r) for r in moved], row_basis="time", exponents=(0.0, 1.0), **options)
+    expected = enumerate_all([Record(r) for r in moved], rows="time", exponents=(0.0, 1.0), **options)
     assert_is_table(found, expected, rtol=1e-6)
 
 
@@ -710,12 +710,16 @@ TOO_MANY = "candidates, more than the limit of"
     [
         (EQUATION, {"orders": {"alpha": [0.5], "beta": [1.0]}}, "the lattice holds no candidate"),
         (EQUATION, {"orders": {"alpha": [0.0]}}, "order alpha = 0 is outside (0, 10]; move the interval of alpha"),
-        ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"step": 0.002}, TOO_MANY),
+        ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"increment": 0.002}, TOO_MANY),
         # Refused from the lengths of the axes: to go through them would take minutes.
-        (EQUATION, {"step": 0.001}, TOO_MANY),
-        (EQUATION, {"step": 1e-4}, ": up to 11.7 years of one core at 10 ns each, as fast as searches are at best;"),
+        (EQUATION, {"increment": 0.001}, TOO_MANY),
+        (
+            EQUATION,
+            {"increment": 1e-4},
+            ": up to 11.7 years of one core at 10 ns each, as fast as searches are at best;",
+        ),
         ("D^alpha y = a D^(alpha+0.1) y + b u", {}, "the lattice holds no candidate"),
-        ("D^alpha y = a D^(alpha-beta) y + b D^mu u + c D^nu u", {"step": 0.002}, TOO_MANY),
+        ("D^alpha y = a D^(alpha-beta) y + b D^mu u + c D^nu u", {"increment": 0.002}, TOO_MANY),
         ("D^1.5 y = a y + b u", {}, "every order is a number, so there is nothing to search"),
         ("D^alpha y = a y + b u; D^beta z = c z", {}, "one by one: pass .equation('y') or use identify"),
     ],
@@ -764,7 +768,7 @@ def test_settings_state_what_matters_and_nothing_else():
     plain = replace(made, coefficients="least-squares")
     assert not plain.needs_haar
     assert plain.to_dict() == {"criterion": "output-error", "norm": "l1", "coefficients": "least-squares"}
-    assert plain.core_arguments()[2] == 0
+    assert plain.core_arguments(1)[2] == 0
 
 
 def test_power_means_of_the_oracle_are_those_of_a_power():
