@@ -126,7 +126,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     """
     runs = () if validation is None else (validation,)
     tried = validation is not None and _is_other(validation)
-    against = _combined_verdict(result_findings(result), result.fit_percent, runs, tried)
+    against = _combined_verdict([*result_findings(result)], result.fit_percent, runs, tried)
     if against is not None:
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
@@ -205,12 +205,8 @@ def saved_findings(known: Estimate) -> list[ModelFinding]:
     return found
 
 
-def result_findings(result: Identification) -> list[ModelFinding]:
-    """Return the findings about a result by itself, most serious first within a level."""
-    return [*_rules(result)]
-
-
-def _rules(result: Identification) -> Iterator[ModelFinding]:
+def result_findings(result: Identification) -> Iterator[ModelFinding]:
+    """Yield the findings about a result by itself, most serious first within a level."""
     kinds = {c.kind.name: c for c in group_warnings(result.warnings)}
 
     def of(kind: WarningKind, reason: str = "", remedy: str = "") -> ModelFinding:
