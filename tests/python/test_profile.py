@@ -332,7 +332,7 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
     joint = replace(
         plain.fit,
         coefficients=dict(zip("abe", values.tolist(), strict=True)),
-        on_grid=values,
+        finest_grid_values=values,
         covariance=np.diag([1.0, np.inf, np.inf]),
     )
     seen = replace(plain, task=task, fit=joint).profile(threads=1)
@@ -395,7 +395,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
         if len(calls) > 2:
             return valley
         orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-        off = valley.grid.descend(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
+        off = valley.grid.minimize(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
         return replace(valley, best=off)
 
     monkeypatch.setattr(profiling.ProfileLikelihood, "at", classmethod(beside))

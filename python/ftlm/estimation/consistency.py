@@ -263,7 +263,7 @@ def _cell(value: Cell) -> str:
 
 def values_of(result: Identification) -> dict[str, float]:
     """Return all parameters with a standard error, by name."""
-    return {**result.orders, **result.coefficients, **({} if result.fit is None else result.parameter_values)}
+    return {**result.orders, **result.coefficients, **result.parameter_values}
 
 
 def consistency(
