@@ -179,7 +179,18 @@ def interruptions(count):
         run().to_csv(data)
         for number in range(count):
             path = Path(folder) / f"{number}.ftlm"
-            call = ["search", str(data), "--structure", EQUATION, "--increment", "0.02", "--m", "2048", "--initial", "rest"]
+            call = [
+                "search",
+                str(data),
+                "--structure",
+                EQUATION,
+                "--increment",
+                "0.02",
+                "--m",
+                "2048",
+                "--initial",
+                "rest",
+            ]
             call += ["--coefficients", "instrumental-variables", "--store", str(path)]
             code, waited, said = control_c(call, path, 1 + number % 3)
             status = ftlm.search_status(path)["y"]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 __all__ = [
     "SIMD",
     "Guard",
-    "JointClock",
+    "JointMultistart",
     "JointProblem",
-    "JointRace",
+    "JointTimeScaling",
     "OrderSearch",
     "Points",
     "StageSearch",
@@ -27,45 +27,44 @@ __all__ = [
     "block_pulse_matrix",
     "certify",
     "chi_squared",
-    "colour_covariances",
-    "coloured",
-    "corners",
     "correlation",
     "covariance_of",
-    "delayed",
+    "delay_samples",
     "equation_error",
     "explicit_euler",
+    "filter_autocovariances",
     "filter_series",
     "fit_covariance",
+    "force_portable",
     "fractional_derivative",
     "fractional_integral",
     "fractional_memory",
     "friction_error",
     "friction_respond",
-    "grows",
     "grunwald_letnikov_weights",
     "haar_inverse",
     "haar_matrix",
     "haar_transform",
+    "has_unstable_pole",
     "instrumental_variables",
+    "interpolate_samples",
     "is_white",
     "joint_fit",
-    "joint_grids",
-    "joint_race",
-    "lattice_size",
+    "joint_multistart",
+    "kink_correction",
     "least_squares",
-    "long_run",
+    "long_run_covariance",
     "metrics",
     "multi_innovation",
     "nyquist_margin",
     "operational_matrix",
+    "order_grid_size",
     "output_error",
     "panic_on_purpose",
     "point_samples",
-    "portable",
     "projected_errors",
     "pulse_means",
-    "read_at",
+    "refine_candidates",
     "respond",
     "respond_and_units",
     "respond_with_initial",
@@ -75,9 +74,10 @@ __all__ = [
     "search_stage",
     "series_divide",
     "series_multiply",
-    "singular",
+    "singular_values",
     "trace_errors",
-    "triangle",
+    "triangular_factor",
+    "whitening_filter",
 ]
 
 _Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -205,15 +205,15 @@ def fractional_derivative(x: _Floats, order: float, step: float, definition: str
 
 def pulse_means(samples: _Floats, m: int, hold: bool) -> _Vector: ...
 def point_samples(means: _Floats) -> _Vector: ...
-def delayed(samples: _Floats, delay: float, before: float) -> _Vector: ...
+def delay_samples(samples: _Floats, delay: float, before: float) -> _Vector: ...
 def filter_series(
     numerator: Sequence[tuple[float, float]], denominator: Sequence[tuple[float, float]], m: int, step: float
 ) -> _Vector: ...
 
 # -------------------------------------------------------------------------------- tall matrices, their columns as rows
 
-def triangle(given: _Floats) -> _Matrix: ...
-def singular(given: _Floats) -> tuple[_Matrix, _Vector, _Matrix]: ...
+def triangular_factor(given: _Floats) -> _Matrix: ...
+def singular_values(given: _Floats) -> tuple[_Matrix, _Vector, _Matrix]: ...
 
 # ---------------------------------------------------------------------------------------------------------- estimators
 
@@ -268,7 +268,7 @@ def output_error(
     steady: bool = False,
     stop: Stop | None = None,
 ) -> _Fit: ...
-def grows(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
+def has_unstable_pole(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
 
 # ----------------------------------------------------------------------------------------------------------- joint fits
 
@@ -350,7 +350,7 @@ class JointProblem:
     def bounds(self) -> list[tuple[float, float]]: ...
     def free_from(self, /, estimated: Mapping[str, float]) -> list[float]: ...
     def feasible(self, /, at: _Floats, towards: _Floats) -> _Vector: ...
-    def descend(
+    def minimize(
         self,
         /,
         runs: Sequence[_Experiment],
@@ -362,25 +362,25 @@ class JointProblem:
         steady: bool,
         stop: Stop | None = None,
     ) -> dict[str, Any]: ...
-    def clock(self, /, spans: Sequence[tuple[float, float]]) -> JointClock: ...
+    def time_scaling(self, /, spans: Sequence[tuple[float, float]]) -> JointTimeScaling: ...
 
 @final
-class JointRace:
+class JointMultistart:
     def __len__(self) -> int: ...
     @property
     def values(self) -> list[list[float]]: ...
     @property
     def origins(self) -> list[str]: ...
 
-def joint_race(
+def joint_multistart(
     problem: JointProblem,
     runs: _Runs,
     weights: Sequence[float],
     floor: float,
     means: tuple[int, int],
     stop: Stop | None = None,
-) -> JointRace: ...
-def joint_grids(
+) -> JointMultistart: ...
+def refine_candidates(
     problem: JointProblem,
     runs: _Runs,
     weights: Sequence[float],
@@ -388,7 +388,7 @@ def joint_grids(
     starts: Sequence[tuple[Sequence[float], str]],
     threads: int,
     stop: Stop | None = None,
-) -> JointRace: ...
+) -> JointMultistart: ...
 def joint_fit(
     problem: JointProblem,
     runs: _Runs,
@@ -396,7 +396,7 @@ def joint_fit(
     known: Sequence[Sequence[float]],
     start: Sequence[float] | None,
     near: tuple[Sequence[float], Sequence[float], int] | None,
-    raced: JointRace | None,
+    raced: JointMultistart | None,
     huber: bool,
     refine: bool,
     means: tuple[int, int],
@@ -404,19 +404,19 @@ def joint_fit(
 ) -> _JointFit | None: ...
 
 @final
-class JointClock:
+class JointTimeScaling:
     @property
     def unit(self) -> float: ...
-    def told(self, /, values: _Floats) -> _Vector: ...
-    def untold(self, /, values: _Floats) -> _Vector: ...
+    def to_scaled(self, /, values: _Floats) -> _Vector: ...
+    def from_scaled(self, /, values: _Floats) -> _Vector: ...
     def step(self, /, values: _Floats, moved: _Floats) -> _Vector: ...
     def errors(self, /, values: _Floats, covariance: _Floats) -> _Vector: ...
 
 def covariance_of(jacobian: _Floats, series: Sequence[_Floats], squares: float) -> _Matrix: ...
 def fit_covariance(jacobian: _Floats, series: Sequence[_Floats], shares: _Floats | None) -> _Matrix: ...
-def long_run(jacobian: _Floats, series: Sequence[_Floats]) -> _Matrix: ...
-def coloured(series: Sequence[_Floats], most: int) -> tuple[_Vector, float]: ...
-def colour_covariances(through: _Floats, power: float, count: int) -> _Vector: ...
+def long_run_covariance(jacobian: _Floats, series: Sequence[_Floats]) -> _Matrix: ...
+def whitening_filter(series: Sequence[_Floats], most: int) -> tuple[_Vector, float]: ...
+def filter_autocovariances(through: _Floats, power: float, count: int) -> _Vector: ...
 def autocovariances(series: Sequence[_Floats], most: int) -> tuple[_Vector, _Vector]: ...
 def is_white(series: _Floats, lags: int) -> bool: ...
 def chi_squared(degrees: float, quantile: float) -> float: ...
@@ -474,8 +474,8 @@ def explicit_euler(signals: _Floats, step: float, model: Sequence[_Equation], in
 def trace_errors(run: _Record, equation: _Structure, inputs: Sequence[bool], trace: _Floats) -> _Vector: ...
 def nyquist_margin(own_terms: Sequence[tuple[float, float]], step: float) -> float: ...
 def correlation(x: Sequence[_Floats], y: Sequence[_Floats], lags: int) -> tuple[_Vector, float, int]: ...
-def read_at(means: _Floats, places: _Floats) -> _Matrix: ...
-def corners(m: int, places: _Floats, jumps: tuple[_Floats, _Floats], order: float, step: float) -> _Vector: ...
+def interpolate_samples(means: _Floats, places: _Floats) -> _Matrix: ...
+def kink_correction(m: int, places: _Floats, jumps: tuple[_Floats, _Floats], order: float, step: float) -> _Vector: ...
 def metrics(measured: _Floats, residuals: _Floats) -> tuple[float, float, float, float]: ...
 
 # ------------------------------------------------------------------------------------------------------------ searches
@@ -486,7 +486,7 @@ def certify(
     asked: tuple[float, float, int, int, int],
     progress: _Progress | None,
 ) -> _Certified: ...
-def lattice_size(orders: _Lattice, inputs: Sequence[bool]) -> int: ...
+def order_grid_size(orders: _Lattice, inputs: Sequence[bool]) -> int: ...
 def search(
     runs: Sequence[_Record],
     orders: _Lattice,
@@ -497,7 +497,7 @@ def search(
     progress: _Progress | None,
 ) -> _Found: ...
 def panic_on_purpose(place: str) -> None: ...
-def portable(on: bool) -> None: ...
+def force_portable(on: bool) -> None: ...
 def search_plan(
     orders: _Lattice, inputs: Sequence[bool], terms: _Initial, settings: _Options, algorithm: int | None
 ) -> tuple[int, list[int], int]: ...
@@ -558,7 +558,7 @@ class StageSearch:
         settings: _Options,
         keeps_course: bool,
     ) -> StageSearch: ...
-    def wanted(self) -> list[_Span]: ...
+    def pending_spans(self) -> list[_Span]: ...
     def state(self) -> tuple[int, float | None]: ...
     def follow(self, spans: Sequence[_Span], threads: int, progress: _Progress | None) -> tuple[bytes, bytes]: ...
     def take(self, values: bytes, kinds: bytes, threads: int) -> None: ...
@@ -583,11 +583,11 @@ class Guard:
     @property
     def fault(self) -> str | None: ...
     @property
-    def written(self) -> list[float]: ...
+    def last_currents(self) -> list[float]: ...
     @property
     def bias(self) -> list[float]: ...
     @property
-    def missed(self) -> int: ...
+    def missed_deadlines(self) -> int: ...
 
 @final
 class Stop:

@@ -78,14 +78,14 @@ def test_the_clock_tells_numbers_steps_and_errors():
     values = dict(alpha=1.9, mu=0.7, gamma=0.4, d=-2.0, a=-30.0, b0=4.0, b1=0.0, delay_u=0.1)
     powers = {"d": 1.2, "a": 1.9, "b0": 1.5, "b1": 1.9}
     point = np.array([values[n] for n in problem.names])
-    told = clock.told(point)
+    told = clock.to_scaled(point)
     expected = [values[n] * scale ** powers.get(n, 0.0) for n in problem.names]
     np.testing.assert_allclose(told, expected, rtol=1e-12)
-    np.testing.assert_allclose(clock.untold(told), point, rtol=1e-12)
+    np.testing.assert_allclose(clock.from_scaled(told), point, rtol=1e-12)
     # By differences: a step in the unit, and how each number moves with each.
     tiny = 1e-6 * np.random.default_rng(3).standard_normal(point.size)
-    np.testing.assert_allclose(clock.step(point, clock.told(point + tiny) - told), tiny, rtol=1e-4, atol=1e-9)
-    turned = np.stack([(clock.told(point + 1e-6 * e) - told) / 1e-6 for e in np.eye(point.size)], axis=1)
+    np.testing.assert_allclose(clock.step(point, clock.to_scaled(point + tiny) - told), tiny, rtol=1e-4, atol=1e-9)
+    turned = np.stack([(clock.to_scaled(point + 1e-6 * e) - told) / 1e-6 for e in np.eye(point.size)], axis=1)
     root = np.random.default_rng(4).standard_normal((point.size, point.size))
     covariance = root @ root.T
     expected = np.sqrt(np.diag(turned @ covariance @ turned.T))

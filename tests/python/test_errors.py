@@ -512,7 +512,7 @@ def hostile_calls(order, alpha, step, signal, output, values, coefficient, expon
         lambda: _core.fractional_integral(means, order, step, "trapezoidal"),
         lambda: _core.fractional_derivative(means, order, step, "caputo", means),
         lambda: _core.pulse_means(means[0], 7, True),
-        lambda: _core.delayed(means[0], order, coefficient),
+        lambda: _core.delay_samples(means[0], order, coefficient),
         lambda: _core.series_divide(means[0], means[1]),
         lambda: _core.metrics(means[0], means[1]),
         lambda: _core.nyquist_margin([(coefficient, order)], step),

@@ -310,7 +310,7 @@ def test_more_points_than_memory_holds_are_refused():
 def test_an_order_that_is_no_number_does_not_turn_for_ever():
     for terms in ([(1.679, 1.526), (-1.0, np.inf)], [(np.nan, 0.5)]):
         with pytest.raises(ftlm.DataError, match="own terms"):
-            _core.grows(1.135, terms)
+            _core.has_unstable_pole(1.135, terms)
 
 
 class Liar:
@@ -329,12 +329,12 @@ class Liar:
 @pytest.mark.parametrize("values", [range(2**40), Liar(2**60), Liar(3), np.broadcast_to(1.0, 2**34)])
 def test_a_sequence_is_not_believed_when_it_tells_its_length(values):
     with pytest.raises(ftlm.ModelError, match="a sequence "):
-        _core.lattice_size((0, values, []), [True])
-    assert _core.lattice_size((0, np.array([1.0, 2.0]), []), [True]) == 2
-    assert _core.lattice_size((0, range(1, 3), []), [True]) == 2
+        _core.order_grid_size((0, values, []), [True])
+    assert _core.order_grid_size((0, np.array([1.0, 2.0]), []), [True]) == 2
+    assert _core.order_grid_size((0, range(1, 3), []), [True]) == 2
     for words in ("12", {1.0: 2.0}, {1.0, 2.0}):
         with pytest.raises(TypeError, match="is no sequence"):
-            _core.lattice_size((0, words, []), [True])
+            _core.order_grid_size((0, words, []), [True])
 
 
 def test_an_array_that_repeats_one_number_is_not_copied_beyond_memory():
@@ -347,9 +347,9 @@ def test_an_array_that_repeats_one_number_is_not_copied_beyond_memory():
 def test_jumps_without_sizes_are_refused():
     places = np.array([3.0, 4.5, 7.0])
     with pytest.raises(ftlm.DataError, match="jumps has length 2, but 3 is needed"):
-        _core.corners(16, places, (places, np.ones(2)), 0.5, 0.1)
+        _core.kink_correction(16, places, (places, np.ones(2)), 0.5, 0.1)
     with pytest.raises(ftlm.ModelError, match="the times of jumps fall from index 1"):
-        _core.corners(16, places, (np.array([3.0, 4.5, -1e300]), np.ones(3)), 0.5, 0.1)
+        _core.kink_correction(16, places, (np.array([3.0, 4.5, -1e300]), np.ones(3)), 0.5, 0.1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -625,7 +625,7 @@ def test_lattice_of_p1_has_313_845_candidates():
     values = ftlm.order_grid(alpha=(1.05, 2.0)).values(structure)
     term = {n: list(values[n]) for n in values}
     axes = [(0, term["beta2"], True), (1, term["gamma2"], False), (0, term["mu2"], True), (2, [0.0], False)]
-    assert _core.lattice_size((0, term["alpha2"], axes), [False, False, True]) == 313_845
+    assert _core.order_grid_size((0, term["alpha2"], axes), [False, False, True]) == 313_845
     # Counted by hand: unordered pairs 0 <= mu < beta < alpha and 0 <= gamma <= alpha on the step 0.05.
     alphas = range(21, 41)
     assert sum(n * (n - 1) // 2 * (n + 1) for n in alphas) == 313_845

@@ -844,11 +844,11 @@ def test_the_oldest_machine_ranks_as_the_newest(run, with_noise, options):
     words = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
     tables = []
     for portable in (False, True):
-        _core.portable(portable)
+        _core.force_portable(portable)
         try:
             found = ftlm.search_orders(noisy, words, **options)
         finally:
-            _core.portable(False)
+            _core.force_portable(False)
         tables.append((found.to_dict(), found.failures))
     assert repr(tables[0]) == repr(tables[1])
     assert len(tables[0][0]["table"]) == 20
@@ -857,11 +857,11 @@ def test_the_oldest_machine_ranks_as_the_newest(run, with_noise, options):
 def test_the_oldest_machine_ranks_a_stage_as_the_newest(drive, plant, with_noise):
     tables = []
     for portable in (False, True):
-        _core.portable(portable)
+        _core.force_portable(portable)
         try:
             tables.append(repr(stage_search(drive, plant, with_noise).to_dict()))
         finally:
-            _core.portable(False)
+            _core.force_portable(False)
     assert tables[0] == tables[1]
 
 

@@ -395,7 +395,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
         if len(calls) > 2:
             return valley
         orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-        off = valley.grid.descend(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
+        off = valley.grid.minimize(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
         return replace(valley, best=off)
 
     monkeypatch.setattr(profiling.ProfileLikelihood, "at", classmethod(beside))

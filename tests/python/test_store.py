@@ -591,7 +591,7 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
     """What a forger would write: whole frames, under digests that are right."""
     job = job_of(stage_run, ftlm.flexible_link(form="published"), ftlm.OrderGrid(orders=STAGE), m=64, top=8)
     work = job.coupled_problem()
-    wave = sum(last - first for _, first, last, _ in work.build_evaluator(keeps_course=True).wanted())
+    wave = sum(last - first for _, first, last, _ in work.build_evaluator(keeps_course=True).pending_spans())
     for number, (first, last, kind, message) in enumerate(
         [
             (0, wave + 1, 0, "are cut up otherwise"),

@@ -257,13 +257,13 @@ def sampling_spans(runs: Sequence[Run]) -> list[tuple[float, float]]:
     return [(run.step, run.length * run.step) for run in runs]
 
 
-def time_scaling(problem: FreeProblem, runs: Sequence[Run]) -> _core.JointClock:
+def time_scaling(problem: FreeProblem, runs: Sequence[Run]) -> _core.JointTimeScaling:
     """Return the time scaling: the geometric mean of the frequencies of the run length and of Nyquist.
 
     A coefficient of D^nu y beside D^alpha y has the unit of time to the power -(alpha - nu), which changes with free
     orders.
     """
-    return problem.core.clock(sampling_spans(runs))
+    return problem.core.time_scaling(sampling_spans(runs))
 
 
 #: Relative difference up to which two signals are multiples of each other: rounding of files.

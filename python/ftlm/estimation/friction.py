@@ -155,7 +155,7 @@ MIN_MOTION_NOISE_RATIO = 10.0
 
 def run_friction_multistart(
     alike: Objective, floor: float, threads: int, progress: Callable[[int, int], None] | None
-) -> _core.JointRace:
+) -> _core.JointMultistart:
     """Rank initial guesses of bodies with friction by coarse fits, with equal weight for every output.
 
     With the measured sign of the velocity the equation is linear. Where the body rests, the sign is noise, but the
@@ -321,16 +321,18 @@ def reaction_coefficients(
 
 def run_frictionless_multistart(
     alike: Objective, floor: float, threads: int, progress: Callable[[int, int], None] | None
-) -> _core.JointRace:
+) -> _core.JointMultistart:
     """Run the multistart of a problem without friction, with equal weight for every output."""
     runs = RunSampler(alike.problem, alike.runs).core_arguments(progress)
-    return _core.joint_race(alike.problem.core, runs, alike.weights, floor, (threads, memory_limit()), stop_flag())
+    return _core.joint_multistart(
+        alike.problem.core, runs, alike.weights, floor, (threads, memory_limit()), stop_flag()
+    )
 
 
-def fit_on_coarse_grids(coarse: Objective, starts: Sequence[Iterate], threads: int) -> _core.JointRace:
+def fit_on_coarse_grids(coarse: Objective, starts: Sequence[Iterate], threads: int) -> _core.JointMultistart:
     """Refine initial guesses on coarse grids and return them ranked, best first."""
     runs = RunSampler(coarse.problem, coarse.runs).core_arguments()
-    return _core.joint_grids(
+    return _core.refine_candidates(
         coarse.problem.core,
         runs,
         coarse.weights,

@@ -155,7 +155,7 @@ class GeneticProblem:
         if self.law:
             return math.prod(len(v) for v in values.values())
         orders = order_grid_tuple(structure.equations[0], records[0].signals, values)
-        return _core.lattice_size(orders, list(records[0].inputs))
+        return _core.order_grid_size(orders, list(records[0].inputs))
 
     def round_orders(self, genes: Floats) -> Floats:
         """Round the orders to the order resolution."""

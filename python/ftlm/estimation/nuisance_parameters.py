@@ -269,7 +269,9 @@ def fit_with_initial_conditions(
     The result states which terms were fitted.
     """
 
-    def fit_initial_terms(initial: Initial, *, refine: bool = True, raced: _core.JointRace | None = None) -> JointFit:
+    def fit_initial_terms(
+        initial: Initial, *, refine: bool = True, raced: _core.JointMultistart | None = None
+    ) -> JointFit:
         asked = replace(structure, initial=initial)
         begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
         return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)

@@ -118,7 +118,7 @@ def _signal_at_samples(
         means = rec.of(name)[::every]
         return np.append(means, means[-1]), held
     if delay:
-        values = _core.delayed(values, delay / run.step, 0.0 if rec.initial == "rest" else float(values[0]))
+        values = _core.delay_samples(values, delay / run.step, 0.0 if rec.initial == "rest" else float(values[0]))
     return np.ascontiguousarray(values[::decimation]), held
 
 
@@ -165,7 +165,7 @@ def minimize_cost(
     projected out and continue from the last values.
     """
     states = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
-    outcome = problem.core.descend(
+    outcome = problem.core.minimize(
         experiments,
         (attempt.values.tolist(), states),
         plain,
@@ -349,7 +349,7 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
 
 def long_run_covariance(jacobian: Floats, series: Sequence[Floats]) -> Floats:
     """Return the long-run covariance of scores with Bartlett weights (doi:10.2307/1913610)."""
-    return _core.long_run(jacobian, series)
+    return _core.long_run_covariance(jacobian, series)
 
 
 def propagated_errors(slopes: Floats, spread: Floats) -> Floats:

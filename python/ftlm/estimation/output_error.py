@@ -278,7 +278,7 @@ class Initialization:
         outputs = zip(structure.outputs, self.deviations, strict=True)
         return [first_noise(self.runs, structure, output, size) for output, size in outputs]
 
-    def run_multistart(self, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
+    def run_multistart(self, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointMultistart:
         """Run the multistart of this problem. Later fits of the same structure to the same runs may reuse it."""
         shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.deviations, strict=True)]
         floor = float(np.mean([share**2 for share in shares]))
@@ -286,7 +286,7 @@ class Initialization:
         if self.problem.structure.has_friction:
             return run_friction_multistart(Objective(self.problem, self.runs, weights), floor, threads, progress)
         runs = RunSampler(self.problem, self.runs).core_arguments(progress)
-        return _core.joint_race(self.problem.core, runs, weights, floor, (threads, memory_limit()), stop_flag())
+        return _core.joint_multistart(self.problem.core, runs, weights, floor, (threads, memory_limit()), stop_flag())
 
 
 def output_deviations(runs: Sequence[Run], structure: Structure) -> list[float]:
@@ -305,7 +305,7 @@ def fit_output_error(
     loss: Loss = "squares",
     known: Sequence[Mapping[str, float]] = (),
     near: JointFit | None = None,
-    raced: _core.JointRace | None = None,
+    raced: _core.JointMultistart | None = None,
 ) -> JointFit:
     """Fit all equations of a structure to all runs by output error, with automatic initialization.
 

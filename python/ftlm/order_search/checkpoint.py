@@ -532,7 +532,7 @@ def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
             else:
                 if frame.search >= len(contents.sections):
                     raise ModelError(f"there is no search {frame.search}")
-                contents.sections[frame.search].take(frame)
+                contents.sections[frame.search].add_frame(frame)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
             raise DataError(
                 f"{path} holds something else at byte {offset}: {error}; start the search again in another file"

@@ -458,7 +458,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
 
     def batches(self) -> Iterator[tuple[int, int]]:
         """Yield batches of the candidates required next, numbered through all batches."""
-        while spans := self.search.wanted():
+        while spans := self.search.pending_spans():
             end = self._first + sum(last - first for _, first, last, _ in spans)
             self._spans, self._wave = spans, []
             self.total, _ = self.search.state()

@@ -264,7 +264,7 @@ class QuanserBoard:
             volts = guard.command(command)
             # A sample that is not finite is a fault and is not recorded.
             if all(map(math.isfinite, values)):
-                self._rows.append([*guard.written, *values, late])
+                self._rows.append([*guard.last_currents, *values, late])
             self._reload_and_write(guard, (volts[0], volts[1]))
             if guard.fault is not None:
                 return

@@ -410,7 +410,7 @@ class Experiment:
             partial, source, self.progress, live, columns, _BLOCK_ROWS_REAL_TIME if paced else _BLOCK_ROWS_FAST
         )
         ended, faults = _run_commands(link, recorder)
-        about |= {"missed_deadlines": link.guard.missed, "faults": faults}
+        about |= {"missed_deadlines": link.guard.missed_deadlines, "faults": faults}
         if live is not None:
             about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.live_error}
         try:

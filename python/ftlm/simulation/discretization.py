@@ -349,7 +349,7 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
         # On a finer grid the delayed command switches within an interval, so it is held on that grid before the delay.
         every = m // intervals if held and m % intervals == 0 else 1
         samples = np.repeat(samples, every)[: intervals * every + 1]
-        samples = _core.delayed(samples, delay / run.step * every, 0.0 if at_rest else float(samples[0]))
+        samples = _core.delay_samples(samples, delay / run.step * every, 0.0 if at_rest else float(samples[0]))
     return _core.pulse_means(samples, m, held)
 
 
@@ -531,7 +531,7 @@ class SampleTimes:
         jumps = self.jumps(name)
         if jumps is None:
             return None
-        return _core.corners(self.record.m, self.pulse_positions, jumps, order, self.record.step)
+        return _core.kink_correction(self.record.m, self.pulse_positions, jumps, order, self.record.step)
 
     def _delay(self, name: str) -> float:
         return self.structure.delay.get(name, 0.0)

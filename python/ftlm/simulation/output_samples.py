@@ -491,7 +491,7 @@ def _first_pulse_gain(eta: float, step: float) -> float:
 
 def _interpolate_smooth(rest: Floats, at: SampleTimes) -> Floats:
     """Interpolate smooth signals at the sample times; not finite from an overflow on."""
-    return _core.read_at(np.ascontiguousarray(rest), at.pulse_positions)
+    return _core.interpolate_samples(np.ascontiguousarray(rest), at.pulse_positions)
 
 
 def _kink_correction(model: Model, run: Run | None, at: SampleTimes, terms: Terms) -> Floats:
@@ -505,7 +505,7 @@ def _kink_correction(model: Model, run: Run | None, at: SampleTimes, terms: Term
         for power, value in terms[item.output].items():
             if value and power != round(power):
                 jump = (np.zeros(1), np.array([value * math.gamma(power + 1.0)]))
-                out[i] += _core.corners(at.record.m, at.pulse_positions, jump, power, at.record.step)
+                out[i] += _core.kink_correction(at.record.m, at.pulse_positions, jump, power, at.record.step)
         own = [t for t in item.terms if t.signal == item.output]
         for term in item.terms if run is not None else ():
             if term.signal == item.output or (coupled and term.signal in names):
@@ -545,7 +545,7 @@ def _values_at_samples(
     """Values of a signal just after the sample times."""
     if at is not None:
         values = at.values(name)
-        return _core.read_at(rec.of(name)[None], at.pulse_positions)[0] if values is None else values
+        return _core.interpolate_samples(rec.of(name)[None], at.pulse_positions)[0] if values is None else values
     delay = structure.delay.get(name, 0.0)
     filtered = rec.sensor is not None and not structure.is_filtered(name)
     if not delay and not filtered:

@@ -122,7 +122,7 @@ class BaseModel:
             for t in item.terms
             if t.signal == item.output
         ]
-        return not _core.grows(item.order.constant, own)
+        return not _core.has_unstable_pole(item.order.constant, own)
 
 
 @dataclass

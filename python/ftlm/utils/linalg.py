@@ -37,7 +37,7 @@ def triangular_factor(tall: Floats) -> Floats:
 
     Orthogonal transformations preserve the inner products of the columns, and with them all least-squares problems.
     """
-    return _core.triangle(np.ascontiguousarray(tall.T))
+    return _core.triangular_factor(np.ascontiguousarray(tall.T))
 
 
 def blockwise_triangular_factor(columns: Sequence[Floats]) -> Floats:
@@ -45,13 +45,13 @@ def blockwise_triangular_factor(columns: Sequence[Floats]) -> Floats:
     whole = np.zeros((0, len(columns)))
     for first in range(0, len(columns[0]), BLOCK_ROWS):
         part = np.stack([column[first : first + BLOCK_ROWS] for column in columns])
-        whole = _core.triangle(np.hstack([whole.T, part]))
+        whole = _core.triangular_factor(np.hstack([whole.T, part]))
     return whole
 
 
 def thin_svd(tall: Floats) -> tuple[Floats, Floats, Floats]:
     """Thin singular value decomposition: the matrix is left * sizes @ right."""
-    left, sizes, right = _core.singular(np.ascontiguousarray(tall.T))
+    left, sizes, right = _core.singular_values(np.ascontiguousarray(tall.T))
     return left.reshape(sizes.size, len(tall)).T, sizes, right.reshape(sizes.size, tall.shape[1])
 
 

@@ -140,12 +140,12 @@ def autoregression(series: Sequence[Floats], most: int) -> Floats:
 
 def fit_whitening_filter(series: Sequence[Floats], most: int) -> tuple[Floats, float]:
     """Return the whitening filter of :func:`autoregression` and the variance of the whitened series."""
-    return _core.coloured(series, most)
+    return _core.whitening_filter(series, most)
 
 
 def colored_noise_covariances(through: Floats, power: float, count: int) -> Floats:
     """Autocovariances at lags 0 to ``count`` - 1 of noise that a filter turns into white noise of this power."""
-    return _core.colour_covariances(through, power, count)
+    return _core.filter_autocovariances(through, power, count)
 
 
 def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:
