@@ -234,16 +234,16 @@ class Sound:
         series = (self.sensor(m, step), [True]) if filtered else None
         instants = [(None, False), (self.samples(count), True)] if self.random.random() < 0.2 else []
         jumps = (self.places(m)[:3], self.samples(3))
-        return (
-            (step, self.normal((2, m)), None),
-            every,
-            self.normal((1, count)),
-            series,
-            [1.0],
-            instants,
-            shares,
-            (places, [None, self.one(None, jumps)]) if own else None,
-        )
+        return {
+            "record": (step, self.normal((2, m)), None),
+            "pulses_per_sample": every,
+            "samples": self.normal((1, count)),
+            "filter": series,
+            "weights": [1.0],
+            "signals": instants,
+            "robust_weights": shares,
+            "sample_times": (places, [None, self.one(None, jumps)]) if own else None,
+        }
 
     def free_inputs(self, *laws):
         """What is free of the second signal."""
@@ -301,14 +301,25 @@ class Sound:
         drawn = [(self.normal(rows), self.normal(rows)) for _ in range(self.one(1, 2))]
 
         class Runs:
-            def sampled(self, every, decimation, first):
+            def sample(self, every, decimation, first):
                 kept = (min(first or rows - 1, rows - 1)) // decimation
                 made = []
                 for run in drawn:
                     signals = [np.ascontiguousarray(s[: kept * decimation + 1]) for s in run]
                     means = np.stack([_core.pulse_means(s, kept * every, True) for s in signals])
                     samples = signals[0][::decimation][None].copy()
-                    made.append(((step * decimation / every, means, None), every, samples, None, [1.0], [], None, None))
+                    made.append(
+                        {
+                            "record": (step * decimation / every, means, None),
+                            "pulses_per_sample": every,
+                            "samples": samples,
+                            "filter": None,
+                            "weights": [1.0],
+                            "signals": [],
+                            "robust_weights": None,
+                            "sample_times": None,
+                        }
+                    )
                 return made
 
             def records(self, m, inputs):
@@ -550,18 +561,18 @@ class Sound:
 
     def settings(self):
         instruments = 3 if self.random.random() < 0.2 else 0
-        return (
-            self.one("output-error", "equation-error"),
-            self.one("l1", "l2"),
-            self.one(0, 3),
-            1e4,
-            self.one(True, False),
-            self.one(1, 5, 20),
-            self.one(1, 2),
-            self.one(True, False),
-            instruments,
-            1 << 31,
-        )
+        return {
+            "criterion": self.one("output-error", "equation-error"),
+            "norm": self.one("l1", "l2"),
+            "innovation_length": self.one(0, 3),
+            "prior_covariance": 1e4,
+            "haar_rows": self.one(True, False),
+            "top": self.one(1, 5, 20),
+            "threads": self.one(1, 2),
+            "pruning": self.one(True, False),
+            "iterations": instruments,
+            "memory": 1 << 31,
+        }
 
     def progress(self):
         return self.one(None, lambda *_: None)
@@ -583,8 +594,19 @@ class Sound:
         low = self.number(0.6, 1.2)
         alpha = low, self.one(low, low + 0.3)
         terms = [(0, 0.0, self.number(0.0, low)), (2, 0.0, self.one(0.0, 0.4))]
-        asked = self.number(0.01, 0.9), self.one(5.0, 100.0), self.one(64, 500, 3000), self.one(1, 2), 1 << 28
-        return [self.record(sensor=False)], (0, alpha, terms, self.one(0.05, 0.2)), asked, self.progress()
+        named = {
+            "output": 0,
+            "alpha": alpha,
+            "terms": terms,
+            "min_separation": self.one(0.05, 0.2),
+            "tolerance": self.number(0.01, 0.9),
+            "max_term_ratio": self.one(5.0, 100.0),
+            "max_cells": self.one(64, 500, 3000),
+            "threads": self.one(1, 2),
+            "memory": 1 << 28,
+            "progress": self.progress(),
+        }
+        return [self.record(sensor=False)], named
 
     def force_portable(self):
         return (self.one(True, False),)
@@ -748,7 +770,7 @@ def of_arm():
 
 
 #: Entries whose last arguments are given by name.
-NAMED = {"block_pulse_kernel", "operational_matrix", "series_multiply", "series_divide"}
+NAMED = {"block_pulse_kernel", "certify", "operational_matrix", "series_multiply", "series_divide"}
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Hostile values
