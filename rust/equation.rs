@@ -474,7 +474,7 @@ fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading 
 ///
 /// ```
 /// use ftlm::equation::{Equation, Structure, Term};
-/// D x = c D^1.5 y, D^1.5 y = D x + u: singular for c = 1.
+/// // D x = c D^1.5 y, D^1.5 y = D x + u: singular for c = 1.
 /// let pair = |c: f64| {
 ///     let of = |output, order, terms, c| Equation::new(Structure { output, order, terms }, c);
 ///     let first = of(0, 1.0, vec![Term { signal: 1, order: 1.5 }], vec![c])?;

@@ -362,7 +362,8 @@ laws = [(0, law(1., 0., 0.), [(0, law(0., 1., 0.)), (2, law(0., 0., 1.))]),
         (1, law(0., 1., 1.), [(1, law(0., .5, .1)), (2, law(0., .3, .1))])]
 call = lambda: _core.search_stage([(0.01, rng.standard_normal((3, 2000)), None)], [ax(1.05, 2), ax(.1, 1), ax(.1, 1)],
     laws, [False, False, True], [[None] * 2] * 2, [1., 1.], (True, []),
-    ("output-error", "l1", 0, 1e6, False, 20, 2, True, 0, 1 << 31), None)
+    {"criterion": "output-error", "norm": "l1", "innovation_length": 0, "prior_covariance": 1e6, "haar_rows": False,
+     "top": 20, "threads": 2, "pruning": True, "iterations": 0, "memory": 1 << 31}, None)
 """,
     "integral of 2^23 samples": """
 x = rng.standard_normal(1 << 23)

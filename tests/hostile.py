@@ -27,7 +27,7 @@ SOUND, TWICE = 0.1, 0.3
 LARGE = 1 << 34
 ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
 #: Where a fit is told how often it may evaluate its cost, which it does; an attack asks it to so often at most.
-EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10, "JointProblem.descend": 4}, 2000
+EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10, "JointProblem.minimize": 4}, 2000
 
 
 class OursError(Exception):
@@ -116,10 +116,10 @@ class Sound:
     def operational_matrix(self):
         return *self.block_pulse_matrix(), {"dense": self.one(True, False)}
 
-    def triangle(self):
+    def triangular_factor(self):
         return (self.normal((self.one(1, 2, 4), self.m())),)
 
-    singular = triangle
+    singular_values = triangular_factor
 
     def series_multiply(self):
         m = self.m()
@@ -150,7 +150,7 @@ class Sound:
     def point_samples(self):
         return (self.samples(),)
 
-    def delayed(self):
+    def delay_samples(self):
         return self.samples(), self.number(0, 5), self.number(-1, 1)
 
     def filter_series(self):
@@ -234,16 +234,16 @@ class Sound:
         series = (self.sensor(m, step), [True]) if filtered else None
         instants = [(None, False), (self.samples(count), True)] if self.random.random() < 0.2 else []
         jumps = (self.places(m)[:3], self.samples(3))
-        return (
-            (step, self.normal((2, m)), None),
-            every,
-            self.normal((1, count)),
-            series,
-            [1.0],
-            instants,
-            shares,
-            (places, [None, self.one(None, jumps)]) if own else None,
-        )
+        return {
+            "record": (step, self.normal((2, m)), None),
+            "pulses_per_sample": every,
+            "samples": self.normal((1, count)),
+            "filter": series,
+            "weights": [1.0],
+            "signals": instants,
+            "robust_weights": shares,
+            "sample_times": (places, [None, self.one(None, jumps)]) if own else None,
+        }
 
     def free_inputs(self, *laws):
         """What is free of the second signal."""
@@ -301,14 +301,25 @@ class Sound:
         drawn = [(self.normal(rows), self.normal(rows)) for _ in range(self.one(1, 2))]
 
         class Runs:
-            def sampled(self, every, decimation, first):
+            def sample(self, every, decimation, first):
                 kept = (min(first or rows - 1, rows - 1)) // decimation
                 made = []
                 for run in drawn:
                     signals = [np.ascontiguousarray(s[: kept * decimation + 1]) for s in run]
                     means = np.stack([_core.pulse_means(s, kept * every, True) for s in signals])
                     samples = signals[0][::decimation][None].copy()
-                    made.append(((step * decimation / every, means, None), every, samples, None, [1.0], [], None, None))
+                    made.append(
+                        {
+                            "record": (step * decimation / every, means, None),
+                            "pulses_per_sample": every,
+                            "samples": samples,
+                            "filter": None,
+                            "weights": [1.0],
+                            "signals": [],
+                            "robust_weights": None,
+                            "sample_times": None,
+                        }
+                    )
                 return made
 
             def records(self, m, inputs):
@@ -344,7 +355,7 @@ class Sound:
         problem, _, values = self.sampled()
         return problem, (np.array(values), np.array(values) * self.one(1.0, 1.4))
 
-    def joint_problem_descend(self):
+    def joint_problem_minimize(self):
         problem, (runs, *_), values = self.sampled()
         held = self.one((), (0,), (1, 2))
         return problem, (
@@ -358,11 +369,11 @@ class Sound:
             self.one(None, _core.Stop()),
         )
 
-    def joint_race(self):
+    def joint_multistart(self):
         problem, runs, _ = self.sampled()
         return problem, runs, [1.0], 1.0, (self.one(1, 2), 1 << 30), self.one(None, _core.Stop())
 
-    def joint_grids(self):
+    def refine_candidates(self):
         problem, runs, values = self.sampled()
         return problem, runs, [1.0], self.one(1, 2), [(values, "here")], self.one(1, 2), self.one(None, _core.Stop())
 
@@ -384,13 +395,13 @@ class Sound:
             self.one(None, _core.Stop()),
         )
 
-    def joint_race_values(self):
+    def joint_multistart_values(self):
         problem, runs, values = self.sampled()
         return _core.refine_candidates(problem, runs, [1.0], 1, [(values, "here")], 1), ()
 
-    joint_race_len = joint_race_origins = joint_race_values
+    joint_multistart_len = joint_multistart_origins = joint_multistart_values
 
-    def joint_problem_clock(self):
+    def joint_problem_time_scaling(self):
         problem, (_, spans, *_), _ = self.sampled()
         return problem, (spans,)
 
@@ -399,20 +410,20 @@ class Sound:
         problem, (_, spans, *_), values = self.sampled()
         return problem.time_scaling(spans), np.array(values)
 
-    def joint_clock_unit(self):
+    def joint_time_scaling_unit(self):
         return self.clocked()[0], ()
 
-    def joint_clock_told(self):
+    def joint_time_scaling_to_scaled(self):
         clock, values = self.clocked()
         return clock, (values,)
 
-    joint_clock_untold = joint_clock_told
+    joint_time_scaling_from_scaled = joint_time_scaling_to_scaled
 
-    def joint_clock_step(self):
+    def joint_time_scaling_step(self):
         clock, values = self.clocked()
         return clock, (values, 0.1 * values)
 
-    def joint_clock_errors(self):
+    def joint_time_scaling_errors(self):
         clock, values = self.clocked()
         return clock, (values, np.diag(values**2))
 
@@ -423,15 +434,15 @@ class Sound:
         jacobian, series, _ = self.covariance_of()
         return jacobian, series, self.one(None, np.ones(40))
 
-    def long_run(self):
+    def long_run_covariance(self):
         return self.covariance_of()[:2]
 
-    def coloured(self):
+    def whitening_filter(self):
         return [self.normal(50), self.normal(40)], self.one(0, 3, 10)
 
-    autocovariances = coloured
+    autocovariances = whitening_filter
 
-    def colour_covariances(self):
+    def filter_autocovariances(self):
         return np.array([1.0, self.number(-0.9, 0.9)]), self.number(0.1, 2.0), self.one(1, 8, 100)
 
     def is_white(self):
@@ -467,7 +478,7 @@ class Sound:
         kept = [c for (s, _), c in zip(terms, coefficients, strict=True) if s != 1]
         return self.record(sensor=False), [(equation, kept)], [(0, law)], [[(0.0, 0.1), (1.0, -0.2)]]
 
-    def grows(self):
+    def has_unstable_pole(self):
         return self.one(1.0, 1.6, 2.0), [(self.number(-3, -0.1), 0.0), (self.number(-1, 0.1), 0.5)]
 
     def streaming_new(self):
@@ -518,7 +529,7 @@ class Sound:
         return record, structure, list(self.INPUTS), trace
 
     def nyquist_margin(self):
-        return self.grows()[1], self.step()
+        return self.has_unstable_pole()[1], self.step()
 
     def correlation(self):
         lengths = [self.one(16, 40) for _ in range(self.one(1, 2))]
@@ -527,11 +538,11 @@ class Sound:
     def places(self, m):
         return np.sort(np.array([self.random.uniform(0.5, m - 0.5) for _ in range(9)]))
 
-    def read_at(self):
+    def interpolate_samples(self):
         m = self.m()
         return self.normal((self.one(1, 2), m)), self.places(m)
 
-    def corners(self):
+    def kink_correction(self):
         m = self.m()
         return m, self.places(m), (self.places(m), self.samples(9)), self.order(), self.step()
 
@@ -550,23 +561,23 @@ class Sound:
 
     def settings(self):
         instruments = 3 if self.random.random() < 0.2 else 0
-        return (
-            self.one("output-error", "equation-error"),
-            self.one("l1", "l2"),
-            self.one(0, 3),
-            1e4,
-            self.one(True, False),
-            self.one(1, 5, 20),
-            self.one(1, 2),
-            self.one(True, False),
-            instruments,
-            1 << 31,
-        )
+        return {
+            "criterion": self.one("output-error", "equation-error"),
+            "norm": self.one("l1", "l2"),
+            "innovation_length": self.one(0, 3),
+            "prior_covariance": 1e4,
+            "haar_rows": self.one(True, False),
+            "top": self.one(1, 5, 20),
+            "threads": self.one(1, 2),
+            "pruning": self.one(True, False),
+            "iterations": instruments,
+            "memory": 1 << 31,
+        }
 
     def progress(self):
         return self.one(None, lambda *_: None)
 
-    def lattice_size(self):
+    def order_grid_size(self):
         return self.orders(), list(self.INPUTS)
 
     def asked(self):
@@ -583,10 +594,21 @@ class Sound:
         low = self.number(0.6, 1.2)
         alpha = low, self.one(low, low + 0.3)
         terms = [(0, 0.0, self.number(0.0, low)), (2, 0.0, self.one(0.0, 0.4))]
-        asked = self.number(0.01, 0.9), self.one(5.0, 100.0), self.one(64, 500, 3000), self.one(1, 2), 1 << 28
-        return [self.record(sensor=False)], (0, alpha, terms, self.one(0.05, 0.2)), asked, self.progress()
+        named = {
+            "output": 0,
+            "alpha": alpha,
+            "terms": terms,
+            "min_separation": self.one(0.05, 0.2),
+            "tolerance": self.number(0.01, 0.9),
+            "max_term_ratio": self.one(5.0, 100.0),
+            "max_cells": self.one(64, 500, 3000),
+            "threads": self.one(1, 2),
+            "memory": 1 << 28,
+            "progress": self.progress(),
+        }
+        return [self.record(sensor=False)], named
 
-    def portable(self):
+    def force_portable(self):
         return (self.one(True, False),)
 
     def search_plan(self):
@@ -628,10 +650,10 @@ class Sound:
     def stage_search_new(self):
         return *self.stage(), True
 
-    def stage_search_wanted(self):
+    def stage_search_pending_spans(self):
         return self.one_of("StageSearch"), ()
 
-    stage_search_state = stage_search_wanted
+    stage_search_state = stage_search_pending_spans
 
     def stage_search_follow(self):
         search = self.one_of("StageSearch")
@@ -683,7 +705,7 @@ class Sound:
     def guard_fault(self):
         return self.one_of("Guard"), ()
 
-    guard_written = guard_bias = guard_missed = guard_fault
+    guard_last_currents = guard_bias = guard_missed_deadlines = guard_fault
 
     def virtual_arm_start(self):
         return self.one_of("VirtualArm"), (self.one(True, False),)
@@ -748,7 +770,7 @@ def of_arm():
 
 
 #: Entries whose last arguments are given by name.
-NAMED = {"block_pulse_kernel", "operational_matrix", "series_multiply", "series_divide"}
+NAMED = {"block_pulse_kernel", "certify", "operational_matrix", "series_multiply", "series_divide"}
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Hostile values

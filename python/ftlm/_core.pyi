@@ -96,8 +96,22 @@ _Equation: TypeAlias = tuple[_Structure, Sequence[float]]
 _Initial: TypeAlias = (
     tuple[bool, Sequence[float]] | tuple[bool, Sequence[float], int] | tuple[bool, Sequence[float], int, int]
 )
-#: (criterion, norm, p or 0 for least squares, K0, Haar rows, keep, threads, early stopping)
-_Options: TypeAlias = tuple[str, str, int, float, bool, int, int, bool, int, int]
+
+class _Options(TypedDict):
+    criterion: str
+    norm: str
+    #: 0 for least squares
+    innovation_length: int
+    prior_covariance: float
+    haar_rows: bool
+    top: int
+    threads: int
+    pruning: bool
+    #: of instrumental variables; 0 without them
+    iterations: int
+    #: [bytes]
+    memory: int
+
 #: (output, values of alpha, [(signal, values, interchangeable), ...])
 _Lattice: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[float], bool]]]
 #: (constant, weight of each free order)
@@ -110,18 +124,22 @@ _Monomial: TypeAlias = tuple[float, Sequence[tuple[int, int]]]
 _FreeEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine, _Monomial]]]
 #: (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between)
 _OwnTimes: TypeAlias = tuple[_Floats, Sequence[tuple[_Floats, _Floats] | None]]
-#: (record, pulses a sample interval, samples of each output as rows, filter of simulated outputs, weights of outputs,
-#: (values at the samples, whether it holds) of each signal, shares of the compared samples, times of their own)
-_Experiment: TypeAlias = tuple[
-    _Record,
-    int,
-    _Floats,
-    tuple[_Floats, Sequence[bool]] | None,
-    Sequence[float],
-    Sequence[tuple[_Floats | None, bool]],
-    _Floats | None,
-    _OwnTimes | None,
-]
+
+class _Experiment(TypedDict):
+    record: _Record
+    pulses_per_sample: int
+    #: one row an output
+    samples: _Floats
+    #: series of the filter of the simulated outputs, and which outputs pass it
+    filter: tuple[_Floats, Sequence[bool]] | None
+    #: one an output
+    weights: Sequence[float]
+    #: values of each signal at the samples, and whether they are held
+    signals: Sequence[tuple[_Floats | None, bool]]
+    #: one row an output
+    robust_weights: _Floats | None
+    sample_times: _OwnTimes | None
+
 _Progress: TypeAlias = Callable[[int, int, int], object]
 
 #: (coefficients, initial terms per record, their exponents, dropped (record, position) pairs)
@@ -142,14 +160,29 @@ _Checkpoint: TypeAlias = tuple[tuple[int, int, int, int, float, int], bool, _Par
 #: equation, first candidate, the one behind the last, limit
 _Span: TypeAlias = tuple[int, int, int, float]
 
+class _FoundRow(TypedDict):
+    index: int
+    score: float
+    alpha: float
+    orders: list[float]
+    coefficients: list[float]
+    #: initial terms by record
+    initial: list[list[float]]
+
 class _Found(TypedDict):
-    #: (index, score, alpha, orders, coefficients, initial terms per record)
-    rows: list[tuple[int, float, float, list[float], list[float], list[list[float]]]]
+    rows: list[_FoundRow]
     counts: _Counts
     #: excluded in whole boxes, among those excluded by a bound
     boxed: int
     #: (index, alpha, orders, reason)
     failures: list[tuple[int, float, list[float], Literal["singular", "diverged"]]]
+
+class _InstrumentalFit(TypedDict):
+    estimates: list[_Estimate]
+    covariances: list[list[float]]
+    iterations: int
+    converged: bool
+    damped: bool
 
 class _Certified(TypedDict):
     at_least: float
@@ -252,7 +285,7 @@ def instrumental_variables(
     terms: _Initial,
     iterations: int,
     tolerance: float,
-) -> tuple[list[_Estimate], list[list[float]], int, bool, bool]: ...
+) -> _InstrumentalFit: ...
 def output_error(
     runs: Sequence[_Experiment],
     laws: Sequence[_FreeEquation],
@@ -305,7 +338,7 @@ class _Named(TypedDict):
     hints: _Hints
 
 class _Asked(Protocol):
-    def sampled(self, every: int, decimation: int, first: int | None, /) -> Sequence[_Experiment]: ...
+    def sample(self, every: int, decimation: int, first: int | None, /) -> Sequence[_Experiment]: ...
     def records(self, m: int, inputs: Sequence[float], /) -> Sequence[_Record]: ...
     def read(self, signal: int, /) -> Sequence[_Floats]: ...
 
@@ -482,8 +515,16 @@ def metrics(measured: _Floats, residuals: _Floats) -> tuple[float, float, float,
 
 def certify(
     runs: Sequence[_Record],
-    region: tuple[int, tuple[float, float], Sequence[tuple[int, float, float]], float],
-    asked: tuple[float, float, int, int, int],
+    *,
+    output: int,
+    alpha: tuple[float, float],
+    terms: Sequence[tuple[int, float, float]],
+    min_separation: float,
+    tolerance: float,
+    max_term_ratio: float,
+    max_cells: int,
+    threads: int,
+    memory: int,
     progress: _Progress | None,
 ) -> _Certified: ...
 def order_grid_size(orders: _Lattice, inputs: Sequence[bool]) -> int: ...

@@ -56,7 +56,7 @@ struct RecordSpectra {
 /// let run = Record::new(0.02, vec![y, input], None)?;
 /// let driven = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// let points = [vec![-4.0], vec![-9.0]];
-/// let found = resonances::fit_with_fixed_poles(&[run], &driven, &[None], &Initial::Rest, &[2.0], &points)?;
+/// let found = resonance_scan::fit_with_fixed_poles(&[run], &driven, &[None], &Initial::Rest, &[2.0], &points)?;
 /// let errors: Vec<f64> = found.iter().flatten().map(|one| one.error).collect();
 /// assert!(errors.len() == 2 && errors[0] > 0.1 && errors[1] < 1e-9);
 /// # Ok(())

@@ -209,7 +209,7 @@ pub fn check_power_of_two(m: usize) -> Result<()> {
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
 /// let mut f = [1.0, 1.0, 1.0, 1.0];
-/// ftlm::fractional::operational_matrices::transform(&mut f)?;
+/// ftlm::fractional::operational_matrices::haar_transform(&mut f)?;
 /// assert!((f[0] - 2.0).abs() < 1e-15 && f[1..] == [0.0; 3]);
 /// # Ok(())
 /// # }

@@ -156,8 +156,7 @@ impl Body {
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
-    /// use ftlm::friction::Body;
-    /// use ftlm::friction::Law;
+    /// use ftlm::friction::{Body, FrictionLaw};
     /// use ftlm::regressors::Record;
     /// # fn main() -> ftlm::error::Result<()> {
     /// // A block slides at 1 m/s with friction of 2 m/s²: it stops after half a second and 0.25 m.

@@ -113,8 +113,15 @@ pub fn multi_innovation<'py>(
     Ok((tuple(estimate), None))
 }
 
-/// Tuple of refined instrumental variables: (estimates, covariances, iterations, converged, instruments damped).
-type InstrumentTuple = (Vec<EstimateTuple>, Vec<Vec<f64>>, usize, bool, bool);
+/// Result of refined instrumental variables.
+#[derive(IntoPyObject)]
+pub struct InstrumentalFit {
+    estimates: Vec<EstimateTuple>,
+    covariances: Vec<Vec<f64>>,
+    iterations: usize,
+    converged: bool,
+    damped: bool,
+}
 
 #[pyfunction]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
@@ -127,7 +134,7 @@ pub fn instrumental_variables(
     terms: InitialArg,
     iterations: usize,
     tolerance: f64,
-) -> PyResult<InstrumentTuple> {
+) -> PyResult<InstrumentalFit> {
     let measured = records(&runs)?;
     let structures =
         equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
@@ -147,7 +154,8 @@ pub fn instrumental_variables(
         estimates.push((e.coefficients, e.initial, e.exponents, Vec::new()));
         covariances.push(e.covariance);
     }
-    Ok((estimates, covariances, fit.iterations, fit.converged, fit.damped))
+    let (iterations, converged, damped) = (fit.iterations, fit.converged, fit.damped);
+    Ok(InstrumentalFit { estimates, covariances, iterations, converged, damped })
 }
 
 /// Affine order: (constant, weight of each free order).
@@ -159,19 +167,21 @@ pub type FreeEquationArg = (usize, AffineArg, List<(usize, AffineArg, MonomialAr
 /// Nonuniform samples: (sample positions in pulses, positions and sizes of the jumps of each held signal).
 pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
-/// Experiment: (record, pulses per sampling interval, samples of each output, filter of simulated outputs, weight of
-/// each output, (values at the samples, whether held) of each signal, robust weights of the samples of each output,
-/// nonuniform sample times).
-pub type ExperimentArg<'py> = (
-    RecordArg<'py>,
-    usize,
-    PyReadonlyArray2<'py, f64>,
-    Option<(PyReadonlyArray1<'py, f64>, List<bool>)>,
-    List<f64>,
-    List<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
-    Option<PyReadonlyArray2<'py, f64>>,
-    Option<OwnTimesArg<'py>>,
-);
+/// Experiment from a dictionary with these keys: record, pulses per sampling interval, samples of each output, filter
+/// of the simulated outputs, weight of each output, (values at the samples, whether held) of each signal, robust weights
+/// of the samples of each output, nonuniform sample times.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct ExperimentArg<'py> {
+    record: RecordArg<'py>,
+    pulses_per_sample: usize,
+    samples: PyReadonlyArray2<'py, f64>,
+    filter: Option<(PyReadonlyArray1<'py, f64>, List<bool>)>,
+    weights: List<f64>,
+    signals: List<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
+    robust_weights: Option<PyReadonlyArray2<'py, f64>>,
+    sample_times: Option<OwnTimesArg<'py>>,
+}
 
 fn affine((constant, weights): AffineArg) -> AffineOrder {
     AffineOrder { constant, weights: weights.into() }
@@ -193,9 +203,9 @@ pub fn jumps_near(
 }
 
 pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
-    let (record, samples, weights) = (record(&argument.0)?, rows(&argument.2)?, argument.4.to_vec());
-    let experiment = match &argument.7 {
-        None => joint::Experiment::new(record, argument.1, samples, weights)?,
+    let (record, samples, weights) = (record(&argument.record)?, rows(&argument.samples)?, argument.weights.to_vec());
+    let experiment = match &argument.sample_times {
+        None => joint::Experiment::new(record, argument.pulses_per_sample, samples, weights)?,
         Some((places, jumps)) => {
             let readings = SampleInterpolation::new(vector("times of readings", places)?, record.m())?;
             let jumps = (jumps.iter())
@@ -212,18 +222,18 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
             )?
         }
     };
-    let experiment = match &argument.6 {
+    let experiment = match &argument.robust_weights {
         None => experiment,
         Some(shares) => experiment.with_sample_weights(rows(shares)?)?,
     };
-    let instants = (argument.5.iter())
+    let instants = (argument.signals.iter())
         .map(|(values, held)| {
             let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;
             Ok(joint::PointValues { values, is_zero_order_hold: *held })
         })
         .collect::<PyResult<Vec<_>>>()?;
     let experiment = experiment.with_point_values(instants)?;
-    Ok(match &argument.3 {
+    Ok(match &argument.filter {
         None => experiment,
         Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.to_vec())?,
     })

@@ -375,10 +375,19 @@ def two_records() -> tuple[list[tuple], tuple]:
     """Two driven records of noise, on grids of their own, and the law of a body, as the core takes them."""
     rng = np.random.default_rng(1)
 
-    def experiment(m: int, every: int) -> tuple:
+    def experiment(m: int, every: int) -> dict:
         u = 2 * np.sin(0.012 * np.arange(m)) + 0.3 * rng.normal(size=m) + 0.2
         samples = rng.normal(size=(1, m // every + 1))
-        return ((0.004, np.stack([0 * u, u]), None), every, samples, None, [1.3], [(None, False)] * 2, None, None)
+        return {
+            "record": (0.004, np.stack([0 * u, u]), None),
+            "pulses_per_sample": every,
+            "samples": samples,
+            "filter": None,
+            "weights": [1.3],
+            "signals": [(None, False)] * 2,
+            "robust_weights": None,
+            "sample_times": None,
+        }
 
     law = (0, (0.0, [1.0, 0.0]), [(0, (0.0, [0.0, 1.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0, 0.0]), (1.0, [(1, 1)]))])
     return [experiment(400, 1), experiment(600, 2)], law

@@ -67,7 +67,7 @@ def test_the_map_names_every_folder():
 
 #: Calls that need no wrapper, and why.
 ATTACHED = {
-    "portable": "sets one flag, for tests",
+    "force_portable": "sets one flag, for tests",
 }
 
 
@@ -77,7 +77,7 @@ def test_every_entry_of_the_extension_computes_detached_and_caught():
     reached = {name.split("::")[1] for name in bodies}
     public = {name for name in dir(_core) if not name.startswith("__") and callable(getattr(_core, name))}
     assert public == {name for name in reached if "." not in name} | {n.split(".")[0] for n in reached if "." in n}
-    bare = crate_structure.unwrapped(ROOT / "rust" / "python", ["detached", "attached"])
+    bare = crate_structure.unwrapped(ROOT / "rust" / "python", ["run_detached", "run_attached"])
     assert [name for name in bare if name.split("::")[1] not in ATTACHED] == []
 
 

@@ -183,7 +183,16 @@ def test_derivatives_are_those_of_finite_differences(orders, passes) -> None:
         low_pass = None
         if passes is not None:
             low_pass = (_core.filter_series([(150.0, 0.0)], [(1.0, 2.0), (22.0, 1.0), (150.0, 0.0)], m, 0.004), passes)
-        return (record, every, samples, low_pass, [1.3, 5.0], [(None, False)] * 3, None, None)
+        return {
+            "record": record,
+            "pulses_per_sample": every,
+            "samples": samples,
+            "filter": low_pass,
+            "weights": [1.3, 5.0],
+            "signals": [(None, False)] * 3,
+            "robust_weights": None,
+            "sample_times": None,
+        }
 
     runs = [experiment(400, 1), experiment(600, 2)]
 

@@ -768,7 +768,7 @@ def test_settings_state_what_matters_and_nothing_else():
     plain = replace(made, coefficients="least-squares")
     assert not plain.needs_haar
     assert plain.to_dict() == {"criterion": "output-error", "norm": "l1", "coefficients": "least-squares"}
-    assert plain.core_arguments(1)[2] == 0
+    assert plain.core_arguments(1)["innovation_length"] == 0
 
 
 def test_power_means_of_the_oracle_are_those_of_a_power():

@@ -15,7 +15,18 @@ def step_response(m: int) -> list:
     """y' = -y + u sampled, as the core compares it."""
     u = np.ones(m)
     y = 1.0 - np.exp(-0.01 * np.arange(m + 1))
-    return [((0.01, np.stack([np.zeros(m), u]), None), 1, y[None], None, [1.0], [], None, None)]
+    return [
+        {
+            "record": (0.01, np.stack([np.zeros(m), u]), None),
+            "pulses_per_sample": 1,
+            "samples": y[None],
+            "filter": None,
+            "weights": [1.0],
+            "signals": [],
+            "robust_weights": None,
+            "sample_times": None,
+        }
+    ]
 
 
 LAW = (0, (1.0, []), [(0, (0.0, []), (1.0, [(0, 1)])), (1, (0.0, []), (1.0, [(1, 1)]))])
@@ -44,7 +55,18 @@ def test_a_flag_that_is_set_ends_a_fit_and_one_that_is_not_changes_nothing(m: in
 
 def test_friction_is_ended_as_well() -> None:
     m = 200
-    runs = [((0.01, np.stack([np.zeros(m), np.ones(m)]), None), 1, np.zeros((1, m + 1)), None, [1.0], [], None, None)]
+    runs = [
+        {
+            "record": (0.01, np.stack([np.zeros(m), np.ones(m)]), None),
+            "pulses_per_sample": 1,
+            "samples": np.zeros((1, m + 1)),
+            "filter": None,
+            "weights": [1.0],
+            "signals": [],
+            "robust_weights": None,
+            "sample_times": None,
+        }
+    ]
     law = (0, (2.0, []), [(1, (0.0, []), (1.0, [(0, 1)]))])
     strength = [(1.0, [(1, 1)]), (0.0, []), (1.0, [])]
 

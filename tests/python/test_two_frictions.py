@@ -199,7 +199,16 @@ def test_derivatives_are_those_of_finite_differences(leans) -> None:
         u = 30 * np.sin(0.012 * np.arange(m)) + 3.0 * rng.normal(size=m)
         samples = rng.normal(size=(2, m // every + 1))
         record = (0.004, np.stack([0 * u, 0 * u, u]), None)
-        return (record, every, samples, None, [1.3, 5.0], [(None, False)] * 3, None, None)
+        return {
+            "record": record,
+            "pulses_per_sample": every,
+            "samples": samples,
+            "filter": None,
+            "weights": [1.3, 5.0],
+            "signals": [(None, False)] * 3,
+            "robust_weights": None,
+            "sample_times": None,
+        }
 
     runs = [experiment(250, 1), experiment(300, 2)]
 

@@ -43,8 +43,15 @@ fn every_entry_goes_through_a_wrapper() {
     for file in ["estimation.rs", "operators.rs", "simulation.rs", "virtual_arm.rs"].into_iter().chain(searches) {
         let text = std::fs::read_to_string(folder.join(file)).unwrap();
         // One entry sets a flag, for tests, and computes nothing.
-        for (name, body) in entries(&text).into_iter().filter(|(name, _)| name != "portable") {
-            let ways = ["detached(py", "attached(", "transformed(py", "watched(py", "saved(py", "leavable(py"];
+        for (name, body) in entries(&text).into_iter().filter(|(name, _)| name != "force_portable") {
+            let ways = [
+                "run_detached(py",
+                "run_attached(",
+                "map_rows(py",
+                "run_watched(py",
+                "run_checkpointed(py",
+                "run_interruptible(py",
+            ];
             assert!(ways.iter().any(|way| body.contains(way)), "{file}: {name} computes outside the wrappers");
             count += 1;
         }

@@ -91,7 +91,7 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
     groups = [structure.equations] if structure.coupling == "simulated" else [(e,) for e in structure.equations]
     for group in groups:
         outputs = ", ".join(e.output for e in group)
-        estimates, covariances, iterations, converged, damped = _core.instrumental_variables(
+        found = _core.instrumental_variables(
             [r.core() for r in records],
             [structure_tuple(e, records[0].signals) for e in group],
             inputs,
@@ -100,15 +100,15 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             MAX_IV_ITERATIONS,
             IV_RELATIVE_TOLERANCE,
         )
-        if not converged:
+        if not found["converged"]:
             fit.warnings.append(
-                f"{outputs}: instrumental variables did not stand still in {iterations} steps; the coefficients are "
-                "those of the least output error met. Too much noise for these terms: use "
+                f"{outputs}: instrumental variables did not stand still in {found['iterations']} steps; the "
+                "coefficients are those of the least output error met. Too much noise for these terms: use "
                 f"{parameter('method', 'output-error')}"
             )
-        if damped:
+        if found["damped"]:
             fit.warnings.append(f"{outputs}: the free run of these coefficients is unstable; do not trust them")
-        for item, (raw, _, _, _), covariance in zip(group, estimates, covariances, strict=True):
+        for item, (raw, _, _, _), covariance in zip(group, found["estimates"], found["covariances"], strict=True):
             fit.values.update(named_coefficients(item, raw))
             free = [t for t in item.terms if t.fixed is None]
             spread = np.sqrt(np.diag(np.reshape(covariance, (len(free), len(free)))))

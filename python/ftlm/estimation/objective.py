@@ -39,7 +39,7 @@ def sample_run(
     every: int = 1,
     decimation: int = 1,
     shares: Floats | None = None,
-) -> tuple[Any, ...]:
+) -> _core._Experiment:
     """Convert a run for the core, with `every` pulses a sample interval and each `decimation`-th sample.
 
     `shares` are the robust weights of the compared samples, one row an output. Missing samples have weight 0.
@@ -63,12 +63,21 @@ def sample_run(
     filtered = _output_filter(structure, rec)
     instants = [_signal_at_samples(run, structure, rec, name, every, decimation) for name in structure.signals]
     measured, counted = _weighted_samples(np.stack(samples), slice(1, -1), shares)
-    return rec.core_with_transients(), every, measured, filtered, list(weights), instants, counted, None
+    return {
+        "record": rec.core_with_transients(),
+        "pulses_per_sample": every,
+        "samples": measured,
+        "filter": filtered,
+        "weights": list(weights),
+        "signals": instants,
+        "robust_weights": counted,
+        "sample_times": None,
+    }
 
 
 def _sample_nonuniform_run(
     run: Run, structure: Structure, rec: Record, weights: Sequence[float], decimation: int, shares: Floats | None
-) -> tuple[Any, ...]:
+) -> _core._Experiment:
     """Convert a run with nonuniform sample times. The first sample only gives the initial value."""
     times = compared_times(run, structure)
     kept = np.flatnonzero(times > 0.0)[::decimation]
@@ -81,14 +90,22 @@ def _sample_nonuniform_run(
     # What was not read everywhere drives nothing.
     instants = [(None if v is None or np.isnan(v).any() else v, False) for v in signals]
     own = (at.pulse_positions, [at.jumps(name) for name in structure.signals])
-    return rec.core_with_transients(), 1, measured, filtered, list(weights), instants, counted, own
+    return {
+        "record": rec.core_with_transients(),
+        "pulses_per_sample": 1,
+        "samples": measured,
+        "filter": filtered,
+        "weights": list(weights),
+        "signals": instants,
+        "robust_weights": counted,
+        "sample_times": own,
+    }
 
 
-def _output_filter(structure: Structure, rec: Record) -> tuple[Floats | None, list[bool]] | None:
+def _output_filter(structure: Structure, rec: Record) -> tuple[Floats, list[bool]] | None:
     """Return the sensor filter of the simulated outputs, or None if all signals are filtered already."""
-    if structure.sensor_filter is None or rec.sensor is not None:
-        return None
-    return sensor_series(structure, rec.m, rec.step), [structure.is_filtered(o) for o in structure.outputs]
+    series = None if rec.sensor is not None else sensor_series(structure, rec.m, rec.step)
+    return None if series is None else (series, [structure.is_filtered(o) for o in structure.outputs])
 
 
 def _weighted_samples(samples: Floats, compared: slice, shares: Floats | None) -> tuple[Floats, Floats | None]:
@@ -257,7 +274,10 @@ class Objective:
     @property
     def counts(self) -> list[tuple[Floats | None, int]]:
         """Robust weights and number of compared samples of each run."""
-        return [(e[6], e[2].shape[1] - (2 if e[7] is None else 0)) for e in self.experiments]
+        return [
+            (e["robust_weights"], e["samples"].shape[1] - (2 if e["sample_times"] is None else 0))
+            for e in self.experiments
+        ]
 
     @property
     def residual_weights(self) -> Floats:

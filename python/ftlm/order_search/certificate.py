@@ -157,13 +157,20 @@ def certify_job(
     _check_certifiable(job)
     record, item = job.records[0], job.structure.equations[0]
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
-    region = _search_region(item, intervals, record.signals)
+    output, alpha, terms = _search_region(item, intervals, record.signals)
     try:
         found = _core.certify(
             [r.core() for r in job.records],
-            (*region, min_separation),
-            (tolerance, max_term_ratio, max_cells, job.threads, memory_limit()),
-            None if progress is None else lambda done, total, _pruned: progress(done, total),
+            output=output,
+            alpha=alpha,
+            terms=terms,
+            min_separation=min_separation,
+            tolerance=tolerance,
+            max_term_ratio=max_term_ratio,
+            max_cells=max_cells,
+            threads=job.threads,
+            memory=memory_limit(),
+            progress=None if progress is None else lambda done, total, _pruned: progress(done, total),
         )
     except ModelError as error:
         raise named_signals(error, record.signals) from None

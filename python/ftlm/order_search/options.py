@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
+from ftlm import _core
 from ftlm.errors import ModelError
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
@@ -89,15 +90,20 @@ class SearchSettings:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
-    def core_arguments(
-        self, threads: int, memory: int | None = None
-    ) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
+    def core_arguments(self, threads: int, memory: int | None = None) -> _core._Options:
         """Return the settings as arguments of the core; the default memory limit is that of this machine."""
-        p = self.innovation_length if self.coefficients == "multi-innovation" else 0
-        steps = MAX_IV_ITERATIONS if self.coefficients == "instrumental-variables" else 0
-        ranked = (self.criterion, self.norm, p, self.prior_covariance, self.row_basis == "haar")
-        most = memory_limit() if memory is None else memory
-        return *ranked, self.top, threads, self.pruning, steps, most
+        return {
+            "criterion": self.criterion,
+            "norm": self.norm,
+            "innovation_length": self.innovation_length if self.coefficients == "multi-innovation" else 0,
+            "prior_covariance": self.prior_covariance,
+            "haar_rows": self.row_basis == "haar",
+            "top": self.top,
+            "threads": threads,
+            "pruning": self.pruning,
+            "iterations": MAX_IV_ITERATIONS if self.coefficients == "instrumental-variables" else 0,
+            "memory": memory_limit() if memory is None else memory,
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings that results and reports show."""

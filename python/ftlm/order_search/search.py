@@ -189,8 +189,14 @@ def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[Sear
         return {o.names[0]: v for o, v in pairs if o.names}
 
     table = [
-        SearchRow(rank, index, score, orders_by_name(alpha, orders), named_coefficients(item, c))
-        for rank, (index, score, alpha, orders, c, _) in enumerate(found["rows"], 1)
+        SearchRow(
+            rank,
+            row["index"],
+            row["score"],
+            orders_by_name(row["alpha"], row["orders"]),
+            named_coefficients(item, row["coefficients"]),
+        )
+        for rank, row in enumerate(found["rows"], 1)
     ]
     return table, [(orders_by_name(alpha, orders), str(reason)) for _, alpha, orders, reason in found["failures"]]
 

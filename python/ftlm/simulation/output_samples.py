@@ -94,16 +94,16 @@ def fit_initial_terms_with_friction(
     structure = model.structure
     series = sensor_series(structure, rec.m, rec.step)
     filtered = None if series is None else (series, [structure.is_filtered(o) for o in model.outputs])
-    experiment = (
-        rec.core(),
-        every,
-        np.where(known, samples, 0.0),
-        filtered,
-        [1.0 / s if s > 0 else 1.0 for s in sizes.tolist()],
-        [(None, False)] * len(rec.signals),
-        shares,
-        None,
-    )
+    experiment: _core._Experiment = {
+        "record": rec.core(),
+        "pulses_per_sample": every,
+        "samples": np.where(known, samples, 0.0),
+        "filter": filtered,
+        "weights": [1.0 / s if s > 0 else 1.0 for s in sizes.tolist()],
+        "signals": [(None, False)] * len(rec.signals),
+        "robust_weights": shares,
+        "sample_times": None,
+    }
     laws = [fixed_equation(item, rec.signals) for item in model.equations]
     frictions: list[tuple[int, list[tuple[float, list[Any]]]]] = [
         (i, [(x, []) for x in friction_parameters(model.equations[i])]) for i in structure.friction_equations

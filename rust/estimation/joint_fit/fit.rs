@@ -181,12 +181,11 @@ impl<'a> FitProblem<'a> {
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::Initial;
 /// use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure, Term};
-/// use ftlm::estimation::joint_fit::parameter_set::Free;
+/// use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 /// use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
-/// use ftlm::estimation::joint_fit::fit;
-/// use ftlm::estimation::joint_fit::Loss;
-/// use ftlm::estimation::joint_fit::fit::{Outset, Settings, Size, Sought};
-/// use ftlm::estimation::joint_fit::{Sampled, Signal};
+/// use ftlm::estimation::joint_fit::{
+///     fit, FitProblem, Initialization, Loss, OutputScale, SampledRuns, Settings, Signal,
+/// };
 /// use ftlm::signal::block_pulse::Intersample;
 /// use ftlm::parallel::Stop;
 /// // Data of D y = −2 y + 3 u in exact steps, fitted by D^alpha y = a y + b u.

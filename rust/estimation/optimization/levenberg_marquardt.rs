@@ -85,7 +85,7 @@ fn cost(residuals: &[f64]) -> f64 {
 ///
 /// ```
 /// use ftlm::error::Result;
-/// use ftlm::estimation::optimization::levenberg_marquardt::{minimise, Settings};
+/// use ftlm::estimation::optimization::levenberg_marquardt::{minimize, Settings};
 /// use ftlm::estimation::optimization::damped_step::Problem;
 ///
 /// /// x² − 2.

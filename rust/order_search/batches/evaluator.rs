@@ -40,7 +40,7 @@ use crate::regressors::Record;
 ///
 /// ```
 /// # use ftlm::order_search::control::Control;
-/// # use ftlm::order_search::grid::{Lattice, TermAxis};
+/// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::order_search::batches::search;
 /// # use ftlm::regressors::Record;
@@ -170,7 +170,7 @@ impl<'a> BatchEvaluator<'a> {
     /// ```
     /// # use std::borrow::Cow;
     /// # use ftlm::order_search::control::Control;
-    /// # use ftlm::order_search::grid::{Lattice, TermAxis};
+    /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
     /// # use ftlm::order_search::options::Options;
     /// # use ftlm::order_search::result::Part;
     /// # use ftlm::order_search::batches::{batch_count, generation_ends, BatchEvaluator};
@@ -351,7 +351,7 @@ pub fn batch_count_by_version(algorithm: u64, candidates: u64, options: &Options
 ///
 /// ```
 /// # use ftlm::order_search::options::Options;
-/// # use ftlm::order_search::batches::{rounds, waves};
+/// # use ftlm::order_search::batches::{batch_count, generation_ends};
 /// let batches = batch_count(400_000, &Options::default());
 /// assert_eq!((batches, generation_ends(batches)), (7, vec![1, 3, 7]));
 /// ```

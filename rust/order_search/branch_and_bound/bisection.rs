@@ -270,7 +270,7 @@ pub struct BoxBound {
 ///
 /// ```
 /// # use ftlm::order_search::branch_and_bound::box_bounds;
-/// # use ftlm::order_search::grid::{Lattice, TermAxis};
+/// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
 /// # use ftlm::order_search::options::{Criterion, Norm};
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();

@@ -66,8 +66,7 @@ pub struct Certificate {
 /// memory, [`Error::Interrupted`].
 ///
 /// ```
-/// # use ftlm::order_search::certificate::{certify, Asked};
-/// # use ftlm::order_search::certificate::{Range, Region};
+/// # use ftlm::order_search::certificate::{certify, CertificateOptions, Range, Region};
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();

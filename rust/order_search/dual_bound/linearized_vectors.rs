@@ -32,7 +32,7 @@ const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 ///
 /// ```
 /// # use ftlm::equation::{Equation, Structure, Term};
-/// # use ftlm::order_search::dual_bound::excluded_along;
+/// # use ftlm::order_search::dual_bound::excluded_by_linearized_vector;
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();

@@ -58,7 +58,7 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 ///
 /// ```
 /// # use ftlm::equation::{Structure, Term};
-/// # use ftlm::order_search::dual_bound::out_of_reach;
+/// # use ftlm::order_search::dual_bound::is_infeasible;
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
@@ -92,7 +92,7 @@ pub fn is_infeasible(
 ///
 /// ```
 /// # use ftlm::equation::{Equation, Structure, Term};
-/// # use ftlm::order_search::{bound::lower_bounds, options::Norm};
+/// # use ftlm::order_search::dual_bound::{excluded_by, lower_bounds};
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();

@@ -40,7 +40,7 @@ const MAX_RECORD_SAMPLES: usize = 1 << 14;
 ///
 /// ```
 /// # use ftlm::equation::{Equation, Structure, Term};
-/// # use ftlm::order_search::dual_bound::explodes;
+/// # use ftlm::order_search::dual_bound::has_unstable_zeros;
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..256).map(|k| if k % 64 < 32 { 1.0 } else { -0.5 }).collect();

@@ -19,18 +19,31 @@ use crate::regressors::Record;
 /// Convergence tolerance of a candidate's instrumental variables, far below a change of the ranking.
 const IV_CONVERGENCE_TOLERANCE: f64 = 1e-4;
 
-/// Settings: (criterion, norm, p or 0 for least squares, K₀, Haar rows, rows kept, threads, pruning, iterations of
-/// instrumental variables or 0, bytes of memory).
-type SettingsTuple = (String, String, usize, f64, bool, usize, usize, bool, usize, u64);
+/// Settings from a dictionary with these keys. `innovation_length` is 0 for least squares, `iterations` is 0 without
+/// instrumental variables, `memory` is in bytes.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct SettingsDict {
+    criterion: String,
+    norm: String,
+    innovation_length: usize,
+    prior_covariance: f64,
+    haar_rows: bool,
+    top: usize,
+    threads: usize,
+    pruning: bool,
+    iterations: usize,
+    memory: u64,
+}
 
 /// Settings of a search without its initial terms.
 pub struct SettingsArg {
     criterion: Criterion,
     norm: Norm,
     estimator: Estimator,
-    keep: usize,
+    top: usize,
     threads: usize,
-    early_stopping: bool,
+    pruning: bool,
     memory: u64,
 }
 
@@ -38,12 +51,10 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
     type Error = PyErr;
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
-        let given: SettingsTuple = object.extract()?;
-        let (criterion, norm, length, prior_covariance, haar, keep, threads, early_stopping, iterations, memory) =
-            given;
+        let given: SettingsDict = object.extract()?;
         let unknown = |what: String, remedy: &str| Error::Structure { what, remedy: remedy.into() };
         Ok(Self {
-            criterion: match criterion.as_str() {
+            criterion: match given.criterion.as_str() {
                 "output-error" => Criterion::OutputError,
                 "equation-error" => Criterion::EquationError,
                 other => {
@@ -51,23 +62,27 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
                     return Err(unknown(what, "use output-error or equation-error").into());
                 }
             },
-            norm: match norm.as_str() {
+            norm: match given.norm.as_str() {
                 "l1" => Norm::L1,
                 "l2" => Norm::L2,
                 other => return Err(unknown(format!("norm '{other}' is not known"), "use l1 or l2").into()),
             },
-            estimator: if iterations > 0 {
-                Estimator::InstrumentalVariables(Settings { iterations, tolerance: IV_CONVERGENCE_TOLERANCE })
-            } else if length == 0 {
+            estimator: if given.iterations > 0 {
+                Estimator::InstrumentalVariables(Settings {
+                    iterations: given.iterations,
+                    tolerance: IV_CONVERGENCE_TOLERANCE,
+                })
+            } else if given.innovation_length == 0 {
                 Estimator::LeastSquares
             } else {
-                let rows = if haar { RowBasis::Haar } else { RowBasis::Time };
-                Estimator::MultiInnovation(Innovation { length, prior_covariance, row_basis: rows })
+                let row_basis = if given.haar_rows { RowBasis::Haar } else { RowBasis::Time };
+                let (length, prior_covariance) = (given.innovation_length, given.prior_covariance);
+                Estimator::MultiInnovation(Innovation { length, prior_covariance, row_basis })
             },
-            keep,
-            threads,
-            early_stopping,
-            memory,
+            top: given.top,
+            threads: given.threads,
+            pruning: given.pruning,
+            memory: given.memory,
         })
     }
 }
@@ -75,17 +90,8 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
 impl SettingsArg {
     /// Options with the initial terms of the records.
     pub fn options(self, terms: InitialArg) -> PyResult<Options> {
-        let Self { criterion, norm, estimator, keep, threads, early_stopping, memory } = self;
-        Ok(Options {
-            criterion,
-            norm,
-            estimator,
-            initial: initial(terms)?,
-            top: keep,
-            threads,
-            pruning: early_stopping,
-            memory,
-        })
+        let Self { criterion, norm, estimator, top, threads, pruning, memory } = self;
+        Ok(Options { criterion, norm, estimator, initial: initial(terms)?, top, threads, pruning, memory })
     }
 }
 

@@ -50,8 +50,16 @@ pub fn search<'py>(
     found.dict(py)
 }
 
-/// Row of a table: (index, score, α, orders, coefficients, initial terms by record).
-type FoundRow = (u64, f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
+/// Row of a table, initial terms by record.
+#[derive(IntoPyObject)]
+struct FoundRow {
+    index: u64,
+    score: f64,
+    alpha: f64,
+    orders: Vec<f64>,
+    coefficients: Vec<f64>,
+    initial: Vec<Vec<f64>>,
+}
 
 /// Result table with counts and failures, and the orders of each index.
 struct OrderTable {
@@ -68,7 +76,8 @@ impl OrderTable {
         };
         let row = |row: Row| {
             let (alpha, orders) = orders(row.index);
-            (row.index, row.score, alpha, orders, row.coefficients, row.initial)
+            let Row { index, score, coefficients, initial } = row;
+            FoundRow { index, score, alpha, orders, coefficients, initial }
         };
         let failure = |&(index, failure): &_| {
             let (alpha, orders) = orders(index);
@@ -203,27 +212,31 @@ impl OrderSearch {
     }
 }
 
-/// Search region: (output, interval of alpha, [(signal, lowest, highest), …], smallest separation).
-type RegionTuple = (usize, (f64, f64), List<(usize, f64, f64)>, f64);
-
-/// Settings: (tolerance, largest coefficient, cells, threads, bytes of memory).
-type AskedTuple = (f64, f64, u64, usize, u64);
-
+/// Certify a lower bound of the equation error. `alpha` is the interval of the output's order, `terms` are (signal,
+/// lowest, highest order), `memory` is in bytes.
 #[pyfunction]
-#[allow(clippy::needless_pass_by_value)]
+#[pyo3(signature = (
+    runs, *, output, alpha, terms, min_separation, tolerance, max_term_ratio, max_cells, threads, memory, progress,
+))]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn certify<'py>(
     py: Python<'py>,
     runs: List<RecordArg<'py>>,
-    region: RegionTuple,
-    asked: AskedTuple,
+    output: usize,
+    alpha: (f64, f64),
+    terms: List<(usize, f64, f64)>,
+    min_separation: f64,
+    tolerance: f64,
+    max_term_ratio: f64,
+    max_cells: u64,
+    threads: usize,
+    memory: u64,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let records = records(&runs)?;
-    let (output, alpha, terms, min_separation) = region;
     let terms = terms.iter().map(|&(signal, lowest, highest)| Range { signal, lowest, highest }).collect();
     let region = Region { output, alpha, terms, min_separation };
-    let (tolerance, max_coefficient, max_cells, threads, memory) = asked;
-    let asked = CertificateOptions { tolerance, max_coefficient, max_cells, threads, memory };
+    let asked = CertificateOptions { tolerance, max_coefficient: max_term_ratio, max_cells, threads, memory };
     let found = run_watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &asked, control))?;
     let dict = PyDict::new(py);
     dict.set_item("at_least", found.lower_bound)?;
