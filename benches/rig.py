@@ -30,7 +30,7 @@ PATIENT = Limits(late=60.0, missed=10**9, standstill=1e9)
 CHILD = """
 import sys
 from ftlm import rig
-rig.record(rig.VirtualBoard(page=sys.argv[1], paced=True), input="sine", amplitude=0.2, duration=25.0)
+rig.record(rig.VirtualBoard(page=sys.argv[1], real_time=True), input="sine", amplitude=0.2, duration=25.0)
 """
 
 

@@ -327,7 +327,7 @@ import attack, ftlm
 run = attack.sample_run()
 equation = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
 found = ftlm.search_orders(
-    run, equation, ftlm.lattice(step={step}), store={store!r}, m=64, early_stopping=False, threads=2
+    run, equation, ftlm.lattice(step={step}), store={store!r}, m=64, pruning=False, threads=2
 )
 print(found)
 """

@@ -146,7 +146,7 @@ class HIL:
     def _expire(self):
         board = self._board
         if board.page is not None:
-            board.expired = board.page.expired
+            board.expired = board.page.has_expired
             return
         if board.timeout and not board.expired and board.time - board.last_reload > board.timeout:
             board.expired = True

@@ -60,11 +60,11 @@ def test_a_machine_that_changes_is_named_with_number_parts_and_distance(changed)
     values = [r.coefficients["a"] for r in changed.results]
     assert values == pytest.approx([-40.0, -48.0], rel=0.02)
     between = abs(values[0] - values[1]) / math.hypot(first.standard_errors["a"], second.standard_errors["a"])
-    assert changed.differences[0].errors == pytest.approx(between, rel=0.05)
+    assert changed.differences[0].difference_in_errors == pytest.approx(between, rel=0.05)
     words = str(changed)
     assert words.startswith("Not the same model: a is -")
     assert "in motor 0 to 6 s and -4" in words
-    assert f"in motor 6 to 12 s, {changed.differences[0].errors:.2g} standard errors apart" in words
+    assert f"in motor 6 to 12 s, {changed.differences[0].difference_in_errors:.2g} standard errors apart" in words
     assert changed.distance > changed.limit
 
 
@@ -195,14 +195,14 @@ def test_words_where_nothing_can_be_compared():
     run = changing([40.0])
     for parts in (1, 0, -2, 1.5, True, "2"):
         with pytest.raises(ftlm.ModelError, match="use a whole number, at least 2"):
-            ftlm.consistency(run, SECOND, parts=parts)
-    with pytest.raises(ftlm.ModelError, match="2 runs are parts by themselves; leave parts= out"):
-        ftlm.consistency([run, changing([40.0], seed=1)], SECOND, parts=2)
+            ftlm.consistency(run, SECOND, segments=parts)
+    with pytest.raises(ftlm.ModelError, match="2 runs are segments by themselves; leave segments= out"):
+        ftlm.consistency([run, changing([40.0], seed=1)], SECOND, segments=2)
     for parts in (200, 10**9):
         with pytest.raises(ftlm.DataError, match=f"motor has 300 rows, too few to be cut into {parts} parts"):
-            ftlm.consistency(run, SECOND, parts=parts)
+            ftlm.consistency(run, SECOND, segments=parts)
     with pytest.raises(ftlm.ModelError, match="store= is of one identification"):
-        ftlm.consistency(run, SECOND, method=ftlm.OutputError(store="a.ftlm"))
+        ftlm.consistency(run, SECOND, method=ftlm.LeastSquares(store="a.ftlm"))
     with pytest.raises(ftlm.ModelError, match="method 'least-squares' gives no standard errors of D"):
         ftlm.consistency(run, SECOND, method="least-squares", threads=1)
     with pytest.raises(ftlm.DataError, match=r"motor 0 to 3 s: .*'z'"):
@@ -223,8 +223,8 @@ def test_what_cannot_be_meant_is_refused_in_words(same):
     run = same.results[0].task.runs[0]
     structure = ftlm.equation("D^alpha y = a0 y + b0 u")
     for runs, options, words in (
-        (run, {"parts": np.complex64(2)}, "parts = np.complex64"),
-        (run, {"method": np.array(["output-error", "x"])}, "method = array"),
+        (run, {"segments": np.complex64(2)}, "segments = np.complex64"),
+        (run, {"method": np.array(["output-error", "x"])}, "method is ndarray"),
         (run, {"method": "x" * 10**6}, "method = 'x{59}… is not known"),
     ):
         with pytest.raises(ftlm.FtlmError, match=words):

@@ -487,7 +487,7 @@ def scripted(page, key, content, folder):
 def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
     (key,) = used.desk.models
     printed = scripted(used, key, content, tmp_path)
-    assert printed.splitlines()[0].startswith(used.desk.models[key].preview["verdict"]["level"].upper())
+    assert printed.splitlines()[0].startswith(used.desk.models[key].told["verdict"]["level"].upper())
     model = ftlm.load_model(tmp_path / "lag-model.json")
     assert model.coefficients["a0"] == pytest.approx(-2, abs=0.1)
 
@@ -918,7 +918,8 @@ def test_a_process_that_works_ends_and_the_page_goes_on(page, how):
         ("hold them with missing='hold'", "hold them with the field “Gaps” hold"),
         ("say which with layout=dict(sheet=NAME)", "say which with the field “Sheet”"),
         ("name them with inputs={name: column} and outputs={name: column}", "name them with the roles below"),
-        ("give it (commands: -u NAME=COLUMN)", "give it"),
+        ("give it, or in a file for columns=; there are", "give it; there are"),
+        ("being zeroed; use window=(1.004, None)", "being zeroed; use the field “From” and “To”"),
     ],
 )
 def test_errors_speak_of_what_the_page_has(words, shown):

@@ -5,8 +5,7 @@ import pytest
 from scipy import signal
 
 import ftlm
-from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.free_parameters import time_scaling as clock_of
+from ftlm.estimation.free_parameters import FreeProblem, sampling_spans
 from ftlm.estimation.objective import Iterate, Objective, minimize_cost
 
 #: Of a lag of first order two orders and an own term too many: along the bottom of a valley nothing tells them.
@@ -23,6 +22,11 @@ def lag(seed, scale):
     y = signal.dlsim(system, u)[1][:, 0]
     y = y + 0.05 * np.std(y) * rng.standard_normal(rows)
     return ftlm.Run.from_arrays(step=0.02 * scale, inputs={"u": u}, outputs={"y": y}, name="lag")
+
+
+def clock_of(problem, run):
+    """Unit of time of a fit: between the frequency of the run's length and Nyquist's."""
+    return problem.core.time_scaling(sampling_spans([run]))
 
 
 def in_seconds(values, scale):
@@ -72,9 +76,9 @@ def test_a_descent_takes_the_same_steps_in_any_unit(plain):
 
 def test_the_clock_tells_numbers_steps_and_errors():
     problem = FreeProblem.of(ftlm.equation("D^alpha y = d D^mu y + a y + b0 D^gamma u + b1 u", delay={"u": (0.0, 0.3)}))
-    clock = clock_of(problem, [lag(0, 60.0)])
+    clock = clock_of(problem, lag(0, 60.0))
     scale = np.exp(clock.unit)
-    assert scale == pytest.approx(60.0 * np.exp(clock_of(problem, [lag(0, 1.0)]).unit))
+    assert scale == pytest.approx(60.0 * np.exp(clock_of(problem, lag(0, 1.0)).unit))
     values = dict(alpha=1.9, mu=0.7, gamma=0.4, d=-2.0, a=-30.0, b0=4.0, b1=0.0, delay_u=0.1)
     powers = {"d": 1.2, "a": 1.9, "b0": 1.5, "b1": 1.9}
     point = np.array([values[n] for n in problem.names])

@@ -71,7 +71,7 @@ def test_a_delay_is_estimated_with_the_rest(found):
     assert errors["delay_u"] < plants.clean_run("3T").step
     assert found.model.structure.delay == found.delays
     assert found.model.structure.free_delays == {}
-    assert found.fit.settled
+    assert found.fit.step_converged
 
 
 def test_its_score_is_that_of_a_standard_normal_number():

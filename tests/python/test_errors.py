@@ -97,7 +97,7 @@ BAD = {
     "lattice with a step of 0": (MODEL, "order alpha: step 0 is not positive", lambda: ftlm.order_grid(increment=0)),
     "lattice of an unknown order": (
         MODEL,
-        "lattice order 'betta' is no free order; free are alpha, beta",
+        "order 'betta' of order_grid= is no free order; free are alpha, beta",
         lambda: search(order_grid=ftlm.order_grid(betta=1.0)),
     ),
     "lattice upside down": (

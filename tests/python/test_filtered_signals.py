@@ -425,20 +425,25 @@ def test_files_keep_the_meaning_of_their_filter(tmp_path):
 
 
 def test_the_command_line_names_filtered_signals():
-    built = StructureOptions(filtered=["y", "v"], low_pass="1:0.9").structure(WORDS)
+    built = StructureOptions(filtered_signals=["y", "v"], sensor_filter="1:0.9").structure(WORDS)
     assert built == ftlm.equation(WORDS, sensor_filter=sensor(("y", "v")))
-    assert StructureOptions(filtered=["v"]).structure(WORDS).sensor_filter == ftlm.SensorFilter.low_pass(["v"])
+    assert StructureOptions(filtered_signals=["v"]).structure(WORDS).sensor_filter == ftlm.SensorFilter.low_pass(["v"])
     for options, text, words in [
-        ({"low_pass": "2"}, WORDS, "--sensor-filter is of signals that --filtered-signals names"),
-        ({"filtered": ["y"], "low_pass": "slow"}, WORDS, "--sensor-filter 'slow' is not HZ or HZ:DAMPING"),
-        ({"filtered": ["w"]}, WORDS, "filtered signal 'w' does not occur"),
+        ({"sensor_filter": "2"}, WORDS, "--sensor-filter is of signals that --filtered-signals names"),
         (
-            {"filtered": ["theta12"]},
+            {"filtered_signals": ["y"], "sensor_filter": "slow"},
+            WORDS,
+            "--sensor-filter 'slow' is not stock, HZ or HZ:DAMPING",
+        ),
+        ({"filtered_signals": ["w"]}, WORDS, "filtered signal 'w' does not occur"),
+        (
+            {"filtered_signals": ["theta12"]},
             "flexible-link:1",
             "of equations in words; the flexible link has --sensor-filter stock",
         ),
-        ({"filtered": ["theta12"]}, "arm", "--filtered-signals: --structure arm has its own; leave it out"),
-        ({"cross_stage": True, "inertial": True}, "flexible-link:1", "use one of them"),
+        ({"filtered_signals": ["theta12"]}, "arm", "--filtered-signals: --structure arm has its own; leave it out"),
+        ({"sensor_filter": "2"}, "flexible-link:1", "the flexible link has --sensor-filter stock"),
+        ({"sensor_filter": "stock"}, "arm", "--sensor-filter: --structure arm has its own; leave it out"),
         ({}, "arm:3", "--structure 'arm:3' is not known; use arm:1, :2 or :both"),
     ]:
         with pytest.raises(ftlm.ModelError, match=words):

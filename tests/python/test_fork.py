@@ -25,7 +25,7 @@ u = np.sign(np.sin(1.3 * t))
 y = ftlm.fractional_integral(u, 1.4, step=0.1)
 run = ftlm.Run.from_arrays(inputs={{"u": u}}, outputs={{"y": y}}, step=0.1)
 FOUND = lambda: ftlm.search_orders(
-    run, ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest"), ftlm.lattice(step=0.1), m=64, threads=2)
+    run, ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest"), ftlm.order_grid(increment=0.1), m=64, threads=2)
 FIT = lambda: ftlm.identify(run, ftlm.equation("D^1.4 y = a y + b u", initial="rest"), threads=2)
 right = answers()
 

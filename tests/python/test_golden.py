@@ -13,7 +13,16 @@ from ftlm.order_search import checkpoint as frames
 
 GOLDEN = ROOT / "tests" / "golden"
 #: Keys of the results that are kept, and what they are called now.
-RENAMED_KEYS = {"pruned": "exclusion_counts", "edges": "at_grid_edge"}
+RENAMED_KEYS = {"pruned": "exclusion_counts", "edges": "at_grid_edge", "rows": "row_basis"}
+
+
+def with_new_keys(value):
+    """A result as it was written, with today's keys."""
+    if isinstance(value, dict):
+        return {RENAMED_KEYS.get(key, key): with_new_keys(inner) for key, inner in value.items()}
+    return value
+
+
 RELEASES = sorted(path.name for path in GOLDEN.iterdir() if path.is_dir() and path.name[0].isdigit())
 
 
@@ -70,7 +79,7 @@ def test_a_finished_store_under_an_order_law_is_read_to_the_bit(folder, tmp_path
     found = json.loads(json.dumps(ftlm.resume_search(path)["stage"].to_dict()))
     # Later versions tell more.
     assert found.pop("excluded_by_box") == 0
-    assert found == {RENAMED_KEYS.get(key, key): value for key, value in expected.items()}
+    assert found == with_new_keys(expected)
     assert path.read_bytes() == (folder / "law.ftlm").read_bytes()
 
 

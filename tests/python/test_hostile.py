@@ -15,7 +15,7 @@ import pytest
 
 import ftlm
 from ftlm import _core, rig
-from ftlm.cli import main as app
+from ftlm.cli.main import app
 from ftlm.order_search import checkpoint as log
 from ftlm.order_search.checkpoint import read_store
 from ftlm.utils import files as output

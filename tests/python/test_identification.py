@@ -70,7 +70,7 @@ def test_multi_innovation_is_the_oracles(small_run, structure, p, k0):
     ((q, y),) = regression([small_run], 256)
     expected = oracles.multi_innovation_closed_form(q, y, p, k0)
     assert [found.coefficients[n] for n in "acb"] == pytest.approx(list(expected), rel=1e-9)
-    for name, value in (("innovation_length", p), ("prior_covariance", k0), ("rows", "haar")):
+    for name, value in (("innovation_length", p), ("prior_covariance", k0), ("row_basis", "haar")):
         assert found.settings[name] == value
 
 
@@ -191,6 +191,7 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
         coefficients="multi-innovation",
         innovation_length=3,
         prior_covariance=50.0,
+        **settings,
         **options,
     )
     assert found.searches["y"].table == same.table

@@ -83,7 +83,7 @@ def test_a_layout_that_is_said_is_not_looked_for(tmp_path):
     assert ftlm.load(odd, columns=toml).length == 3
     assert ftlm.load(odd, columns=toml, layout=ftlm.Layout(skip=1), outputs={"y": "c2"}).length == 4
     messages(["no table below the first 99 lines"], lambda: ftlm.load(odd, layout=dict(skip=99), **SIGNALS))
-    messages(["2 lines of header, and 1"], lambda: ftlm.load(odd, layout=dict(skip=4, header=2), **SIGNALS))
+    messages(["header says 2 lines, and 1"], lambda: ftlm.load(odd, layout=dict(skip=4, header=2), **SIGNALS))
 
 
 BAD_LAYOUTS = {
@@ -97,7 +97,7 @@ BAD_LAYOUTS = {
     "dates": ({"dates": "dym"}, ["'dym'", "'dmy'"]),
     "encoding": ({"encoding": "utf-9"}, ["'utf-9'"]),
     "no encoding of text": ({"encoding": "base64"}, ["'base64'"]),
-    "sheet": ({"sheet": "a"}, ["'sheet' is not used with text"]),
+    "sheet": ({"sheet": "a"}, ["layout=: sheet is not used with text"]),
     "sheet number": ({"sheet": 1}, ["sheet is a int"]),
     "wrong encoding": ({"encoding": "ascii"}, ["line 1 is not ASCII", "0xc3"]),
 }
@@ -310,7 +310,7 @@ def test_sheets_of_a_workbook_and_what_is_not_used_with_them(tmp_path):
     assert ftlm.load(path, **SIGNALS, layout=dict(sheet="first")).step == 0.1
     assert ftlm.load(path, **SIGNALS, layout=dict(sheet="second")).step == 1e-4
     messages(["no sheet 'third'", "'first'"], lambda: ftlm.load(path, **SIGNALS, layout=dict(sheet="third")))
-    messages(["'decimal' is not used with sheet"], lambda: ftlm.load(path, **SIGNALS, layout=dict(decimal="comma")))
+    messages(["decimal is not used with sheet"], lambda: ftlm.load(path, **SIGNALS, layout=dict(decimal="comma")))
     dated = [[np.datetime64("2024-01-01T00:00").item() + k * np.timedelta64(500, "ms").item(), k, k] for k in range(9)]
     assert ftlm.load(sheet(tmp_path, [["when", "u", "y"], *dated]), **SIGNALS).step == 0.5
 

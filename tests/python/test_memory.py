@@ -186,7 +186,7 @@ run = ftlm.Run.from_arrays(inputs={"u": np.ones(65537)}, outputs={"y": np.arange
 equation = ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest")
 before = held()
 try:
-    ftlm.search_orders(run, equation, ftlm.lattice(step=0.005), coefficients="least-squares", m=1 << 16)
+    ftlm.search_orders(run, equation, ftlm.order_grid(increment=0.005), coefficients="least-squares", m=1 << 16)
 except ftlm.ModelError as error:
     print(error)
 print(held() - before)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm.cli.main import app
 from ftlm.estimation.fit import Fit
-from ftlm.estimation.methods import METHODS, OrderSearchMethod, method_with_options
+from ftlm.estimation.methods import METHODS_BY_NAME, OrderSearchMethod, method_with_options
 from ftlm.order_search.options import SearchSettings
 
 FREE = "D^alpha y = a D^0.6 y + c y + b u"
@@ -44,11 +44,11 @@ def noisy(small_run, with_noise):
     return with_noise(small_run, 0.01, 1)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", METHODS_BY_NAME)
 def test_a_name_stands_for_the_defaults(name, noisy):
     if name == "genetic":
         pytest.importorskip("pygad")
-    method = METHODS[name]()
+    method = METHODS_BY_NAME[name]()
     by_name, by_object = (
         ftlm.identify(noisy, ftlm.equation(FREE), method=m, m=128, threads=1).to_dict() for m in (name, method)
     )
@@ -57,7 +57,7 @@ def test_a_name_stands_for_the_defaults(name, noisy):
 
 
 def test_every_method_is_public_and_is_made_by_keywords_alone():
-    for kind in METHODS.values():
+    for kind in METHODS_BY_NAME.values():
         assert getattr(ftlm, kind.__name__) is kind
         assert kind.__name__ in ftlm.__all__
         assert kind() == kind()
@@ -69,21 +69,23 @@ def test_every_method_is_public_and_is_made_by_keywords_alone():
 
 def test_defaults_of_a_search_are_those_of_search_orders(noisy):
     for name in ("least-squares", "multi-innovation", "instrumental-variables"):
-        assert METHODS[name]().settings() == SearchSettings(coefficients=name)
-        found = ftlm.identify(noisy, ftlm.equation(FREE), method=METHODS[name](order_grid=GRID), m=128)
+        assert METHODS_BY_NAME[name]().settings() == SearchSettings(coefficients=name)
+        found = ftlm.identify(noisy, ftlm.equation(FREE), method=METHODS_BY_NAME[name](order_grid=GRID), m=128)
         alone = ftlm.search_orders(noisy, ftlm.equation(FREE), GRID, coefficients=name, m=128)
         assert found.searches["y"].to_dict() == alone.to_dict()
 
 
 def test_each_option_has_a_bad_value():
-    assert {f.name for kind in METHODS.values() for f in fields(kind)} == set(BAD_VALUES)
+    assert {f.name for kind in METHODS_BY_NAME.values() for f in fields(kind)} == set(BAD_VALUES)
 
 
-@pytest.mark.parametrize(("name", "option"), [(name, f.name) for name, kind in METHODS.items() for f in fields(kind)])
+@pytest.mark.parametrize(
+    ("name", "option"), [(name, f.name) for name, kind in METHODS_BY_NAME.items() for f in fields(kind)]
+)
 def test_a_bad_value_is_refused_where_it_is_written(name, option):
     value, message = BAD_VALUES[option]
     with pytest.raises(ftlm.ModelError) as refused:
-        METHODS[name](**{option: value})
+        METHODS_BY_NAME[name](**{option: value})
     assert message in str(refused.value)
 
 
@@ -100,7 +102,7 @@ def test_what_is_no_method_is_refused(noisy):
         ftlm.identify(noisy, structure, method=ftlm.OutputError)
     with pytest.raises(ftlm.ModelError) as refused:
         ftlm.identify(noisy, structure, method="magic")
-    assert all(repr(name) in str(refused.value) for name in METHODS)
+    assert all(repr(name) in str(refused.value) for name in METHODS_BY_NAME)
     for wrong in (None, 3, ["output-error"]):
         with pytest.raises(ftlm.ModelError, match=r"^method is .*, or an object such as ftlm\.OutputError"):
             ftlm.identify(noisy, structure, method=wrong)
@@ -133,7 +135,7 @@ def test_options_of_a_search_need_a_free_order(option, value, noisy, tmp_path, m
 
 def test_an_order_grid_names_free_orders(noisy):
     for kind in (*OrderSearchMethod.__subclasses__(), ftlm.GeneticAlgorithm):
-        with pytest.raises(ftlm.ModelError, match="'beta' is no free order; free are alpha"):
+        with pytest.raises(ftlm.ModelError, match="'beta' of order_grid= is no free order; free are"):
             ftlm.identify(noisy, ftlm.equation(FREE), method=kind(order_grid=ftlm.order_grid(beta=0.1)))
 
 
@@ -225,7 +227,7 @@ def test_options_by_name():
     ("method", "words"),
     [
         ("output-error", ["--norm", "l1"]),
-        ("output-error", ["--seed", "0"]),
+        ("output-error", ["--seeds", "0"]),
         ("least-squares", ["--loss", "squares"]),
         ("least-squares", ["--reference", "r"]),
         ("genetic", ["--store", "s.ftlm"]),

@@ -642,7 +642,7 @@ def test_a_file_that_cannot_be_written_is_an_error_in_words(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
 
 
-FORCED = "exists; {} with force=True (--force)"
+FORCED = "exists; {} with force=True"
 
 
 @pytest.mark.parametrize(
@@ -650,7 +650,7 @@ FORCED = "exists; {} with force=True (--force)"
     [
         (DEFAULT_MESSAGES, f"{{}} {FORCED}", f"{{}} {FORCED}", "{} is no folder"),
         (RUN_MESSAGES, f"'{{}}' {FORCED}", "'{}' is a folder; give the name of a file in it", "'{}' is no folder"),
-        (COMMAND_MESSAGES, "{} exists; {} with --force", "{} is a folder; name a file in it", "{} is no folder"),
+        (COMMAND_MESSAGES, f"{{}} {FORCED}", "{} is a folder; name a file in it", "{} is no folder"),
     ],
 )
 def test_whether_a_file_may_be_written_is_said_in_the_words_of_who_asks(tmp_path, words, exists, folder, missing):

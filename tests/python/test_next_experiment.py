@@ -439,7 +439,7 @@ BAD = {
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),
     "seed": ({"seed": -1}, None, "seed = -1"),
     "period": ({"period": 0.01}, None, "period = 0.01 s is not between"),
-    "reference_run": ({"reference_run": 7}, None, "like is int, not a Run"),
+    "reference_run": ({"reference_run": 7}, None, "reference_run is int, not a Run"),
 }
 
 

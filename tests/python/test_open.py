@@ -198,7 +198,7 @@ BAD = {
     "detrend": (["x.csv", "--detrend", "constant"], "--detrend is not used with open"),
     "skip": (["x.csv", "--skip", "-3"], "skip is -3"),
     "header": (["x.csv", "--header", "7"], "header is 7"),
-    "sheet": (["x.csv", "--sheet", "a"], "'sheet' is not used with text"),
+    "sheet": (["x.csv", "--sheet", "a"], "--sheet is not used with text"),
     "dates": (["x.csv", "--dates", "ydm"], "'ydm'"),
     "encoding": (["x.csv", "--encoding", "klingon"], "'klingon'"),
     "two files": (["x.csv", "x.csv"], "unexpected extra argument"),

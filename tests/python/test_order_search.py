@@ -70,14 +70,14 @@ class Record:
         return np.stack(means, axis=1) if means else np.zeros((self.m, 0))
 
 
-def evaluate(records, o, criterion, norm, coefficients, rows, exponents=(), p=7, k0=1.0):
+def evaluate(records, o, criterion, norm, coefficients, row_basis, exponents=(), p=7, k0=1.0):
     """Score and coefficients of one candidate."""
     blocks, targets, weights = [], [], []
     for i, r in enumerate(records):
         others = [np.zeros((r.m, len(exponents))) for _ in records]
         others[i] = r.powers(exponents)
         q = np.hstack([r.regressors(o), *others])
-        phi = oracles.haar_matrix(r.m) if rows == "haar" else np.eye(r.m)
+        phi = oracles.haar_matrix(r.m) if row_basis == "haar" else np.eye(r.m)
         blocks.append(phi @ q)
         targets.append(phi @ r.y)
         weights.append([min(p, r.m - k) for k in range(r.m)])
@@ -133,14 +133,14 @@ def test_table_is_that_of_enumeration(run, criterion, norm, coefficients, rows):
     weighted = {"row_basis": rows} if coefficients == "multi-innovation" else {}
     found = search(run, top=10, **options, **weighted)
     assert len(found.table) == 10
-    assert_is_table(found, enumerate_all([Record(run)], rows=rows, **options))
+    assert_is_table(found, enumerate_all([Record(run)], row_basis=rows, **options))
 
 
 @pytest.mark.parametrize(("p", "k0"), [(1, 0.01), (3, 100.0), (200, 1e6)])
 def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
-    options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation", "row_basis": "haar"}
+    options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation"}
     found = search(run, innovation_length=p, prior_covariance=k0, **options)
-    assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, **options))
+    assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, rows="haar", **options))
     assert found.settings["innovation_length"] == p
     assert found.settings["prior_covariance"] == k0
 
@@ -150,7 +150,7 @@ def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
 def test_several_runs_are_one_fit(run, second, norm, coefficients):
     options = {"criterion": "output-error", "norm": norm, "coefficients": coefficients}
     found = search([run, second], **options)
-    assert_is_table(found, enumerate_all([Record(run), Record(second)], row_basis="haar", **options))
+    assert_is_table(found, enumerate_all([Record(run), Record(second)], rows="haar", **options))
     assert found.model.about["runs"] == f"{run.name}, {second.name}"
     assert found.table != search(run, **options).table
 
@@ -160,7 +160,7 @@ def test_initial_terms_belong_to_each_run(run, second):
     options = {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
     structure = ftlm.equation(EQUATION, initial=(0.0, 1.0))
     found = ftlm.search_orders(moved, structure, ftlm.OrderGrid(orders=GRID), m=M, **options)
-    expected = enumerate_all([Record(r) for r in moved], row_basis="time", exponents=(0.0, 1.0), **options)
+    expected = enumerate_all([Record(r) for r in moved], rows="time", exponents=(0.0, 1.0), **options)
     assert_is_table(found, expected, rtol=1e-6)
 
 
@@ -687,11 +687,11 @@ def test_settings_that_mean_nothing_are_refused(run, options, message):
         (lambda: values(ftlm.order_grid(beta=(2, 1))), "order beta: interval 2:1 is empty"),
         (
             lambda: values(ftlm.order_grid(gama=1)),
-            "lattice order 'gama' is no free order; free are alpha, beta, mu, nu",
+            "order 'gama' of order_grid= is no free order; free are alpha, beta, mu, nu",
         ),
         (
             lambda: values(ftlm.order_grid(beta=1), "D^1.5 y = a y"),
-            "lattice order 'beta' is no free order; free are none",
+            "order 'beta' of order_grid= is no free order; free are none",
         ),
         (lambda: values(ftlm.OrderGrid(increment=1e-7)), "has 9.5e+06 values, more than 1000000"),
     ],
@@ -710,12 +710,16 @@ TOO_MANY = "candidates, more than the limit of"
     [
         (EQUATION, {"orders": {"alpha": [0.5], "beta": [1.0]}}, "the lattice holds no candidate"),
         (EQUATION, {"orders": {"alpha": [0.0]}}, "order alpha = 0 is outside (0, 10]; move the interval of alpha"),
-        ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"step": 0.002}, TOO_MANY),
+        ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"increment": 0.002}, TOO_MANY),
         # Refused from the lengths of the axes: to go through them would take minutes.
-        (EQUATION, {"step": 0.001}, TOO_MANY),
-        (EQUATION, {"step": 1e-4}, ": up to 11.7 years of one core at 10 ns each, as fast as searches are at best;"),
+        (EQUATION, {"increment": 0.001}, TOO_MANY),
+        (
+            EQUATION,
+            {"increment": 1e-4},
+            ": up to 11.7 years of one core at 10 ns each, as fast as searches are at best;",
+        ),
         ("D^alpha y = a D^(alpha+0.1) y + b u", {}, "the lattice holds no candidate"),
-        ("D^alpha y = a D^(alpha-beta) y + b D^mu u + c D^nu u", {"step": 0.002}, TOO_MANY),
+        ("D^alpha y = a D^(alpha-beta) y + b D^mu u + c D^nu u", {"increment": 0.002}, TOO_MANY),
         ("D^1.5 y = a y + b u", {}, "every order is a number, so there is nothing to search"),
         ("D^alpha y = a y + b u; D^beta z = c z", {}, "one by one: pass .equation('y') or use identify"),
     ],
@@ -729,7 +733,7 @@ def test_nothing_or_too_much_to_search_is_refused(run, text, order_grid, message
 def test_what_is_no_structure_no_lattice_and_no_run_is_refused(run):
     with pytest.raises(ftlm.ModelError, match="equation is str, not a structure; use"):
         ftlm.search_orders(run, EQUATION)
-    with pytest.raises(ftlm.ModelError, match="lattice is dict, not a Lattice"):
+    with pytest.raises(ftlm.ModelError, match="order_grid is dict, not an OrderGrid"):
         ftlm.search_orders(run, ftlm.equation(EQUATION), GRID)
     with pytest.raises(ftlm.DataError, match="no run is given"):
         ftlm.search_orders([], ftlm.equation(EQUATION))

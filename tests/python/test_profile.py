@@ -332,7 +332,7 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
     joint = replace(
         plain.fit,
         coefficients=dict(zip("abe", values.tolist(), strict=True)),
-        on_grid=values,
+        finest_grid_values=values,
         covariance=np.diag([1.0, np.inf, np.inf]),
     )
     seen = replace(plain, task=task, fit=joint).profile(threads=1)

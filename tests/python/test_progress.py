@@ -223,7 +223,7 @@ ASKED = {
         "run.csv -u u -y y --increment 0.1 --structure",
         "D^alpha y = a0 y + b0 u",
     ),
-    "agreement": ("fitting all parts", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
+    "consistency": ("fitting all segments", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "select": ("choosing", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "search": ("the search", "run.csv -u u -y y --increment 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
     "identify-frequency": ("the fit", "bode.csv -u u -y y --structure", "D^alpha y = a0 y + b0 u"),

@@ -390,7 +390,7 @@ def test_checked_runs_pass_untouched_and_keep_their_records():
     assert records(runs, structure, 98)[0] is not records(runs, structure, 98)[0]
     with pytest.raises(ValueError, match="read-only"):
         first.means[0, 0] = 1.0
-    assert pickle.loads(pickle.dumps(runs))._kept == {}
+    assert pickle.loads(pickle.dumps(runs))._cache == {}
 
 
 def test_what_is_kept_with_runs_goes_with_them():

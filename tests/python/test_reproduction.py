@@ -401,7 +401,7 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
         "other.csv",
         "--increment",
         "0.25",
-        "--seed",
+        "--seeds",
         "5",
         "--evaluations",
         "400",

@@ -11,7 +11,7 @@ from scipy.signal import cont2discrete
 import ftlm
 import lagrange
 from ftlm import _core, rig
-from ftlm.cli import main as app
+from ftlm.cli.main import app
 from ftlm.rig.rig import CURRENT_LIMIT, ENCODER_SCALE, STRAIN_SCALE
 from ftlm.rig.virtual_board import VirtualBoard
 

@@ -281,7 +281,11 @@ REFUSED = [
     ({"reference": np.zeros((200, 2)), "rig": 10**5000}, ftlm.ModelError, "rig is a int"),
     ({"reference": np.zeros((200, 2)), "rate": 10**5000}, ftlm.ModelError, "rate = an integer of"),
     ({"reference": np.zeros((200, 2)), "watchdog": "0.1"}, ftlm.ModelError, "watchdog = '0.1' is not a number"),
-    ({"reference": np.zeros((200, 2)), "real_time": None}, ftlm.ModelError, "paced = None is neither True nor False"),
+    (
+        {"reference": np.zeros((200, 2)), "real_time": None},
+        ftlm.ModelError,
+        "real_time = None is neither True nor False",
+    ),
     ({"reference": np.zeros((200, 2)), "arm": "no"}, ftlm.ModelError, "arm = 'no' is neither True nor False"),
     ({"reference": np.zeros((200, 2)), "progress": 5}, ftlm.ModelError, "progress is a int"),
     ({"reference": np.zeros((200, 2)), "offset": "ab"}, ftlm.ModelError, "offset = 'ab' is not a pair"),

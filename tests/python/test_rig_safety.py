@@ -15,7 +15,7 @@ import pytest
 
 import ftlm
 from ftlm import rig
-from ftlm.cli import main as app
+from ftlm.cli.main import app
 from ftlm.rig import quanser, watchdog
 from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.rig import shut_down
@@ -33,7 +33,7 @@ class Watched(rig.VirtualBoard):
         super().__init__(**options)
         self.log, self.hook = [], None
 
-    def _put(self, volts1, volts2):
+    def _output_volts(self, volts1, volts2):
         # The first write sets up; from then on there is one a sample.
         at = len(self.log) - 1
         if self.hook is not None:
@@ -180,7 +180,7 @@ def test_return_leaves_the_motors_off(bench):
         link.run(drive())
         assert bench.enabled
         assert len(link.take()) == 400
-    assert link.troubles == []
+    assert link.shutdown_errors == []
     bench.assert_safe(within=502)
 
 
@@ -249,8 +249,8 @@ def test_every_step_of_the_way_out_is_tried(bench, failing, monkeypatch):
 
             monkeypatch.setattr(bench.board, name, step)
     assert done == ["write", "enable", "stop", "stop_watchdog", "close"]
-    assert "no answer" in link.troubles[0]
-    assert link.troubles[1:] == (
+    assert "no answer" in link.shutdown_errors[0]
+    assert link.shutdown_errors[1:] == (
         ["the watchdog was let expire instead, which puts 0 V out"] if failing in ("write", "enable") else []
     )
     monkeypatch.undo()
@@ -313,14 +313,14 @@ import sys
 sys.path.insert(0, {here!r})
 from ftlm import rig
 if {kind!r} == "virtual":
-    board = rig.VirtualBoard(page={page!r}, paced=True)
+    board = rig.VirtualBoard(page={page!r}, real_time=True)
 else:
     from quanser_stand_in import Board
     from ftlm.rig.quanser import QuanserBoard
     sys.modules |= Board("linear", page={page!r}).modules()
     board = QuanserBoard()
 # A busy machine may be late before it is struck; that is not what is tested here.
-rig.experiment.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+rig.recording.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
 rig.record(board, arm=True, input="sine", amplitude=0.2, duration=25.0, watchdog=1.0, out={out!r})
 """
 
@@ -344,7 +344,7 @@ def child(kind, tmp_path):
 
 def until_expired(page):
     until = time.monotonic() + 30
-    while not page.expired or page.volts != (0.0, 0.0):
+    while not page.has_expired or page.volts != (0.0, 0.0):
         assert time.monotonic() < until
         time.sleep(0.01)
 
@@ -384,7 +384,7 @@ def test_a_frozen_program_leaves_the_motors_off_and_wakes_to_a_fault(kind, tmp_p
 COMMAND = """
 import sys
 from ftlm import cli, rig
-rig.experiment.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+rig.recording.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
 sys.argv = ["ftlm", "record", "--real-time", "--duration", "25", "--watchdog", "1", "-o", {out!r}]
 cli.main()
 """

@@ -340,9 +340,8 @@ def test_corners_are_those_of_the_definition() -> None:
         )
         / 1.5446858458505939
     )
-    read = _core.interpolate_samples(response[None], places)[0] + _core.kink_correction(
-        m, places, (jumps, sizes), eta, h
-    )
+    read = _core.interpolate_samples(response[None], places)[0]
+    read += _core.kink_correction(m, places, (jumps, sizes), eta, h)
     exact = [np.sum(sizes * np.clip(p - jumps, 0, None) ** eta) * h**eta / gamma(eta + 1) for p in places]
     assert gamma(eta + 2) == pytest.approx(1.5446858458505939)
     near = np.array([np.min(np.abs(p - jumps)) < 14 for p in places])

@@ -66,7 +66,7 @@ def chosen(runs):
 
 def test_the_true_structure_is_chosen_from_a_richer_one(chosen):
     assert chosen.winner.name == "D^2 y = d D^1 y + a y + b0 u"
-    assert chosen.winner.numbers == 3
+    assert chosen.winner.parameters == 3
     truth = {"d": -5.0, "a": -40.0, "b0": 40.0}
     for name, value in truth.items():
         low, high = chosen.best.intervals[name]
@@ -474,7 +474,7 @@ def test_none_wins_that_fails_where_another_does_not():
         failing, failing, [failing, other]
     )
     # One that grows without bound fails nobody, nor do stretches that nobody predicts, of noise alone.
-    grown = replace(stretches("grown", (80, 80, 80, 60)), grows=True)
+    grown = replace(stretches("grown", (80, 80, 80, 60)), unstable=True)
     assert _rank_trials([grown, failing]) == [failing, grown]
     quiet = [stretches("one", (90, 90, 90, -1)), stretches("two", (89, 89, 89, 3))]
     assert _rank_trials(quiet) == quiet

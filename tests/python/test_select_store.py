@@ -253,7 +253,7 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
         if what == "a fit":
             return kept.fit(FIRST, [], True, lambda: joint)
         if what == "a judgement":
-            return kept.judgement("first", FIRST, joint, False, lambda: trial.Trial("first", FIRST, 2, failed="x"))
+            return kept.validation("first", FIRST, joint, False, lambda: trial.Trial("first", FIRST, 2, failed="x"))
         return kept.subsets(FIRST, list)
 
     questions, answers = ("a fit", "a judgement", "subsets"), {}

@@ -144,7 +144,7 @@ def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
 def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, clean_a, monkeypatch):
     from typer.testing import CliRunner
 
-    from ftlm.cli import main as app
+    from ftlm.cli.main import app
 
     data, path = tmp_path / "a.csv", str(tmp_path / "s.ftlm")
     clean_a.to_csv(data)
@@ -160,7 +160,7 @@ def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, c
     assert "100.0 %" in CliRunner().invoke(app, ["status", path]).stdout
     other = CliRunner().invoke(app, [*call, "--store", path, "--top", "5"])
     assert other.exit_code == 3
-    assert "other settings: keep = 5" in other.stderr
+    assert "other settings: top = 5" in other.stderr
     # Under the order law both are one search.
     law = ["search", str(data), *common, "--laws", "orders"]
     plain = CliRunner().invoke(app, law)
@@ -362,7 +362,7 @@ def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, e
     path.write_bytes(damaged)
     end = read_store(path).end
     for again in (lambda: search(run, path), lambda: ftlm.resume_search(path)):
-        with pytest.raises(ftlm.DataError, match=f"is damaged: the frame at byte {end} .*--recover"):
+        with pytest.raises(ftlm.DataError, match=f"is damaged: the frame at byte {end} .*recover=True"):
             again()
     assert path.read_bytes() == damaged
     assert "damaged" in str(ftlm.search_status(path)["y"])
@@ -522,7 +522,7 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
 def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage_expected, tmp_path, monkeypatch):
     path = tmp_path / "s.ftlm"
     path.write_bytes(stage_store)
-    monkeypatch.setattr("ftlm.order_search.schedule.StageWork.build_evaluator", None)
+    monkeypatch.setattr("ftlm.order_search.schedule.CoupledProblem.build_evaluator", None)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert ftlm.search_status(path)["stage"].complete
     held = msgspec.structs.asdict(read_store(path).sections[0].joined)
@@ -663,7 +663,7 @@ def test_a_store_where_nothing_is_searched_is_refused(stage_run, tmp_path):
 def test_the_command_identify_goes_on_with_its_store(tmp_path, clean_a):
     from typer.testing import CliRunner
 
-    from ftlm.cli import main as app
+    from ftlm.cli.main import app
 
     data, path = tmp_path / "a.csv", tmp_path / "s.ftlm"
     clean_a.to_csv(data)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.estimation.methods import METHODS
+from ftlm.estimation.methods import METHODS_BY_NAME
 from ftlm.utils.validation import available_threads, check_threads
 
 WORDS = "D^1.5 y = a y + b u"
@@ -49,7 +49,7 @@ def test_the_log_tells_files_fits_and_doubts(run, tmp_path, caplog):
 
 def test_a_program_that_does_not_listen_hears_nothing():
     script = (
-        "import logging, ftlm, numpy as np; from ftlm.base.log import LOG; LOG.warning('loud'); "
+        "import logging, ftlm, numpy as np; from ftlm.utils.files import PACKAGE_LOGGER as log; log.warning('loud'); "
         "print([type(h).__name__ for h in logging.getLogger('ftlm').handlers], logging.getLogger().handlers)"
     )
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -78,7 +78,7 @@ def test_the_environment_gives_the_threads_of_what_does_not_say_its_own(monkeypa
         ("identify --meth", {"--method"}),
         (
             "identify --method ",
-            set(METHODS),
+            set(METHODS_BY_NAME),
         ),
         ("identify-frequency --weights ", {"auto", "relative", "uniform", "deviation"}),
     ],

@@ -156,9 +156,9 @@ def test_a_fit_that_is_worse_than_what_it_contains_tells_nothing(fractional):
     link = fractional.deflections["theta12"]
     assert link.worse("both fractional") == []
     fitted = link.fits["fractional damping"]["first"]
-    own = fitted.compared["first"]
+    own = fitted.comparisons["first"]
     flown = replace(own, output_error={n: replace(f, fit=50.0) for n, f in own.output_error.items()})
-    lost = replace(fitted, compared={**fitted.compared, "first": flown})
+    lost = replace(fitted, comparisons={**fitted.comparisons, "first": flown})
     fits = {**link.fits, "fractional damping": {**link.fits["fractional damping"], "first": lost}}
     broken = replace(link, fits=fits)
     assert broken.worse("fractional damping") == ["first"]
@@ -223,7 +223,7 @@ def test_places_are_told_before_and_after_the_rate(fractional, tmp_path):
     link = fractional.deflections["theta12"]
     assert places_table(fractional) is None
     idle = {
-        run: replace(each, compared=link.fits["whole orders"][run].compared)
+        run: replace(each, comparisons=link.fits["whole orders"][run].comparisons)
         for run, each in link.fits["fractional damping"].items()
     }
     after = replace(link, fits={**link.fits, "fractional damping": idle}, before=link)

@@ -18,7 +18,7 @@ from ftlm.estimation import estimators as estimating
 from ftlm.estimation import nuisance_parameters as history
 from ftlm.estimation.output_error import ProfileInterval, fit_output_error
 from ftlm.estimation.verdict import saved_verdict
-from ftlm.report import html_report as model_page
+from ftlm.report.html_report import model_page
 from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, OTHER_KIND, WARNING_KINDS, group_warnings, warning_kind
 from loops import loop
 
@@ -323,7 +323,7 @@ def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checke
         assert worse(found, residuals=part).verdict(checked).trusted == trusted
     part = replace(
         found.residuals,
-        outputs={"y": replace(tests, inputs={"u": replace(tests.inputs["u"], passed=False, decided=True)})},
+        outputs={"y": replace(tests, inputs={"u": replace(tests.inputs["u"], passed=False, conclusive=True)})},
     )
     assert worse(found, residuals=part).verdict(checked).reason == (
         "residuals of y still follow u: it leaves something out"

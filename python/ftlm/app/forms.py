@@ -126,7 +126,7 @@ class FitRequest:
         }[self.way]
 
     def settings(self) -> dict[str, str]:
-        """Given options of the fit other than runs and structure."""
+        """Options of the fit that the user gave, other than runs and structure."""
         given = {"method": self.method, "offset": self.offset, "loss": self.loss}
         return {name: value for name, value in given.items() if value}
 

@@ -44,10 +44,10 @@ _FIELD_LABELS = {
 }
 #: Python argument with its value, or with a placeholder in capitals.
 _ARGUMENT_PATTERN = re.compile(
-    r"\b(resample|time_unit|missing|step|time|window)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b)?|layout=dict\((\w+)=[^)]*\)"
+    r"\b(resample|time_unit|missing|step|time|window)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b|\([^()]*\))?|layout=dict\((\w+)=[^)]*\)"
 )
 _PHRASE_REPLACEMENTS = (
-    (re.compile(r" \(commands: [^)]*\)"), ""),
+    (re.compile(r", or in a file for columns="), ""),
     (re.compile(r"inputs=\{name: column\} and outputs=\{name: column\}"), "the roles below"),
 )
 _VERDICT_RANKS = {"trust": 0, "with care": 1, "do not use": 2}

@@ -158,7 +158,8 @@ def record(
     ] = None,
     real_time: Annotated[bool, Option("--real-time", help="Run the virtual rig in real time.")] = False,
     sensor_filter: Annotated[
-        Literal["stock"] | None, Option(help="Record behind the stock 2 Hz low-pass filter; default none.")
+        Literal["stock"] | None,
+        Option(metavar="stock", help="Record behind the stock 2 Hz low-pass filter; default none."),
     ] = None,
     watchdog: Annotated[float, Option(help="Time after which the motors are stopped [s].")] = 0.1,
     arm: Annotated[bool, Option("--arm", help="Confirm that a real arm may move.")] = False,

@@ -14,10 +14,10 @@ from typer import Argument, Option
 
 from ftlm.cli.framework import EXIT_INTERRUPTED, command, numbers, pairs, print_text, ranges, show, show_json
 from ftlm.cli.options import (
-    FILE,
-    METHOD,
-    OUTPUT,
-    STRUCTURE,
+    FILE_PANEL,
+    METHOD_PANEL,
+    OUTPUT_PANEL,
+    STRUCTURE_PANEL,
     BlockPulses,
     CandidateTexts,
     Decimal,
@@ -91,7 +91,7 @@ def identify(
     *,
     files: Files,
     structure: StructureText,
-    method: Annotated[Method, Option(rich_help_panel=METHOD, help="Estimation method.")] = "output-error",
+    method: Annotated[Method, Option(rich_help_panel=METHOD_PANEL, help="Estimation method.")] = "output-error",
     reading: ReadingOptions,
     shape: StructureOptions,
     fit: OutputErrorOptions,
@@ -104,7 +104,7 @@ def identify(
     out: Out = None,
     report: Report = None,
     validation: Annotated[
-        Text, Option(metavar="FILE", rich_help_panel=OUTPUT, help="Validate the model on this run.")
+        Text, Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Validate the model on this run.")
     ] = None,
     force: Force = False,
     verbose: Verbose = False,
@@ -159,7 +159,7 @@ def search(
     files: Files,
     structure: StructureText,
     coefficients: Annotated[
-        Estimator, Option(rich_help_panel=METHOD, help="Estimation method of the coefficients.")
+        Estimator, Option(rich_help_panel=METHOD_PANEL, help="Estimation method of the coefficients.")
     ] = "multi-innovation",
     reading: ReadingOptions,
     shape: StructureOptions,
@@ -212,22 +212,24 @@ def certify(
     shape: StructureOptions,
     order_grid: Annotated[
         Texts,
-        Option(metavar="NAME=LOW:HIGH:STEP", rich_help_panel=METHOD, help="Interval of an order; alpha: every alpha."),
+        Option(
+            metavar="NAME=LOW:HIGH:STEP", rich_help_panel=METHOD_PANEL, help="Interval of an order; alpha: every alpha."
+        ),
     ] = None,
     increment: Annotated[
-        Number, Option(rich_help_panel=METHOD, help="Increment of the order grid; default 0.05.")
+        Number, Option(rich_help_panel=METHOD_PANEL, help="Increment of the order grid; default 0.05.")
     ] = None,
     tolerance: Annotated[
-        float, Option(rich_help_panel=METHOD, help="How much smaller other errors may be, as a fraction.")
+        float, Option(rich_help_panel=METHOD_PANEL, help="How much smaller other errors may be, as a fraction.")
     ] = DEFAULT_TOLERANCE,
     min_separation: Annotated[
-        Number, Option(rich_help_panel=METHOD, help="Minimum distance of orders; default the increment.")
+        Number, Option(rich_help_panel=METHOD_PANEL, help="Minimum distance of orders; default the increment.")
     ] = None,
     max_term_ratio: Annotated[
-        float, Option(rich_help_panel=METHOD, help="Maximum RMS of an equation's terms per RMS of its output.")
+        float, Option(rich_help_panel=METHOD_PANEL, help="Maximum RMS of an equation's terms per RMS of its output.")
     ] = DEFAULT_MAX_TERM_RATIO,
     max_cells: Annotated[
-        int, Option(rich_help_panel=METHOD, help="Maximum number of boxes of orders.")
+        int, Option(rich_help_panel=METHOD_PANEL, help="Maximum number of boxes of orders.")
     ] = DEFAULT_MAX_CELLS,
     m: BlockPulses = None,
     threads: Threads = None,
@@ -337,7 +339,7 @@ def status(*, store: SavedStore, as_json: Json = False) -> None:
 class ResponseOptions:
     """Options for reading frequency responses; None for an option that is not given."""
 
-    panel: ClassVar[str] = FILE
+    panel: ClassVar[str] = FILE_PANEL
 
     columns: Annotated[
         Texts, Option(metavar="PART=COLUMN", help="Column of frequency, real, imag, magnitude, phase, deviation.")
@@ -387,28 +389,32 @@ def identify_frequency(
     structure: Annotated[
         str,
         Option(
-            metavar="EQUATION", rich_help_panel=STRUCTURE, help="Equation in words, such as D^alpha y = a0 y + b0 u."
+            metavar="EQUATION",
+            rich_help_panel=STRUCTURE_PANEL,
+            help="Equation in words, such as D^alpha y = a0 y + b0 u.",
         ),
     ],
     weights: Annotated[
         Literal["auto", "relative", "uniform", "deviation"],
-        Option(rich_help_panel=METHOD, help="Weights; auto: deviations if the file has them."),
+        Option(rich_help_panel=METHOD_PANEL, help="Weights; auto: deviations if the file has them."),
     ] = "auto",
     reading: ResponseOptions,
     orders: Annotated[
         Texts,
-        Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE, help="Fix an order, or give LOW:HIGH:STEP."),
+        Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix an order, or give LOW:HIGH:STEP."),
     ] = None,
     fixed: Fixed = None,
     delay: Delay = None,
     start: Annotated[
         Texts,
-        Option(metavar="NAME=VALUE", rich_help_panel=METHOD, help="Additional initial guess of a free parameter."),
+        Option(
+            metavar="NAME=VALUE", rich_help_panel=METHOD_PANEL, help="Additional initial guess of a free parameter."
+        ),
     ] = None,
     out: Out = None,
     report: Report = None,
     validation: Annotated[
-        Text, Option(metavar="FILE", rich_help_panel=OUTPUT, help="Validate the model on this response.")
+        Text, Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Validate the model on this response.")
     ] = None,
     force: Force = False,
     verbose: Verbose = False,
@@ -459,7 +465,7 @@ def select(
         Text,
         Option(
             metavar="runs|blocks|FILE",
-            rich_help_panel=METHOD,
+            rich_help_panel=METHOD_PANEL,
             help="Cross-validate over runs or quarters, or on another run.",
         ),
     ] = None,
@@ -513,7 +519,8 @@ def consistency(
     reading: ReadingOptions,
     shape: StructureOptions,
     segments: Annotated[
-        int | None, Option(rich_help_panel=METHOD, help="Segments of one run; several runs are segments; default 2.")
+        int | None,
+        Option(rich_help_panel=METHOD_PANEL, help="Segments of one run; several runs are segments; default 2."),
     ] = None,
     loss: Loss = None,
     threads: Threads = None,

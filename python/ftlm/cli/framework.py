@@ -122,7 +122,7 @@ EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTE
 #: Options whose value is the method that a command uses, and flag for the options of all methods.
 METHOD_FLAGS, HELP_ALL_FLAG = ("--method", "--coefficients"), "--help-all"
 #: Order of the panels in a help text; options of no panel come last.
-PANELS = ("File", "Structure", "Method", "Output")
+OPTION_PANELS = ("File", "Structure", "Method", "Output")
 OTHER_PANEL = "Options"
 
 
@@ -161,7 +161,7 @@ class Command(TyperCommand):
         if option is None:
             return None
         chosen = option.default
-        for word, following in zip(args, [*args[1:], ""], strict=True):
+        for word, following in zip(args, [*args, ""][1:], strict=True):
             flag, equals, value = word.partition("=")
             if flag in option.opts:
                 chosen = value if equals else following
@@ -170,7 +170,10 @@ class Command(TyperCommand):
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options by panel; of the options of methods those of the chosen one."""
         method = ctx.meta.get("method")
-        panels: dict[str, list[tuple[str, str]]] = {"Arguments": [], **{name: [] for name in (*PANELS, OTHER_PANEL)}}
+        panels: dict[str, list[tuple[str, str]]] = {
+            "Arguments": [],
+            **{name: [] for name in (*OPTION_PANELS, OTHER_PANEL)},
+        }
         hidden = False
         for parameter in self.get_params(ctx):
             told: Any = parameter

@@ -14,7 +14,7 @@ from ftlm.arm.flexible_link import Law, flexible_link
 from ftlm.cli.framework import announce_reading, interval, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation.methods import METHODS
+from ftlm.estimation.methods import METHODS_BY_NAME
 from ftlm.io.dialect import Layout
 from ftlm.io.load import load
 from ftlm.io.preview import OpenedFile, open_file
@@ -26,7 +26,7 @@ from ftlm.structure.structure import INITIAL_CHOICES, Structure, check_initial
 from ftlm.utils.parameters import parameter
 
 #: Panels of options in a command's help.
-FILE, STRUCTURE, METHOD, OUTPUT = "File", "Structure", "Method", "Output"
+FILE_PANEL, STRUCTURE_PANEL, METHOD_PANEL, OUTPUT_PANEL = "File", "Structure", "Method", "Output"
 #: Types of optional options.
 Text = str | None
 Number = float | None
@@ -37,38 +37,45 @@ SavedModel = Annotated[str, Argument(metavar="MODEL", help="Saved model.")]
 StructureText = Annotated[
     str,
     Option(
-        "--structure", rich_help_panel=STRUCTURE, help="flexible-link:1|2|both, arm:1|2|both or an equation in words."
+        "--structure",
+        rich_help_panel=STRUCTURE_PANEL,
+        help="flexible-link:1|2|both, arm:1|2|both or an equation in words.",
     ),
 ]
 CandidateTexts = Annotated[
     list[str],
-    Option("--structure", rich_help_panel=STRUCTURE, help="Largest structure, several to compare, or auto."),
+    Option("--structure", rich_help_panel=STRUCTURE_PANEL, help="Largest structure, several to compare, or auto."),
 ]
 GridIncrement = Annotated[float, Option("--increment", help="Increment of the order grid.")]
 BlockPulses = Annotated[
-    int | None, Option("--m", rich_help_panel=METHOD, help="Block pulses per run; default 2048, or as many as fit.")
+    int | None,
+    Option("--m", rich_help_panel=METHOD_PANEL, help="Block pulses per run; default 2048, or as many as fit."),
 ]
 Threads = Annotated[
-    int | None, Option("--threads", rich_help_panel=METHOD, help="Threads; default FTLM_THREADS, or all cores.")
+    int | None, Option("--threads", rich_help_panel=METHOD_PANEL, help="Threads; default FTLM_THREADS, or all cores.")
 ]
 StoreFile = Annotated[
-    Text, Option(metavar="FILE", rich_help_panel=OUTPUT, help="Checkpoint file; the same command resumes from it.")
+    Text,
+    Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Checkpoint file; the same command resumes from it."),
 ]
 Out = Annotated[
-    Text, Option("-o", "--out", metavar="FILE", rich_help_panel=OUTPUT, help="Write the model to this .json file.")
+    Text,
+    Option("-o", "--out", metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Write the model to this .json file."),
 ]
 Page = Annotated[
-    str, Option("-o", "--out", metavar="HTML", rich_help_panel=OUTPUT, help="Write the page to this file.")
+    str, Option("-o", "--out", metavar="HTML", rich_help_panel=OUTPUT_PANEL, help="Write the page to this file.")
 ]
 Report = Annotated[
-    Text, Option("--report", metavar="HTML", rich_help_panel=OUTPUT, help="Write an HTML report to this file.")
+    Text, Option("--report", metavar="HTML", rich_help_panel=OUTPUT_PANEL, help="Write an HTML report to this file.")
 ]
-Force = Annotated[bool, Option("--force", rich_help_panel=OUTPUT, help="Overwrite existing files.")]
-Json = Annotated[bool, Option("--json", rich_help_panel=OUTPUT, help="Print the result as JSON.")]
-Verbose = Annotated[bool, Option("-v", "--verbose", rich_help_panel=OUTPUT, help="Print all details and all warnings.")]
+Force = Annotated[bool, Option("--force", rich_help_panel=OUTPUT_PANEL, help="Overwrite existing files.")]
+Json = Annotated[bool, Option("--json", rich_help_panel=OUTPUT_PANEL, help="Print the result as JSON.")]
+Verbose = Annotated[
+    bool, Option("-v", "--verbose", rich_help_panel=OUTPUT_PANEL, help="Print all details and all warnings.")
+]
 Loss = Annotated[
     Literal["squares", "huber"] | None,
-    Option(rich_help_panel=METHOD, help="Loss of residuals; huber resists outliers; default squares."),
+    Option(rich_help_panel=METHOD_PANEL, help="Loss of residuals; huber resists outliers; default squares."),
 ]
 Noise = Annotated[
     Texts, Option(metavar="OUTPUT=A", help="Noise standard deviation of an output; default the fit's residual.")
@@ -88,10 +95,11 @@ HeaderLines = Annotated[
     int | None, Option(metavar="0|1|2", help="Header lines: none, names, names and units; default detected.")
 ]
 Sheet = Annotated[Text, Option(help="Sheet of a workbook.")]
-Orders = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE, help="Fix an order.")]
-Fixed = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE, help="Fix a coefficient.")]
+Orders = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix an order.")]
+Fixed = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix a coefficient.")]
 Delay = Annotated[
-    Texts, Option(metavar="INPUT=SECONDS", rich_help_panel=STRUCTURE, help="Delay of an input; LOW:HIGH is estimated.")
+    Texts,
+    Option(metavar="INPUT=SECONDS", rich_help_panel=STRUCTURE_PANEL, help="Delay of an input; LOW:HIGH is estimated."),
 ]
 
 
@@ -103,14 +111,14 @@ def layout_options(record: object) -> dict[str, Any]:
 
 def methods_with(*options: str) -> tuple[str, ...]:
     """Return the names of the methods of estimation that have these options."""
-    return tuple(name for name, method in METHODS.items() if set(options) <= {f.name for f in fields(method)})
+    return tuple(name for name, method in METHODS_BY_NAME.items() if set(options) <= {f.name for f in fields(method)})
 
 
 @dataclass(frozen=True)
 class ReadingOptions:
     """Options for reading files."""
 
-    panel: ClassVar[str] = FILE
+    panel: ClassVar[str] = FILE_PANEL
 
     time: Annotated[Text, Option(help="Time column; default found by its name.")] = None
     time_unit: Annotated[
@@ -212,7 +220,7 @@ class ReadingOptions:
 class StructureOptions:
     """Options that modify a structure; None for an option that is not given."""
 
-    panel: ClassVar[str] = STRUCTURE
+    panel: ClassVar[str] = STRUCTURE_PANEL
 
     only: Annotated[Text, Option(metavar="OUTPUT", help="Fit the equation of this output only; default all.")] = None
     coupling: Annotated[
@@ -421,7 +429,7 @@ class StructureOptions:
 class OrderGridOptions:
     """Order grid of a search and its norm; None for an option that is not given."""
 
-    panel: ClassVar[str] = METHOD
+    panel: ClassVar[str] = METHOD_PANEL
     methods: ClassVar[tuple[str, ...]] = methods_with("order_grid", "norm")
 
     order_grid: Annotated[
@@ -444,7 +452,7 @@ class OrderGridOptions:
 class RankingOptions:
     """Options of the ranking of candidates; None for an option that is not given."""
 
-    panel: ClassVar[str] = METHOD
+    panel: ClassVar[str] = METHOD_PANEL
     methods: ClassVar[tuple[str, ...]] = methods_with("criterion", "top", "store")
 
     criterion: Annotated[Criterion | None, Option(help="Error that ranks candidates; default output-error.")] = None
@@ -456,7 +464,7 @@ class RankingOptions:
 class MultiInnovationOptions:
     """Options of the multi-innovation method; None for an option that is not given."""
 
-    panel: ClassVar[str] = METHOD
+    panel: ClassVar[str] = METHOD_PANEL
     methods: ClassVar[tuple[str, ...]] = methods_with("innovation_length", "prior_covariance", "row_basis")
 
     innovation_length: Annotated[int | None, Option(help="Innovation length p; default 7.")] = None
@@ -468,7 +476,7 @@ class MultiInnovationOptions:
 class OutputErrorOptions:
     """Options of the output-error method; None for an option that is not given."""
 
-    panel: ClassVar[str] = METHOD
+    panel: ClassVar[str] = METHOD_PANEL
     methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference")
 
     loss: Loss = None
@@ -486,7 +494,7 @@ class OutputErrorOptions:
 class GeneticOptions:
     """Options of the genetic algorithm; None for an option that is not given."""
 
-    panel: ClassVar[str] = METHOD
+    panel: ClassVar[str] = METHOD_PANEL
     methods: ClassVar[tuple[str, ...]] = methods_with("seeds", "evaluations")
 
     seeds: Annotated[

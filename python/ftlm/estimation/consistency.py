@@ -263,7 +263,7 @@ def _cell(value: Cell) -> str:
 
 def values_of(result: Identification) -> dict[str, float]:
     """Return all parameters with a standard error, by name."""
-    return {**result.orders, **result.coefficients, **({} if result.fit is None else result.parameter_values)}
+    return {**result.orders, **result.coefficients, **result.parameter_values}
 
 
 def consistency(
@@ -322,7 +322,7 @@ def consistency(
     chosen = resolve_method(method)
     kept = [n for n in ("store", "start") if getattr(chosen, n, None) is not None]
     if kept:
-        raise ModelError(f"{kept[0]}= is of one identification, and each part has its own; leave it out")
+        raise ModelError(f"{parameter(kept[0])} is of one identification, and each part has its own; leave it out")
     pieces = split_run(every[0], given or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
     names = _segment_names(pieces)
     results: list[Identification] = []

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
 from ftlm.estimation.confidence_intervals import Intervals, with_intervals
@@ -20,7 +21,7 @@ from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_s
 from ftlm.estimation.linear import estimate_coefficients, step_bias_warnings
 from ftlm.estimation.model_checks import coefficient_law_warnings, identifiability_warnings, sample_warnings
 from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_initial_conditions
-from ftlm.estimation.objective import Iterate, Objective, long_run_covariance
+from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, Loss
 from ftlm.estimation.result import Task
 from ftlm.model.model import Model
@@ -119,9 +120,12 @@ def _moment_norm(moment: tuple[Iterate, Floats, Floats]) -> float:
 
 
 def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
-    """Return the covariance of the parameters from the influence of each residual on each of them."""
+    """Return the covariance from the influence of each residual on each parameter, by Bartlett weights of the lags.
+
+    See doi:10.2307/1913610.
+    """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
-    return long_run_covariance(influence, series)
+    return _core.long_run_covariance(influence, series)
 
 
 #: Largest number of block pulses a run for the final instrumental-variable fit if m is not given.

@@ -133,10 +133,6 @@ class FreeProblem:
                 rows.append(row)
         return np.stack(rows)
 
-    def free_coefficients(self, estimated: Mapping[str, float]) -> list[float]:
-        """Return the free coefficients from separately estimated ones; ratios are medians over equations."""
-        return self.core.free_from(dict(estimated))
-
 
 def core_arguments(structure: Structure) -> Any:
     """Return a structure with decided initial terms as keyword data of the core."""
@@ -255,15 +251,6 @@ def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float
 def sampling_spans(runs: Sequence[Run]) -> list[tuple[float, float]]:
     """Return sample interval and duration of each run [s]."""
     return [(run.step, run.length * run.step) for run in runs]
-
-
-def time_scaling(problem: FreeProblem, runs: Sequence[Run]) -> _core.JointTimeScaling:
-    """Return the time scaling: the geometric mean of the frequencies of the run length and of Nyquist.
-
-    A coefficient of D^nu y beside D^alpha y has the unit of time to the power -(alpha - nu), which changes with free
-    orders.
-    """
-    return problem.core.time_scaling(sampling_spans(runs))
 
 
 #: Relative difference up to which two signals are multiples of each other: rounding of files.

@@ -292,7 +292,7 @@ class FrequencyIdentification:
             )
         for concern in group_warnings(self.warnings):
             if concern.kind.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE):
-                found.append((concern.kind.level, concern.warnings[0].partition(";")[0], concern.kind.remedy))
+                found.append((concern.kind.level, concern.warnings[0].partition(";")[0], concern.kind.format_remedy()))
         if others is not None:
             most = max(e.rms for e in own)
             lost = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]

@@ -263,7 +263,7 @@ def loaded_body_starts(
             found |= reaction_coefficients(structure, item, values, share)
             found |= {n: (1.0 + share) * v for n, v in numbers.items()}
             rest |= orders
-        free = dict(zip(problem.coefficients, problem.free_coefficients(found), strict=True))
+        free = dict(zip(problem.coefficients, problem.core.free_from(found), strict=True))
         rest = {n: v for n, v in rest.items() if n in problem.names}
         words = " and ".join(item.output for item, _, _ in told) + (", each" if len(told) > 1 else "")
         carried = " and ".join(f"{share:g}" for share in (shares[:1] if together else shares))
@@ -324,9 +324,8 @@ def run_frictionless_multistart(
 ) -> _core.JointMultistart:
     """Run the multistart of a problem without friction, with equal weight for every output."""
     runs = RunSampler(alike.problem, alike.runs).core_arguments(progress)
-    return _core.joint_multistart(
-        alike.problem.core, runs, alike.weights, floor, (threads, memory_limit()), stop_flag()
-    )
+    limits = (threads, memory_limit())
+    return _core.joint_multistart(alike.problem.core, runs, alike.weights, floor, limits, stop_flag())
 
 
 def fit_on_coarse_grids(coarse: Objective, starts: Sequence[Iterate], threads: int) -> _core.JointMultistart:

@@ -169,8 +169,8 @@ class OrderSearchMethod:
         changed = [f.name for f in fields(OrderSearchMethod) if getattr(self, f.name) != f.default]
         if changed and not structure.order_names:
             raise ModelError(
-                f"{changed[0]}= is not used: it is for order searches, and every order here is a number; leave it "
-                "out, or free an order"
+                f"{parameter(changed[0])} is not used: it is for order searches, and every order here is a number; "
+                "leave it out, or free an order"
             )
         task, workers = Task(tuple(runs), structure, self.order_grid), threads_per_task(threads, self.executor)
         return estimate_order_search(task, self.settings(), m, workers, progress, self.store, self.executor)
@@ -198,7 +198,7 @@ class LeastSquares(OrderSearchMethod):
 
 @dataclass(frozen=True, kw_only=True)
 class InstrumentalVariables(OrderSearchMethod):
-    """Refined instrumental variables: orders from the order grid, coefficients without the bias of noise.
+    """Instrumental variables, refined: orders from the order grid, coefficients without the bias of noise.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ class MultiInnovation(OrderSearchMethod):
 
 
 #: Methods by the name that stands for their defaults.
-METHODS: dict[str, type[Any]] = {
+METHODS_BY_NAME: dict[str, type[Any]] = {
     method.name: method
     for method in (OutputError, InstrumentalVariables, MultiInnovation, LeastSquares, GeneticAlgorithm)
 }
@@ -251,21 +251,21 @@ METHODS: dict[str, type[Any]] = {
 def resolve_method(method: str | EstimationMethod) -> EstimationMethod:
     """Return a method of estimation from its name, or itself; raise ModelError for anything else."""
     if isinstance(method, str):
-        check_choice("method", method, METHODS)
-        made: EstimationMethod = METHODS[method]()
+        check_choice("method", method, METHODS_BY_NAME)
+        made: EstimationMethod = METHODS_BY_NAME[method]()
         return made
     if isinstance(method, type):
         raise ModelError(f"method is the class {method.__name__}; pass an object, method={method.__name__}()")
     if not (isinstance(getattr(method, "name", None), str) and callable(getattr(method, "fit", None))):
-        known = " or ".join(map(repr, METHODS))
+        known = " or ".join(map(repr, METHODS_BY_NAME))
         raise ModelError(f"method is {type(method).__name__}; use {known}, or an object such as ftlm.OutputError()")
     return method
 
 
 def method_with_options(name: str, options: Mapping[str, Any]) -> EstimationMethod:
     """Return the method of a name with options by name; raise ModelError for an option that it does not have."""
-    check_choice("method", name, METHODS)
-    names = {method: [f.name for f in fields(kind)] for method, kind in METHODS.items()}
+    check_choice("method", name, METHODS_BY_NAME)
+    names = {method: [f.name for f in fields(kind)] for method, kind in METHODS_BY_NAME.items()}
     foreign = [option for option in options if option not in names[name]]
     if foreign:
         users = " or ".join(parameter("method", method) for method, known in names.items() if foreign[0] in known)
@@ -274,5 +274,5 @@ def method_with_options(name: str, options: Mapping[str, Any]) -> EstimationMeth
         raise ModelError(
             f"{parameter(foreign[0])} is not used by {parameter('method', name)}{others}; leave it out, or use {users}"
         )
-    made: EstimationMethod = METHODS[name](**options)
+    made: EstimationMethod = METHODS_BY_NAME[name](**options)
     return made

@@ -367,11 +367,6 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
     return _core.covariance_of(jacobian, series, squares)
 
 
-def long_run_covariance(jacobian: Floats, series: Sequence[Floats]) -> Floats:
-    """Return the long-run covariance of scores with Bartlett weights (doi:10.2307/1913610)."""
-    return _core.long_run_covariance(jacobian, series)
-
-
 def propagated_errors(slopes: Floats, spread: Floats) -> Floats:
     """Return standard errors by first-order propagation, infinite if a variance involved is infinite."""
     unseen = np.isinf(np.diag(spread))

@@ -119,7 +119,7 @@ class Identification:
         Value ± 1.96 standard errors. Parameters of a joint fit with a nonquadratic cost have profile-likelihood
         intervals, which may be asymmetric or unbounded.
         """
-        values = {**self.orders, **self.coefficients, **({} if self.fit is None else self.parameter_values)}
+        values = {**self.orders, **self.coefficients, **self.parameter_values}
         errors = self.standard_errors
         quadratic = {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
         return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}

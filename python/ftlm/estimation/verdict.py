@@ -126,7 +126,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     """
     runs = () if validation is None else (validation,)
     tried = validation is not None and _is_other(validation)
-    against = _combined_verdict(result_findings(result), result.fit_percent, runs, tried)
+    against = _combined_verdict([*result_findings(result)], result.fit_percent, runs, tried)
     if against is not None:
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
@@ -205,12 +205,8 @@ def saved_findings(known: Estimate) -> list[ModelFinding]:
     return found
 
 
-def result_findings(result: Identification) -> list[ModelFinding]:
-    """Return the findings about a result by itself, most serious first within a level."""
-    return [*_rules(result)]
-
-
-def _rules(result: Identification) -> Iterator[ModelFinding]:
+def result_findings(result: Identification) -> Iterator[ModelFinding]:
+    """Yield the findings about a result by itself, most serious first within a level."""
     kinds = {c.kind.name: c for c in group_warnings(result.warnings)}
 
     def of(kind: WarningKind, reason: str = "", remedy: str = "") -> ModelFinding:
@@ -253,7 +249,7 @@ def _rules(result: Identification) -> Iterator[ModelFinding]:
 def _free_runs(result: Identification) -> Iterator[ModelFinding]:
     """Yield findings about simulations: overflow, instability and poor fit."""
     if not all(math.isfinite(f.nr) for f in result.output_error.values()):
-        yield _make_finding(LEVEL_DO_NOT_USE, _KINDS_BY_NAME["range"].what, _KINDS_BY_NAME["range"].remedy)
+        yield _make_finding(LEVEL_DO_NOT_USE, _KINDS_BY_NAME["range"].what, _KINDS_BY_NAME["range"].format_remedy())
     yield from _unstable_poles(result.model)
     yield from _poor_fits("", result.comparison)
 
@@ -268,13 +264,13 @@ def _unstable_poles(model: Model) -> Iterator[ModelFinding]:
     stable = model.stability(coupling=model.structure.coupling)
     if math.isnan(stable.unstable_poles):
         yield _make_finding(
-            LEVEL_WITH_CARE, "whether its free run grows cannot be told", _KINDS_BY_NAME["unstable"].remedy
+            LEVEL_WITH_CARE, "whether its free run grows cannot be told", _KINDS_BY_NAME["unstable"].format_remedy()
         )
     elif stable.unstable_poles > 0:
         count = int(stable.unstable_poles)
         poles = f"{count} pole{'s' if count > 1 else ''} with a positive real part"
         yield _make_finding(
-            LEVEL_DO_NOT_USE, f"{_KINDS_BY_NAME['unstable'].what} ({poles})", _KINDS_BY_NAME["unstable"].remedy
+            LEVEL_DO_NOT_USE, f"{_KINDS_BY_NAME['unstable'].what} ({poles})", _KINDS_BY_NAME["unstable"].format_remedy()
         )
     else:
         with contextlib.suppress(FtlmError):
@@ -302,7 +298,9 @@ def _poor_fits(where: str, comparison: Comparison) -> Iterator[ModelFinding]:
         if useless:
             shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{run})" for o in useless)
             yield _make_finding(
-                LEVEL_DO_NOT_USE, f"the free run explains little of {where}{shown}", _KINDS_BY_NAME["useless"].remedy
+                LEVEL_DO_NOT_USE,
+                f"the free run explains little of {where}{shown}",
+                _KINDS_BY_NAME["useless"].format_remedy(),
             )
             return
 
@@ -327,7 +325,7 @@ def _validation_losses(before: Mapping[str, float], validation: Comparison) -> I
                 and all(left <= times * own or left <= little for times, little in VALIDATION_LOSS_LIMITS)
             ):
                 words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation{run}"
-                yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["lost"].remedy)
+                yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["lost"].format_remedy())
                 return
 
 
@@ -351,19 +349,21 @@ def _residuals(result: Identification) -> Iterator[ModelFinding]:
     if any(following.values()):
         words = ", ".join(f"{o} still follow {_join_names(signals)}" for o, signals in following.items() if signals)
         yield _make_finding(
-            LEVEL_WITH_CARE, f"residuals of {words}: it leaves something out", _KINDS_BY_NAME["residuals"].remedy
+            LEVEL_WITH_CARE,
+            f"residuals of {words}: it leaves something out",
+            _KINDS_BY_NAME["residuals"].format_remedy(),
         )
     for output, tests in judged.items():
         if tests.feedback and not tests.whiteness.passed and not looped:
             words = (
                 f"{_join_names(tests.feedback)} answers {output}, a closed loop, and what comes back biases the numbers"
             )
-            yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["loop"].remedy)
+            yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["loop"].format_remedy())
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not r.whiteness.passed]
     if coloured:
         words = f"residuals of {_join_names(coloured)} are not white: it leaves something out"
-        yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["residuals"].remedy)
+        yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["residuals"].format_remedy())
 
 
 def _is_uncertain(result: Identification, name: str) -> bool:

@@ -44,7 +44,7 @@ def certify_orders(
     """Certify that no orders in the intervals of an order grid, on it or between, have a much smaller equation error.
 
     Branch and bound halves boxes of orders until each has a lower bound of the RMS equation error, with the best
-    coefficients of each of its orders, of at least the best one found times ``1 - within``. The certificate covers
+    coefficients of each of its orders, of at least the best one found times ``1 - tolerance``. The certificate covers
     squared equation errors, equations at rest, and free coefficients only. No such certificate is known for
     simulations.
 

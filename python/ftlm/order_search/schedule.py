@@ -384,7 +384,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
     def __init__(self, work: EquationProblem, algorithm: int | None = None) -> None:
         super().__init__(work, Throughput())
         self.total, self._ends, present = work.plan(algorithm)
-        self.goes_on = algorithm is None or algorithm >= present
+        self.can_resume = algorithm is None or algorithm >= present
         self._parts: list[Part] = []
         self._seed: list[tuple[int, float]] = []
 
