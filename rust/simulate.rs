@@ -114,7 +114,7 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// # use ftlm::regressors::Record;
 /// # use ftlm::simulate;
 /// # fn main() -> ftlm::error::Result<()> {
-/// D y = -2 y from y(0) = 1, and from a constant on its right-hand side, which is t^1.
+/// // D y = -2 y from y(0) = 1, and from a constant on its right-hand side, which is t^1.
 /// let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 0, order: 0.0 }] };
 /// let record = Record::new(0.001, vec![vec![0.0; 1000]], None)?;
 /// let decay = Equation { structure, coefficients: vec![-2.0] };

@@ -20,7 +20,7 @@ pub(crate) struct CandidateIndex<'a> {
     pub(crate) problem: Problem,
     pub(crate) lattice: Cow<'a, OrderGrid>,
     pub(crate) options: Options,
-    /// Memory that remains of the limit [bytes].
+    /// Memory that remains of the limit \[bytes\].
     pub(crate) spare_bytes: u64,
     /// Column of each value of each term, per block of the order grid.
     tables: Vec<Vec<Vec<usize>>>,

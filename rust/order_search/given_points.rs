@@ -16,7 +16,7 @@ use crate::order_search::result::Verdict;
 use crate::parallel::{pool, PerThread};
 use crate::regressors::{Key, Record};
 
-/// Maximum memory of regressors cached between calls [bytes]. A converged population reuses them.
+/// Maximum memory of regressors cached between calls \[bytes\]. A converged population reuses them.
 const MAX_CACHE_BYTES: usize = 256 << 20;
 
 /// Candidate with an order and a coefficient for each term.

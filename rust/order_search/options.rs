@@ -191,7 +191,7 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// Add the rows of a layout [bytes].
+    /// Add the rows of a layout \[bytes\].
     pub(crate) fn add_layout(&mut self, bytes: u128) {
         self.layout += bytes;
         self.bytes += bytes;
@@ -233,7 +233,7 @@ impl Budget {
         self.columns += index.keys().len();
     }
 
-    /// Memory that remains of a limit [bytes].
+    /// Memory that remains of a limit \[bytes\].
     pub(crate) fn remaining_bytes(&self, limit: u64) -> u64 {
         u128::from(limit).saturating_sub(self.bytes).try_into().unwrap_or(u64::MAX)
     }

@@ -168,8 +168,8 @@ pub type FreeEquationArg = (usize, AffineArg, List<(usize, AffineArg, MonomialAr
 pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
 /// Experiment from a dictionary with these keys: record, pulses per sampling interval, samples of each output, filter
-/// of the simulated outputs, weight of each output, (values at the samples, whether held) of each signal, robust weights
-/// of the samples of each output, nonuniform sample times.
+/// of the simulated outputs, weight of each output, (values at the samples, whether held) of each signal, robust
+/// weights of the samples of each output, nonuniform sample times.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct ExperimentArg<'py> {

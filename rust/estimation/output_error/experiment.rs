@@ -169,7 +169,7 @@ impl Experiment {
     /// Equations and filter commute, so that filtering the inputs once replaces filtering every simulated output.
     ///
     /// # Errors
-    /// As [`Record::through`].
+    /// As [`Record::with_filter`].
     pub(crate) fn prefilter_signals(&self) -> Result<Option<Self>> {
         match &self.filter {
             Some((series, applies))

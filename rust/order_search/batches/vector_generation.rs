@@ -33,7 +33,7 @@ const MAX_GENERATION_PASSES: u64 = 4;
 const MIN_OPEN_CANDIDATES: f64 = 16_384.0;
 const MIN_VECTOR_EXCLUSIONS: f64 = 512.0;
 const SELECTION_BIAS_FACTOR: usize = 4;
-/// Maximum memory of test vectors, including those on trial [bytes].
+/// Maximum memory of test vectors, including those on trial \[bytes\].
 const MAX_TAILORED_BYTES: u64 = 256 << 20;
 
 /// Result of one pass of vector generation.
@@ -159,7 +159,7 @@ const MIN_LINEARIZED_EXCLUSIONS: f64 = 32.0;
 /// Maximum vectors for the same own orders, and maximum unsuccessful trials.
 const MAX_LINEARIZED_VECTORS: usize = 24;
 const MAX_FAILED_VECTORS: usize = 6;
-/// Maximum memory of all vectors [bytes].
+/// Maximum memory of all vectors \[bytes\].
 const MAX_LINEARIZED_BYTES: u64 = 1 << 30;
 
 impl BatchEvaluation<'_> {

@@ -9,7 +9,7 @@ use crate::order_search::candidate::normal_equations::Normal;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, NO_INDEX};
 use crate::simd::LANE_COUNT;
 
-/// One value for each of [`WIDTH`] test vectors.
+/// One value for each of [`LANE_COUNT`] test vectors.
 pub(super) type Wide = [f64; LANE_COUNT];
 pub(super) const ZERO_LANES: Wide = [0.0; LANE_COUNT];
 

@@ -408,7 +408,7 @@ mod tests {
     }
 
     /// Deviations of a candidate's ⟨t, w⟩ and divisor from the box values, relative to their bounds. One value for each
-    /// of [`WIDTH`] test vectors.
+    /// of [`LANE_COUNT`] test vectors.
     fn relative_deviations(whole: &CornerValues, one: &CornerValues, place: (f64, f64)) -> [Wide; 2] {
         let corners = |of: &dyn Fn(usize) -> f64| interpolate_bilinear(std::array::from_fn(of), place);
         let apart = |part: usize, n: usize| one.values[0][part][n] - corners(&|c| whole.values[c][part][n]);

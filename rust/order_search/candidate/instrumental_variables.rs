@@ -97,7 +97,7 @@ impl Refiner {
 /// Bank and target for the initial coefficients: noise-free signals, low-pass filtered.
 ///
 /// # Errors
-/// As [`Bank::counted`].
+/// As [`Bank::new_interruptible`].
 pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
     let band = START_BAND * power_frequency(record.signal(output), record.step());
     let smooth = record.clean_record().with_filter(&low_pass(band, record)?)?;

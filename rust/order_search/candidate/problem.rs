@@ -282,7 +282,7 @@ impl Problem {
         self.refiner.is_some()
     }
 
-    /// Return an empty set of tailored test vectors, and the memory that each needs [bytes].
+    /// Return an empty set of tailored test vectors, and the memory that each needs \[bytes\].
     pub(crate) fn empty_tailored_vectors(&self) -> (TailoredVectors, u64) {
         (TailoredVectors::new(&self.banks, &self.targets, self.options.norm), TailoredVectors::bytes(&self.banks))
     }
@@ -335,7 +335,7 @@ impl Problem {
         all.iter().filter(|(terms, c)| !tangents.vector_excludes(made, terms, c, limit)).cloned().collect()
     }
 
-    /// Build the test for unstable zeros if its tables fit into this memory [bytes]. Return the memory used. Runs on
+    /// Build the test for unstable zeros if its tables fit into this memory \[bytes\]. Return the memory used. Runs on
     /// the current thread pool.
     pub(crate) fn add_unstable_zeros(&mut self, spare: u64) -> u64 {
         let bytes = UnstableZeros::bytes(&self.banks);

@@ -15,7 +15,7 @@ use crate::regressors::Record;
 /// Cells that a task bounds, and cells whose bounds are held in memory at a time.
 const CELLS_PER_TASK: usize = 256;
 const CELLS_PER_PASS: usize = 1 << 16;
-/// Memory per cell while cells are bisected [bytes].
+/// Memory per cell while cells are bisected \[bytes\].
 const CELL_MEMORY_BYTES: u64 = 4 * size_of::<Cell>() as u64;
 
 /// Maximum evaluations of the local search from the best orders.

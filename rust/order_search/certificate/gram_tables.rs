@@ -42,7 +42,7 @@ pub(super) struct GramTables {
     terms: Vec<(Option<LevelIntervals>, usize)>,
     /// Highest level with tables.
     table_level: u8,
-    /// Memory of the tables [bytes].
+    /// Memory of the tables \[bytes\].
     pub(super) bytes: u64,
     nodes: usize,
     samples: usize,
@@ -123,7 +123,7 @@ fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
     NodeLayout { nodes, terms }
 }
 
-/// Memory of columns and products of this many nodes [bytes].
+/// Memory of columns and products of this many nodes \[bytes\].
 fn bytes(nodes: usize, samples: usize) -> u64 {
     8 * nodes as u64 * (DERIVATIVE_PAIRS.len() * nodes + 2 * EXPANSION_COLUMNS * samples) as u64
 }

@@ -139,7 +139,7 @@ impl LinearizedVectors {
         }
     }
 
-    /// Memory of one vector for candidates with this many own terms [bytes].
+    /// Memory of one vector for candidates with this many own terms \[bytes\].
     pub(crate) fn bytes(&self, own: usize) -> u64 {
         8 * ((own + 1) * (own + 1 + self.width) + own * (2 * own + 4) + 8) as u64
     }
@@ -160,7 +160,7 @@ impl LinearizedVectors {
         self.vectors.len()
     }
 
-    /// Memory of all vectors [bytes].
+    /// Memory of all vectors \[bytes\].
     pub(crate) fn memory_bytes(&self) -> u64 {
         self.ranges.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
     }

@@ -162,7 +162,7 @@ impl Bound {
     /// Maximum number of test vectors.
     pub(crate) const MAX_TEST_VECTORS: usize = MAX_TEST_VECTORS;
 
-    /// Build `count` test vectors for these records, a multiple of [`WIDTH`] and at most [`MAX_TEST_VECTORS`].
+    /// Build `count` test vectors for these records, a multiple of [`LANE_COUNT`] and at most [`MAX_TEST_VECTORS`].
     ///
     /// `output_error` selects whether own-output columns enter the divisor. For the equation error D = 1. Runs on the
     /// current thread pool. The result is unusable after a stop request.
@@ -188,7 +188,7 @@ impl Bound {
         self.test_vectors.first().map_or(0, |p| p.groups * LANE_COUNT)
     }
 
-    /// Return the bound with these test vectors only, in this order. Their number is a multiple of [`WIDTH`].
+    /// Return the bound with these test vectors only, in this order. Their number is a multiple of [`LANE_COUNT`].
     pub(crate) fn select_vectors(&self, which: &[usize]) -> Self {
         Self { norm: self.norm, test_vectors: self.test_vectors.iter().map(|p| p.select_vectors(which)).collect() }
     }

@@ -79,7 +79,7 @@ pub(crate) struct TailoredVectors {
 }
 
 impl TailoredVectors {
-    /// Memory of one vector [bytes].
+    /// Memory of one vector \[bytes\].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         let samples: usize = banks.iter().map(samples).sum();
         let own = banks.first().map_or(0, |bank| own_columns(bank).len());

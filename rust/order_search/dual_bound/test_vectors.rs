@@ -11,13 +11,13 @@ use crate::regressors::Bank;
 use crate::series::{Buffers, Kernel};
 use crate::simd::LANE_COUNT;
 
-/// One value for each of [`WIDTH`] test vectors.
+/// One value for each of [`LANE_COUNT`] test vectors.
 pub(super) type Wide = [f64; LANE_COUNT];
 
 /// Lowest frequency of a test vector [cycles per record].
 const MIN_CYCLES_PER_RECORD: f64 = 0.3;
 
-/// Memory of the spectra of test vectors, and of columns, per batch [bytes].
+/// Memory of the spectra of test vectors, and of columns, per batch \[bytes\].
 const VECTOR_SPECTRA_BYTES: usize = 64 << 20;
 const COLUMN_SPECTRA_BYTES: usize = 192 << 20;
 

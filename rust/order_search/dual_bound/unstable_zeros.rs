@@ -238,7 +238,7 @@ impl UnstableZeros {
         targets.iter().all(|target| target.len() <= MAX_RECORD_SAMPLES)
     }
 
-    /// Memory of the tables for these banks [bytes].
+    /// Memory of the tables for these banks \[bytes\].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         banks
             .iter()

@@ -50,9 +50,9 @@ impl OrderGrid {
     /// Build the grid from its axes. `is_input` selects the signals that may have a negative order.
     ///
     /// # Errors
-    /// [`Error::EmptyOrderGrid`], [`Error::OrderGridTooLarge`] before anything of that size is enumerated, an α outside (0,
-    /// 10], [`Error::NotFinite`] for an order that is not finite, [`Error::Structure`] for more than 34 terms of one
-    /// signal.
+    /// [`Error::EmptyOrderGrid`], [`Error::OrderGridTooLarge`] before anything of that size is enumerated, an α outside
+    /// (0, 10], [`Error::NotFinite`] for an order that is not finite, [`Error::Structure`] for more than 34 terms of
+    /// one signal.
     ///
     /// ```
     /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};

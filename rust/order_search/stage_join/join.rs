@@ -76,7 +76,7 @@ pub(super) struct Join {
 
 /// Maximum rows of both halves, about 1 GB.
 const MAX_HALF_ROWS: u128 = 40_000_000;
-/// Memory per row, doubled while the list grows [bytes].
+/// Memory per row, doubled while the list grows \[bytes\].
 const BYTES_PER_HALF_ROW: u128 = 2 * size_of::<HalfRow>() as u128;
 /// Maximum free orders assigned to either half by trial. Further ones belong to the second half.
 const MAX_SPLIT_ORDERS: usize = 10;
@@ -127,7 +127,7 @@ fn split_free_orders(
 
 impl Join {
     /// Build the join and the distinct candidates of every equation, and mark the candidates that occur in some tuple.
-    /// Raises an error for rows beyond this memory [bytes].
+    /// Raises an error for rows beyond this memory \[bytes\].
     pub(super) fn new(
         lattice: &OrderLawGrid,
         candidates: &mut [Candidates],
@@ -222,7 +222,7 @@ impl Join {
         Ok(())
     }
 
-    /// Memory of the rows [bytes].
+    /// Memory of the rows \[bytes\].
     pub(super) fn bytes(&self) -> u128 {
         self.halves.iter().map(|half| (half.rows.capacity() * size_of::<HalfRow>()) as u128).sum()
     }

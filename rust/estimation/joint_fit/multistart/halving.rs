@@ -172,7 +172,8 @@ pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
     competitive_candidates(&first)
 }
 
-/// Candidates with a cost within a fixed ratio (`MAX_SURVIVOR_COST_RATIO`) of the best; the input need not be sorted after the first.
+/// Candidates with a cost within a fixed ratio (`MAX_SURVIVOR_COST_RATIO`) of the best; the input need not be sorted
+/// after the first.
 #[must_use]
 pub fn competitive_candidates(reached: &[Candidate]) -> Vec<Candidate> {
     let limit = reached.first().map_or(0.0, |best| MAX_SURVIVOR_COST_RATIO * best.cost_per_residual());
