@@ -417,7 +417,7 @@ class Sound:
         clock, values = self.clocked()
         return clock, (values,)
 
-    joint_time_scaling_from_scaled = joint_time_scaling_to_scaled
+    joint_time_scaling_to_unscaled = joint_time_scaling_to_scaled
 
     def joint_time_scaling_step(self):
         clock, values = self.clocked()

@@ -140,7 +140,7 @@ def test_table_is_that_of_enumeration(run, criterion, norm, coefficients, rows):
 def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
     options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation"}
     found = search(run, innovation_length=p, prior_covariance=k0, **options)
-    assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, rows="haar", **options))
+    assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, row_basis="haar", **options))
     assert found.settings["innovation_length"] == p
     assert found.settings["prior_covariance"] == k0
 
@@ -150,7 +150,7 @@ def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
 def test_several_runs_are_one_fit(run, second, norm, coefficients):
     options = {"criterion": "output-error", "norm": norm, "coefficients": coefficients}
     found = search([run, second], **options)
-    assert_is_table(found, enumerate_all([Record(run), Record(second)], rows="haar", **options))
+    assert_is_table(found, enumerate_all([Record(run), Record(second)], row_basis="haar", **options))
     assert found.model.about["runs"] == f"{run.name}, {second.name}"
     assert found.table != search(run, **options).table
 
@@ -160,7 +160,7 @@ def test_initial_terms_belong_to_each_run(run, second):
     options = {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
     structure = ftlm.equation(EQUATION, initial=(0.0, 1.0))
     found = ftlm.search_orders(moved, structure, ftlm.OrderGrid(orders=GRID), m=M, **options)
-    expected = enumerate_all([Record(r) for r in moved], rows="time", exponents=(0.0, 1.0), **options)
+    expected = enumerate_all([Record(r) for r in moved], row_basis="time", exponents=(0.0, 1.0), **options)
     assert_is_table(found, expected, rtol=1e-6)
 
 
