@@ -359,7 +359,7 @@ class Sound:
         problem, (runs, *_), values = self.sampled()
         held = self.one((), (0,), (1, 2))
         return problem, (
-            runs.sampled(1, 1, None),
+            runs.sample(1, 1, None),
             (values, []),
             self.one(True, False),
             held,
