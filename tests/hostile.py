@@ -359,7 +359,7 @@ class Sound:
         problem, (runs, *_), values = self.sampled()
         held = self.one((), (0,), (1, 2))
         return problem, (
-            runs.sampled(1, 1, None),
+            runs.sample(1, 1, None),
             (values, []),
             self.one(True, False),
             held,
@@ -417,7 +417,7 @@ class Sound:
         clock, values = self.clocked()
         return clock, (values,)
 
-    joint_time_scaling_from_scaled = joint_time_scaling_to_scaled
+    joint_time_scaling_to_unscaled = joint_time_scaling_to_scaled
 
     def joint_time_scaling_step(self):
         clock, values = self.clocked()

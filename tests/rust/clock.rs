@@ -51,7 +51,7 @@ fn compare(name: &str, equations: &[(Orders, Terms<'_>)], values: &[f64]) {
             check(name, ((product(&told) / product(&all)).ln() - wanted).abs(), 1e-12);
         }
     }
-    let back = clock.from_scaled(&told);
+    let back = clock.to_unscaled(&told);
     check(name, back.iter().zip(&all).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f64::max), 1e-14);
 }
 

@@ -304,7 +304,7 @@ impl TimeScaling {
 
     /// Convert parameters back from the unit.
     #[must_use]
-    pub fn from_scaled(&self, values: &[f64]) -> Vec<f64> {
+    pub fn to_unscaled(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v / f).collect()
     }
 

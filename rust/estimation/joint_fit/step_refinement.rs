@@ -156,7 +156,7 @@ fn extrapolate(
 ) -> Result<Vec<f64>> {
     let (fine, coarse) = (clock.to_scaled(fine), clock.to_scaled(coarse));
     let ahead: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
-    Ok(clock.from_scaled(&grid.problem.last_feasible_point(&fine, &ahead)?))
+    Ok(clock.to_unscaled(&grid.problem.last_feasible_point(&fine, &ahead)?))
 }
 
 /// Start on half the step: the optimum is expected to move a quarter as far as at the last halving.

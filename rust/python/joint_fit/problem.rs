@@ -174,9 +174,9 @@ impl JointTimeScaling {
     }
 
     /// Parameters from those in scaled time.
-    fn from_scaled<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
+    fn to_unscaled<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
         let values = self.values("values", &values)?;
-        Ok(PyArray1::from_vec(py, run_attached(|| Ok(self.inner.from_scaled(&values)))?))
+        Ok(PyArray1::from_vec(py, run_attached(|| Ok(self.inner.to_unscaled(&values)))?))
     }
 
     /// Small step of the parameters at some values, from the step in scaled time.

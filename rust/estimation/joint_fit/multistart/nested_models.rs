@@ -331,7 +331,7 @@ impl FixedOrderProblem {
     pub fn restrict(&self, runner: &Candidate, clock: &TimeScaling) -> Candidate {
         let mut told = clock.to_scaled(&runner.result.values());
         told[self.order] = self.value;
-        let mut values = clock.from_scaled(&told);
+        let mut values = clock.to_unscaled(&told);
         values.remove(self.order);
         let (orders, rest) = values.split_at(self.free.orders.len());
         let (coefficients, inputs) = rest.split_at(self.free.coefficients.len());
