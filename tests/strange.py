@@ -179,14 +179,14 @@ def recipes():
         ),
         "smooth_move": (
             control.point_to_point,
-            {"size": 0.3, "duration": 0.5, "rate": 500.0, "before": 0.3, "after": 1.2},
+            {"distance": 0.3, "duration": 0.5, "rate": 500.0, "dwell_before": 0.3, "dwell_after": 1.2},
         ),
         "inverse": (
             control.inverse_dynamics,
             {
                 "design": control.fractional_pid(hub, crossover=40.0),
                 "path": control.point_to_point(0.3, 0.5),
-                "of": "theta",
+                "output": "theta",
                 "limit": 30.0,
                 "samples": 2,
                 "seed": 0,

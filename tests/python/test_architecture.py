@@ -362,7 +362,7 @@ def test_every_field_of_every_public_record_is_documented():
 
 
 @pytest.mark.parametrize(
-    "name", ["Run", "Model", "Structure", "Identification", "SearchResult", "Comparison", "Order", "Lattice"]
+    "name", ["Run", "Model", "Structure", "Identification", "SearchResult", "Comparison", "Order", "OrderGrid"]
 )
 def test_every_public_member_has_a_docstring(name):
     for member, value in vars(getattr(ftlm, name)).items():

@@ -200,11 +200,11 @@ def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
     assert "no cases: 4 of 16" in claim.evidence
     strong, weak = (trials_of(reproduction, prior) for prior in (1.0, 1e10))
     for output in ("theta11", "theta21"):
-        steps = list(strong[output].arrived.values())
+        steps = list(strong[output].convergence_steps.values())
         assert steps == sorted(steps, reverse=True)
         assert steps[-1] < 0.5 * steps[0]
         # The same with the data alone: p is a weight, and weighs nothing against nothing.
-        assert max(weak[output].arrived.values()) < 1.15 * min(weak[output].arrived.values())
+        assert max(weak[output].convergence_steps.values()) < 1.15 * min(weak[output].convergence_steps.values())
 
 
 def test_larger_p_has_a_smaller_error_on_some_angles_with_one_prior(reproduction):
@@ -220,7 +220,7 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
     found = claims(reproduction)
     for words in ("better than whole ones", "closer to the run than the manual's"):
         assert by_words(found, words).verdict == "cannot be told from a simulated truth"
-    freed = {(f.arm, f.stage): f for f in reproduction.panel.freed}
+    freed = {(f.arm, f.stage): f for f in reproduction.panel.order_comparisons}
     for stage in (1, 2):
         put_in, whole = freed["fractional", stage], freed["whole orders", stage]
         assert whole.away == []
@@ -246,12 +246,15 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     contests = tuple(replace(c, lattice=dict.fromkeys(c.lattice, 1e-9)) for c in panel.contests)
     freed = tuple(
         replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
-        for f in panel.freed
+        for f in panel.order_comparisons
     )
     stage = reproduction.stages[1]
     swapped = {**stage.candidates, "published, output error": stage.candidates["output error"]}
     other = replace(stage, candidates=swapped, near=stage.candidates["output error"])
-    ran = tuple(replace(r, moved=r.implied, stability=replace(r.stability, stable=True)) for r in reproduction.ran)
+    ran = tuple(
+        replace(r, angle_deviation=r.implied_deviation, stability=replace(r.stability, stable=True))
+        for r in reproduction.ran
+    )
     tables = {
         o: replace(
             t,
@@ -383,7 +386,7 @@ def test_the_text_is_for_a_terminal(reproduction):
 
 
 def test_nothing_is_overwritten_in_a_folder(reproduction, saved):
-    with pytest.raises(ftlm.DataError, match="such files\\); choose another folder, or --force"):
+    with pytest.raises(ftlm.DataError, match="such files\\); choose another folder, or force=True"):
         reproduction.save(saved)
     assert len(reproduction.save(saved, force=True)) == len(list(saved.iterdir()))
 
@@ -493,7 +496,7 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
     [
         (["-o", "there.html"], 3, "there.html exists; choose another name"),
         (["-o", "no/folder.html"], 3, "no is no folder; make it first"),
-        (["--save", "full"], 3, "full/square.csv exists (1 such files); choose another folder, or --force"),
+        (["--save", "full"], 3, "full/square.csv exists (1 such files); choose another folder, or force=True"),
         (["--save", "there.html"], 3, "there.html cannot be made"),
         (["--sine", "strange.csv"], 2, "--sine is given without --square"),
         (["--square", "strange.csv"], 3, "a stage of the arm needs I1, theta11 and theta12"),

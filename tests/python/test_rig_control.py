@@ -40,7 +40,7 @@ class Bad:
 
 def borne(monkeypatch):
     """A busy machine may be late in real time; that is not what is tested here."""
-    monkeypatch.setattr(rig.experiment, "Limits", lambda: rig.Limits(late=60.0, missed=10**9))
+    monkeypatch.setattr(rig.recording, "Limits", lambda: rig.Limits(late=60.0, missed=10**9))
 
 
 def run_with(bench, controller, **options):

@@ -132,13 +132,13 @@ def dense_response(stage, p, m):
 
 def test_printed_models_move_5_to_316_times_less_than_the_paper_s_arm(first_stage):
     row = first_stage["theta11", 7]
-    assert row.implied == pytest.approx(0.0180 / 0.1974)
-    assert row.moved == pytest.approx(0.00029, abs=5e-6)
-    assert 315 < row.too_small < 317
-    assert min(r.too_small for r in first_stage.values()) > 5
+    assert row.implied_deviation == pytest.approx(0.0180 / 0.1974)
+    assert row.angle_deviation == pytest.approx(0.00029, abs=5e-6)
+    assert 315 < row.deviation_ratio < 317
+    assert min(r.deviation_ratio for r in first_stage.values()) > 5
     hub, link = dense_response(1, 7, 512)
-    assert np.std(hub) == pytest.approx(row.moved, rel=0.01)
-    assert np.std(link) == pytest.approx(first_stage["theta12", 7].moved, rel=0.01)
+    assert np.std(hub) == pytest.approx(row.angle_deviation, rel=0.01)
+    assert np.std(link) == pytest.approx(first_stage["theta12", 7].angle_deviation, rel=0.01)
     # None is stable, either.
     assert all(r.stability.unstable_poles >= 1 for r in first_stage.values())
 
@@ -149,14 +149,14 @@ def test_words_on_printed_models_follow_their_numbers(first_stage):
     assert "from 5.78 to 316, median 18.9" in told
     assert "at least 0.83 to 0.997, where 0.14 to 0.37 is printed: in 8 of 8 rows" in told
     # Had they moved as far, nothing would follow.
-    moving = tuple(replace(r, moved=0.9 * r.implied) for r in rows)
+    moving = tuple(replace(r, angle_deviation=0.9 * r.implied_deviation) for r in rows)
     assert deviation_in_words(SimpleNamespace(ran=moving)).endswith("from 1.11 to 1.11, median 1.11")
 
 
 def test_the_one_angle_reading_moves_as_little(first_stage):
     model = one_angle("theta11", 7)
     assert [t.signal for t in model.equations[0].terms] == ["theta11"] * 3 + ["I1"]
-    assert first_stage["theta11", 7].alone == pytest.approx(0.000297, abs=2e-6)
+    assert first_stage["theta11", 7].single_equation_deviation == pytest.approx(0.000297, abs=2e-6)
 
 
 def test_a_printed_model_does_not_give_back_its_coefficients(first_stage):
@@ -164,8 +164,8 @@ def test_a_printed_model_does_not_give_back_its_coefficients(first_stage):
         a = f"a{output[-1]}"
         stated = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
         # With K0 = 1 a response this small is nothing beside the prior.
-        assert abs(row.returned[1.0][a]) < 1e-3 * abs(stated)
-        assert abs(row.returned[1e10][a] / stated - 1) > 0.02
+        assert abs(row.returned_coefficients[1.0][a]) < 1e-3 * abs(stated)
+        assert abs(row.returned_coefficients[1e10][a] / stated - 1) > 0.02
     last = first_stage["theta11", 7].orders
     assert all(found["beta1"] != 1.85 or found["gamma1"] != 1.9 for found in last.values())
 
@@ -188,16 +188,16 @@ def test_tables_4_and_5_come_near_as_equation_errors(tables):
         for p, row in made.rows.items():
             assert np.sign(row.coefficients["a"]) == np.sign(table[p].coefficients["a"])
             assert row.equation.error / table[p].error == pytest.approx(1.0, abs=0.25), (output, p)
-        assert "a" in made.alike
+        assert "a" in made.matching_trends
         assert made.rank > 50, output
     # A prior that was chosen by a and NR does not bring b, d and g along.
-    assert not any(t.near for t in tables.values())
+    assert not any(t.is_close for t in tables.values())
     assert [round(tables["theta12"].ratios[c][-1], 2) for c in "bdg"] == [1.84, 3.03, 0.19]
     assert max(max(tables["theta12"].ratios[c]) for c in ("a", "NR")) < 1.25
     assert all(min(t.ratios["g"]) < 0.5 for t in tables.values())
     # Even the printed d, which falls and then rises again.
     d = [r.coefficients["d"] for r in tables["theta22"].rows.values()]
-    assert "d" in tables["theta22"].alike
+    assert "d" in tables["theta22"].matching_trends
     assert d[1] < d[0] < d[2] < d[3]
 
 
@@ -323,7 +323,7 @@ def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
     seen = []
     monkeypatch.setattr(
         "ftlm.reproduction.stage_models.search_orders",
-        lambda *a, **k: seen.append(a[2].step) or ftlm.search_orders(*a, **k),
+        lambda *a, **k: seen.append(a[2].increment) or ftlm.search_orders(*a, **k),
     )
     found = work.search_candidate("p = 3", lattice, **options)
     # The hub once; the deflection in steps of 0.4, then around the ten best.
@@ -420,9 +420,9 @@ def test_arms_differ_in_what_they_are_called_for():
         ({"arms": "whole orders"}, "is a text; give a list of names"),
         ({"records": 0}, "records = 0 is no whole number from 1"),
         ({"records": 2.5}, "records = 2.5 is no whole number from 1"),
-        ({"step": 0.0}, "step"),
-        ({"rivals_step": 0.0}, "step"),
-        ({"rivals_step": "0.1"}, "step"),
+        ({"increment": 0.0}, "increment"),
+        ({"rivals_increment": 0.0}, "increment"),
+        ({"rivals_increment": "0.1"}, "increment"),
     ],
 )
 def test_what_cannot_be_asked_for_is_said_first(words, message):

@@ -169,7 +169,7 @@ def design_input(
     ----------
     model : Identification or Model
         Of method ``"output-error"``; a saved model will do.
-    like : Run, optional
+    reference_run : Run, optional
         An admissible run of the machine. It gives the defaults of the other arguments, the largest output included.
         Default of an identification: its first run.
     duration, step : float, optional
@@ -180,7 +180,7 @@ def design_input(
         Fastest change of each input, a second; default none.
     limits : mapping, optional
         Largest size of outputs by name, in the model's units; infinity for none.
-    names : sequence of str, optional
+    parameters : sequence of str, optional
         Parameters of interest; default all free orders, or all parameters if no order is free.
     criterion : {"D", "E"}, default "D"
         ``"D"``: smallest volume of the confidence ellipsoid of these parameters. ``"E"``: shortest widest axis, with

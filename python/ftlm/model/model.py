@@ -132,6 +132,11 @@ class Model:
         Metadata about the origin of the model.
     estimate
         Standard errors, covariance and warnings of the identification; None for a model defined by hand.
+
+    Raises
+    ------
+    ModelError
+        A free order or coefficient without a value, or a value that is not finite.
     """
 
     structure: Structure

@@ -53,7 +53,7 @@ class Reproduction(ReproductionData):
         Whether the runs come from the virtual rig, whose parameters are known.
     stages
         Stage results by number.
-    lattice
+    order_grid
         Order grid of the searches.
     notes
         Omitted parts with reasons.

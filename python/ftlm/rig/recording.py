@@ -245,7 +245,7 @@ def record(
     offset : pair of float, optional
         Current offset of each motor of the simulated arm while the amplifiers are enabled [A]; default that of its
         parameters, 0. On hardware the offset differs from run to run.
-    paced : bool
+    real_time : bool
         Whether the virtual rig runs in real time.
     sensor_filter : {"stock"}, optional
         Record deflections behind the stock 2 Hz low-pass.
@@ -253,7 +253,7 @@ def record(
         Timeout after which the watchdog stops the motors [s], 0.01 to 1.
     arm : bool
         Must be True for hardware, as confirmation that the arm may move.
-    card : str
+    board : str
         Identifier of the Q8-USB, such as ``"0"`` or ``"0@tcpip://host:port"``.
     name : str, optional
         Name of the run; default the shape of the input.
