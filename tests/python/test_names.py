@@ -16,10 +16,25 @@ IRREGULAR = frozenset(
     laid met said sent spent slid bent done brought bought fallen torn unknown unread unseen untold won broken
     struck stuck swept dealt meant sold paid heard led fed apart abreast afterwards again ahead alike along
     already alone aside away beforehand behind below beside between beyond elsewhere enough here instead
-    lastly late later least most much near nearby never now often once others rather since then there together
+    lastly late later most much near nearby never now often once others rather since then there together
     twice whence within whole
     """.split()  # noqa: SIM905 — read as words, not as a column of literals
 )
+#: Participles with which no description begins.
+FIRST_WORDS = IRREGULAR & {
+    "told",
+    "held",
+    "made",
+    "built",
+    "drawn",
+    "given",
+    "found",
+    "kept",
+    "taken",
+    "known",
+    "left",
+    "seen",
+}
 #: Nouns and verbs that end as participles and adverbs do.
 NOUNS = frozenset(
     """
