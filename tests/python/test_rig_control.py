@@ -10,6 +10,7 @@ import pytest
 
 import ftlm
 from ftlm import rig
+from ftlm.rig import recording
 from ftlm.rig.quanser import QuanserBoard
 from quanser_stand_in import Board
 from test_rig_safety import Bench
@@ -40,7 +41,7 @@ class Bad:
 
 def borne(monkeypatch):
     """A busy machine may be late in real time; that is not what is tested here."""
-    monkeypatch.setattr(rig.experiment, "Limits", lambda: rig.Limits(late=60.0, missed=10**9))
+    monkeypatch.setattr(recording, "Limits", lambda: rig.Limits(late=60.0, missed=10**9))
 
 
 def run_with(bench, controller, **options):

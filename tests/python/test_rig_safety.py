@@ -43,7 +43,7 @@ class Watched(rig.VirtualBoard):
         return found
 
     def write(self, volts):
-        if volts == (0.0, 0.0) and self._page is not None and self._page.has_expired:
+        if volts == (0.0, 0.0) and self._page is not None and (self._page.has_expired or self.gate.reason):
             self.log.append((len(self.log) - 1, volts))
         super().write(volts)
 
@@ -164,7 +164,7 @@ def recorded(bench, tmp_path, **options):
     loaded = ftlm.load(path)
     assert np.array_equal(loaded["theta11"], fault.value.run["theta11"])
     assert loaded.metadata["faults"]
-    assert any("the rig stopped the run" in w for w in loaded.warnings)
+    assert any("the rig stopped the run" in w for w in loaded.notes)
     assert str(path) in str(fault.value)
     assert sorted(p.name for p in tmp_path.iterdir() if p.name != "page") == ["run.csv"]
     bench.assert_safe()
@@ -312,6 +312,7 @@ CHILD = """
 import sys
 sys.path.insert(0, {here!r})
 from ftlm import rig
+from ftlm.rig import recording
 if {kind!r} == "virtual":
     board = rig.VirtualBoard(page={page!r}, real_time=True)
 else:
@@ -360,7 +361,7 @@ def test_a_killed_program_leaves_the_motors_off(kind, tmp_path):
     page.close()
     kept = ftlm.load(out.with_name("run.csv.partial"))
     assert kept.length >= 3
-    assert "did not end" in kept.warnings[0]
+    assert "did not end" in kept.notes[0]
 
 
 @pytest.mark.parametrize("kind", ["virtual", "q8"])
@@ -408,7 +409,7 @@ def test_a_command_that_is_stopped_says_where_its_run_is(number, code, tmp_path)
     process.send_signal(number)
     _, said = process.communicate(timeout=60)
     assert process.returncode == code
-    assert f"what was recorded is in {out}" in said
+    assert f"the motors are at 0 V; {ftlm.load(out).length} rows were recorded until then and are in {out}" in said
     assert ftlm.load(out).metadata["faults"] == ["stopped by " + ("Ctrl-C" if code == 130 else "SIGTERM")]
     assert not partial.exists()
 
