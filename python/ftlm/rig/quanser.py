@@ -165,7 +165,7 @@ class QuanserBoard:
     def configure(self, rate: float) -> None:
         """Set ranges, directions and encoders, zero the outputs, and create one reader for simultaneous sampling."""
         check_rate(rate)
-        self._rate = rate
+        self._rate, self._samples, self._origin, self._rows = rate, 0, math.inf, []
         speed = "normal" if rate <= MAX_NORMAL_RATE_HZ else "fast"
         low_in, low_out = np.full(len(ANALOG_IN), -10.0), np.full(len(ANALOG_OUT), -10.0)
         with self._translate_errors("configuring the board") as hil:

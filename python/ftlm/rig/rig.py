@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import faulthandler
 import math
 import os
 import select
@@ -22,8 +23,8 @@ from ftlm.utils.validation import Floats, error_text, real_number
 
 #: Termination signals, including those of a closed terminal.
 _TERMINATION_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-#: Longest time for which another owner of Python's signal wake-up stays unnoticed [s].
-_WAKEUP_CHECK_INTERVAL_S = 0.02
+#: Longest time for which a new signal handler of the program stays unnoticed [ms].
+_HANDLER_CHECK_INTERVAL_MS = 20.0
 
 
 class OutputGate:
@@ -54,73 +55,93 @@ class OutputGate:
 class InterruptWatch:
     """Thread that stops the motors on a termination signal while their run is not in the main thread.
 
-    Python calls signal handlers in the main thread only, which may wait for the run. The thread reads Python's signal
-    wake-up descriptor instead, and passes its bytes on to the previous owner, such as an event loop.
+    Python calls signal handlers in the main thread only, which may wait for the run. :mod:`faulthandler` instead writes
+    from within the signal itself, here to a pipe that the thread reads, and then passes the signal on to Python.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._boards: list[Board] = []
-        self._watching = False
-        self._set_descriptor = getattr(ctypes.pythonapi, "PySignal_SetWakeupFd", None) if os.name == "posix" else None
+        #: Ends of the pipe of each signal, and the system's handler while it is that of faulthandler.
+        self._pipes: dict[int, tuple[int, int]] = {}
+        self._handlers: dict[int, bytes] = {}
 
     @property
     def available(self) -> bool:
-        """Whether the platform can deliver signals to the thread."""
-        return self._set_descriptor is not None
+        """Whether the platform can report signals to the thread."""
+        return hasattr(faulthandler, "register")
 
     def add(self, board: Board) -> None:
-        """Stop this board on the next termination signal."""
-        if self._set_descriptor is None:
-            return
+        """Stop this board on the next termination signal that Python handles; any other one ends the program."""
         with self._lock:
             self._boards.append(board)
-            if not self._watching:
-                self._watching = True
-                ends = os.pipe()
-                os.set_blocking(ends[1], False)
-                arguments = (*ends, self._set_descriptor(ends[1]))
-                threading.Thread(target=self._watch, args=arguments, name="ftlm signals", daemon=True).start()
+            if self._pipes or not self.available:
+                return
+            for name in _TERMINATION_SIGNALS:
+                if hasattr(signal, name):
+                    ends = os.pipe()
+                    os.set_blocking(ends[1], False)
+                    self._pipes[getattr(signal, name)] = ends
+            self._register()
+            threading.Thread(target=self._watch, name="ftlm signals", daemon=True).start()
 
     def remove(self, board: Board) -> None:
         """Forget a board."""
         with self._lock, contextlib.suppress(ValueError):
             self._boards.remove(board)
 
-    def forget_all(self) -> None:
-        """Start anew in a forked child, which has neither the thread nor the motors."""
-        if self._watching and self._set_descriptor is not None:
-            self._set_descriptor(-1)
-        self.__init__()  # type: ignore[misc]
+    def reset(self) -> None:
+        """Stop watching in a forked child, which has neither the thread nor the motors."""
+        self._lock = threading.Lock()
+        self._boards = []
+        self._stop()
 
-    def _watch(self, read_end: int, write_end: int, previous: int) -> None:
-        assert self._set_descriptor is not None
+    def _stop(self) -> None:
+        for number, ends in self._pipes.items():
+            # A handler that is no function of Python has replaced that of faulthandler already.
+            if number in self._handlers and callable(signal.getsignal(number)):
+                faulthandler.unregister(number)
+            for end in ends:
+                os.close(end)
+        self._handlers, self._pipes = {}, {}
+
+    def _register(self) -> None:
+        """Register each signal whose handler the program has set since, which replaces that of faulthandler."""
+        for number, (_, write_end) in self._pipes.items():
+            if callable(signal.getsignal(number)) and _system_handler(number) != self._handlers.get(number):
+                faulthandler.unregister(number)
+                faulthandler.register(number, write_end, all_threads=False, chain=True)
+                self._handlers[number] = _system_handler(number)
+
+    def _watch(self) -> None:
+        numbers = {ends[0]: number for number, ends in self._pipes.items()}
+        poll = select.poll()
+        for end in numbers:
+            poll.register(end, select.POLLIN)
         while True:
-            ready, _, _ = select.select([read_end], [], [], _WAKEUP_CHECK_INTERVAL_S)
-            received = os.read(read_end, 64) if ready else b""
+            ready = poll.poll(_HANDLER_CHECK_INTERVAL_MS)
             with self._lock:
-                owner = self._set_descriptor(write_end)
-                previous = previous if owner == write_end else owner
+                self._register()
                 boards = list(self._boards)
-                self._watching = bool(boards)
                 if not boards:
-                    self._set_descriptor(previous)
-            if received and previous >= 0:
-                with contextlib.suppress(OSError):
-                    os.write(previous, received)
-            for number in received:
-                if number in {getattr(signal, name, None) for name in _TERMINATION_SIGNALS}:
-                    for board in boards:
-                        _stop_motors(board, describe_signal(number))
-            if not boards:
-                os.close(read_end)
-                os.close(write_end)
-                return
+                    self._stop()
+                    return
+            for end, _ in ready:
+                os.read(end, 1 << 16)
+                for board in boards:
+                    _stop_motors(board, describe_signal(numbers[end]))
+
+
+def _system_handler(number: int) -> bytes:
+    """Address of the function that handles a signal, the first member of the system's structure."""
+    action = ctypes.create_string_buffer(1024)
+    ctypes.CDLL(None).sigaction(number, None, action)
+    return action.raw[: ctypes.sizeof(ctypes.c_void_p)]
 
 
 INTERRUPT_WATCH = InterruptWatch()
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=INTERRUPT_WATCH.forget_all)
+    os.register_at_fork(after_in_child=INTERRUPT_WATCH.reset)
 
 
 def check_thread(board: Board) -> None:
@@ -202,8 +223,9 @@ class SignalHandlers:
 
     def release(self) -> None:
         """Restore all previous handlers; :meth:`deliver` raises what was deferred."""
-        self._kept = self._deferring = False
+        self._kept, self._deferring = False, True
         self._restore()
+        self._deferring = False
 
     def ignore(self) -> None:
         """Ignore further signals, because the process is about to exit."""
@@ -588,9 +610,11 @@ class Rig:
             # Write 0 V immediately, because the caller may stay in the with statement.
             with contextlib.suppress(Exception):
                 self.board.write((0.0, 0.0))
-            if not isinstance(error, FtlmError):
+            # Whatever a call meets on a board that was shut down meanwhile, the shutdown is its cause.
+            reason = self._gate.reason if isinstance(error, Exception) else None
+            if reason is None and not isinstance(error, FtlmError):
                 raise
-            self.guard.fail(error_text(error))
+            self.guard.fail(reason or error_text(error))
         finally:
             self._gate.running = False
         self._check()

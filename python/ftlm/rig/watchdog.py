@@ -130,8 +130,10 @@ def start(page: RegisterPage, *, keep: bool, patience: float = 10.0) -> subproce
     until = time.monotonic() + patience
     try:
         while not page.get("ready"):
-            if process.poll() is not None or time.monotonic() > until:
-                raise OSError("the watchdog process of the virtual rig did not start")
+            if process.poll() is not None:
+                raise OSError(f"the watchdog process ended at its start (exit code {process.returncode})")
+            if time.monotonic() > until:
+                raise OSError(f"the watchdog process did not start within {patience:g} s")
             time.sleep(0.002)
     except BaseException:
         process.kill()
