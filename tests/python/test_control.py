@@ -452,10 +452,13 @@ def test_the_crossover_asked_for_is_the_last_one_or_refused(damping, stiffness, 
     response = response * np.exp(-s / 500.0) * (1.0 - np.exp(-s / 500.0)) / (s / 500.0)
     designed = 0
     for crossover in (0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 20.0):
+        refused = ""
         try:
             design = control.fractional_pid(plant, crossover=crossover, phase_margin=60.0)
         except ftlm.ModelError as error:
-            assert re.search("crosses a gain of 1 again|flat phase margin|is not stable", str(error))
+            refused = str(error)
+        if refused:
+            assert re.search("crosses a gain of 1 again|flat phase margin|is not stable", refused)
             continue
         designed += 1
         loop = response * np.ravel(design.pid.response(w))

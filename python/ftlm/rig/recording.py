@@ -426,8 +426,8 @@ class Experiment:
         step, live = 1.0 / self.rate, self.live
         if live is not None and not math.isclose(live.step, step, rel_tol=1e-9):
             raise ModelError(
-                f"{setting('live')} a stream with a step of {live.step:g} s, and the rig has {step:g} s; make it for the "
-                "rig's rate"
+                f"{setting('live')} a stream with a step of {live.step:g} s, and the rig has {step:g} s; make it for "
+                "the rig's rate"
             )
         columns = [] if live is None else [_column_of(signal_name) for signal_name in live.signals]
         partial = PartialRecording(target, self.name, step, about, tuple(source.extra_signals))
