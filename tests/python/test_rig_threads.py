@@ -67,27 +67,28 @@ def in_thread(work):
 def test_a_thread_that_is_about_to_write_volts_writes_none_after_the_shutdown(monkeypatch, call):
     hardware, board = stand_in(monkeypatch)
     link = rig.Rig(board)
-    reached, shut = threading.Event(), threading.Event()
+    about, zero = threading.Event(), threading.Event()
 
     def wait(hardware):
         if threading.current_thread() is not threading.main_thread() and hardware.sample == 150:
-            reached.set()
-            shut.wait(0.5)
+            about.set()
+            zero.wait(0.5)
+
+    def switched(hardware):
+        # The first step after 0 V: now the other thread may write what it was about to.
+        if threading.current_thread() is threading.main_thread():
+            zero.set()
+            time.sleep(0.2)
 
     link.__enter__()
-    hardware.hooks[call] = wait
+    hardware.hooks |= {call: wait, "write_digital": switched}
     done, raised = in_thread(lambda: link.run(np.full((2000, 2), 0.3)))
-    assert reached.wait(30)
+    assert about.wait(30)
     link.__exit__(None, None, None)
-    shut.set()
-    done.wait(30)
-    last_volts = max(k for k, (_, volts) in enumerate(hardware.writes) if volts != (0.0, 0.0))
-    first_zero = min(
-        k for k, (what, _, states) in enumerate(hardware.log) if what == "write_digital" and states[4] == 0 and k > 20
-    )
-    assert hardware.writes[-1][1] == (0.0, 0.0)
-    assert all(volts == (0.0, 0.0) for what, _, volts in hardware.log[first_zero:] if what == "write_analog")
-    assert last_volts < len(hardware.writes) - 1
+    assert done.wait(30)
+    volts = [values for _, values in hardware.writes]
+    assert max(k for k, one in enumerate(volts) if one != (0.0, 0.0)) < volts.index((0.0, 0.0), 150)
+    assert volts[-1] == hardware.volts == (0.0, 0.0)
     assert not hardware.enabled
     assert isinstance(raised[0], ftlm.RigFault)
     assert hardware.violations == []
