@@ -4,8 +4,6 @@ import os
 import signal
 import threading
 
-from ftlm.cli import main
-
 
 def _leave(*_: object) -> None:
     os.write(2, b"ftlm: interrupted; nothing was written\n")
@@ -19,6 +17,8 @@ _OWNS_INTERRUPT = (
 )
 if _OWNS_INTERRUPT:
     signal.signal(signal.SIGINT, _leave)
+# The handler above must be in place during this import.
+from ftlm.cli import main  # noqa: E402
 
 if _OWNS_INTERRUPT:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -212,17 +212,17 @@ impl VirtualArm {
     }
 
     fn inject(&mut self, what: &str, channel: usize, sample: u64, value: f64) -> PyResult<()> {
-        let stage = channel.min(1);
+        let stage = channel;
         let injection = match what {
             "dead encoder" => Injection::DeadEncoder { stage, from: sample },
             "saturated gauge" => Injection::SaturatedGauge { stage, from: sample },
-            "limit switch" => Injection::LimitSwitch { line: channel.min(3), from: sample },
+            "limit switch" => Injection::LimitSwitch { line: channel, from: sample },
             "deflection" => Injection::Deflection { stage, from: sample, angle: value },
             "late" => Injection::Late { at: sample, seconds: value },
             "lost samples" => Injection::LostSamples { from: sample },
             _ => {
                 let what = format!("{what:?} cannot be injected");
-                return Err(Error::Structure { what, remedy: "see ftlm.rig.INJECTIONS".into() }.into());
+                return Err(Error::Structure { what, remedy: "see ftlm.rig.FAULT_INJECTIONS".into() }.into());
             }
         };
         run_attached(|| self.plant.inject(injection))

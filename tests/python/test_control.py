@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import control as python_control
 import numpy as np
@@ -387,7 +388,7 @@ def test_a_reset_forgets():
 def test_what_cannot_be_realised_is_refused(options, words):
     with pytest.raises(ftlm.ModelError, match=words):
         control.DiscretePid(PID, **{"rate": 500.0, **options})
-    with pytest.raises(ftlm.ModelError, match="Realised or Lqg controllers"):
+    with pytest.raises(ftlm.ModelError, match="DiscretePid or Lqg controllers"):
         control.JointControllers(PID)
 
 
@@ -435,3 +436,42 @@ def test_a_designed_loop_runs_on_the_virtual_arm_and_holds_what_it_is_told():
     assert np.abs(run["theta11"][-200:] - 0.3).max() < 0.002
     assert np.abs(run["theta21"]).max() < 0.01
     assert run.metadata["control"]["controller"]["settings"]["hub1"]["memory"] > 10
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Where the loop gain is 1
+
+
+@pytest.mark.parametrize(("damping", "stiffness", "order"), [(3.0, 8.0, 1.6), (0.8, 6.0, 1.7), (0.3, 9.0, 1.9)])
+def test_the_crossover_asked_for_is_the_last_one_or_refused(damping, stiffness, order):
+    """Oracle: the loop on a fine grid, from the closed form of the plant."""
+    plant = ftlm.Model(ftlm.equation(f"D^{order} y = -{damping} D^{order - 1:g} y - {stiffness} y + 5 u"))
+    w = np.geomspace(0.01, 500.0, 20001)
+    s = 1j * w
+    response = 5.0 / (s**order + damping * s ** (order - 1.0) + stiffness)
+    response = response * np.exp(-s / 500.0) * (1.0 - np.exp(-s / 500.0)) / (s / 500.0)
+    designed = 0
+    for crossover in (0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 20.0):
+        refused = ""
+        try:
+            design = control.fractional_pid(plant, crossover=crossover, phase_margin=60.0)
+        except ftlm.ModelError as error:
+            refused = str(error)
+        if refused:
+            assert re.search("crosses a gain of 1 again|flat phase margin|is not stable", refused)
+            continue
+        designed += 1
+        loop = response * np.ravel(design.pid.response(w))
+        at = np.flatnonzero(np.diff(np.sign(np.abs(loop) - 1.0)))
+        margins = np.abs((np.degrees(np.angle(loop[at])) + 360.0) % 360.0 - 180.0)
+        assert w[at[-1]] == pytest.approx(crossover, rel=2e-3)
+        assert design.nominal.crossover == pytest.approx(crossover, rel=2e-3)
+        assert design.nominal.phase == pytest.approx(margins.min(), abs=0.2)
+        assert f"highest crossover {design.nominal.crossover:.4g} rad/s, smallest phase margin" in str(design)
+    assert designed >= 2
+
+
+def test_a_crossover_below_a_resonance_that_crosses_again_says_where():
+    plant = ftlm.Model(ftlm.equation("D^1.7 y = -0.8 D^0.7 y - 6 y + 5 u"))
+    with pytest.raises(ftlm.ModelError, match=r"crossover of 2 rad/s crosses a gain of 1 again .* last at 40\.3"):
+        control.fractional_pid(plant, crossover=2.0)

@@ -143,7 +143,7 @@ def test_what_is_no_controller_is_refused(case, tmp_path):
         control.load_controller(path)
     with pytest.raises(ftlm.DataError, match="cannot be read"):
         control.load_controller(tmp_path / "none.json")
-    with pytest.raises(ftlm.ModelError, match="give a Realised or an Lqg"):
+    with pytest.raises(ftlm.ModelError, match="give a DiscretePid or an Lqg"):
         control.save_controller(PID, tmp_path / "p.json")
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm import rig
+from ftlm import control, rig
+from ftlm.rig import recording
 from ftlm.rig.quanser import QuanserBoard
 from quanser_stand_in import Board
 from test_rig_safety import Bench
@@ -40,7 +41,7 @@ class Bad:
 
 def borne(monkeypatch):
     """A busy machine may be late in real time; that is not what is tested here."""
-    monkeypatch.setattr(rig.recording, "Limits", lambda: rig.Limits(late=60.0, missed=10**9))
+    monkeypatch.setattr(recording, "Limits", lambda: rig.Limits(late=60.0, missed=10**9))
 
 
 def run_with(bench, controller, **options):
@@ -350,3 +351,99 @@ def test_the_board_needs_arm(monkeypatch):
     with pytest.raises(ftlm.ModelError, match="moves a real arm"):
         rig.control(proportional, HOLD, QuanserBoard(clock=lambda: hardware.time), duration=0.4)
     assert hardware.log == []
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# A controller keeps its rate
+
+PID = control.FractionalPid(2.0, 1.0, 0.1, 0.9, 0.8)
+
+
+def observed(rate, driven="I1", hub="theta11"):
+    """An LQG of a double integrator with friction."""
+    model = ftlm.Model(ftlm.equation(f"D^2 {hub} = -63 D^1 {hub} + 140 {driven}"))
+    design = control.lqg(
+        model, max_deviation={hub: 0.02}, max_input=1.0, noise={hub: 1e-4}, rate=rate, limit=0.9, samples=0
+    )
+    return design.controller
+
+
+class Own:
+    """A controller of a user that carries its rate."""
+
+    rate = 250.0
+
+    def __call__(self, time, angles, reference):
+        return proportional(time, angles, reference)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: control.JointControllers(control.DiscretePid(PID, 250.0, limit=0.9)),
+        lambda: control.JointControllers(None, control.DiscretePid(PID, 250.0, limit=0.9)),
+        lambda: control.JointControllers(observed(250.0)),
+        lambda: observed(250.0),
+        Own,
+    ],
+    ids=["pid", "second", "lqg in joints", "lqg", "own"],
+)
+def test_a_controller_runs_at_its_own_rate_only(bench, make):
+    for rate in (500.0, 100.0, 250.1):
+        with pytest.raises(ftlm.ModelError, match=rf"rate = {rate:g} Hz is not the 250 Hz that the controller is made"):
+            rig.control(make(), HOLD, bench.board, arm=True, duration=0.1, rate=rate)
+    assert bench.kind == "q8" or bench.board._page is None
+    assert bench.kind == "virtual" or bench.hardware.log == []
+    run = rig.control(make(), HOLD, bench.board, arm=True, duration=0.1)
+    assert run.step == 1 / 250.0
+    assert run.metadata["rate"] == 250.0
+    assert rig.control(make(), np.zeros((26, 2)), bench.board, arm=True, rate=250).length == 26
+
+
+def test_a_saved_controller_runs_as_it_is_loaded_or_says_what_to_wrap_it_in(tmp_path):
+    lqgs = {"I1": observed(250.0), "I2": observed(250.0, "I2", "theta21")}
+    for name, controller in lqgs.items():
+        control.save_controller(controller, tmp_path / f"{name}.json")
+        loaded = control.load_controller(tmp_path / f"{name}.json")
+        run = rig.control(loaded, HOLD, duration=0.4, parameters="linear")
+        assert run.step == 1 / 250.0
+        other = {"I1": "I2", "I2": "I1"}[name]
+        assert np.ptp(run[name]) > 0.0
+        assert np.all(run[other] == 0.0)
+        wrapped = control.JointControllers(*((loaded,) if name == "I1" else (None, loaded)))
+        same = rig.control(wrapped, HOLD, duration=0.4, parameters="linear")
+        assert np.array_equal(run[name], same[name])
+    control.save_controller(control.DiscretePid(PID, 500.0, limit=0.9), tmp_path / "pid.json")
+    loaded = control.load_controller(tmp_path / "pid.json")
+    with pytest.raises(
+        ftlm.ModelError, match=r"JointControllers\(controller\) for joint 1 or JointControllers\(None, "
+    ):
+        rig.control(loaded, HOLD, duration=0.1)
+    run = rig.control(control.JointControllers(loaded), HOLD, duration=0.4, parameters="linear")
+    assert np.abs(run["I1"]).max() <= 0.9
+
+
+def test_joint_controllers_have_one_rate_and_their_own_motors():
+    slow, fast = (control.DiscretePid(PID, rate, limit=0.9) for rate in (250.0, 500.0))
+    with pytest.raises(ftlm.ModelError, match="have the rates 250 and 500 Hz"):
+        control.JointControllers(slow, fast)
+    assert control.JointControllers(slow, slow).rate == 250.0
+    assert control.JointControllers(None).rate is None
+    assert rig.control(control.JointControllers(None), HOLD, duration=0.1).step == 0.002
+    with pytest.raises(ftlm.ModelError, match="controller of joint 1 commands I2, the current of joint 2; give it"):
+        control.JointControllers(observed(250.0, "I2", "theta21"))
+    with pytest.raises(ftlm.ModelError, match="controller of joint 2 commands I1"):
+        control.JointControllers(None, observed(250.0))
+
+
+def test_a_design_is_no_controller_and_says_so():
+    model = ftlm.Model(ftlm.equation("D^2 theta11 = -63 D^0.95 theta11 + 140 I1"))
+    with pytest.raises(ftlm.ModelError, match=r"controller is a PidDesign; .* a design is run by its controller"):
+        rig.control(control.fractional_pid(model, crossover=20.0, samples=0), HOLD, duration=0.1)
+
+
+def test_a_live_estimate_for_another_rate_is_refused():
+    structure = ftlm.equation("D^2 theta11 = a D^0.95 theta11 + b I1")
+    live = rig.Streaming(structure, step=0.004, longest=1.0)
+    with pytest.raises(ftlm.ModelError, match=r"live = a stream with a step of 0.004 s, and the rig has 0.002 s"):
+        rig.record(duration=0.1, live=live)

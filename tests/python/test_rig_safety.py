@@ -16,7 +16,7 @@ import pytest
 import ftlm
 from ftlm import rig
 from ftlm.cli.main import app
-from ftlm.rig import quanser, watchdog
+from ftlm.rig import quanser, recording, watchdog
 from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.rig import shut_down
 from quanser_stand_in import Board
@@ -43,7 +43,7 @@ class Watched(rig.VirtualBoard):
         return found
 
     def write(self, volts):
-        if volts == (0.0, 0.0) and self._page is not None and self._page.has_expired:
+        if volts == (0.0, 0.0) and self._page is not None and (self._page.has_expired or self.gate.reason):
             self.log.append((len(self.log) - 1, volts))
         super().write(volts)
 
@@ -106,6 +106,19 @@ class Bench:
 
         self.hardware.hooks["reading"] = reading
 
+    def trip_at_rest(self, line):
+        """Trips a limit switch before a run begins."""
+        if self.kind == "q8":
+            self.inject("limit switch", -100, line)
+            return
+        start = self.board.start
+
+        def started(rate):
+            start(rate)
+            self.board._arm.inject("limit switch", line, 0, 0.0)
+
+        self.board.start = started
+
     @property
     def writes(self):
         return self.board.log if self.kind == "virtual" else self.hardware.writes
@@ -164,7 +177,7 @@ def recorded(bench, tmp_path, **options):
     loaded = ftlm.load(path)
     assert np.array_equal(loaded["theta11"], fault.value.run["theta11"])
     assert loaded.metadata["faults"]
-    assert any("the rig stopped the run" in w for w in loaded.warnings)
+    assert any("the rig stopped the run" in w for w in loaded.notes)
     assert str(path) in str(fault.value)
     assert sorted(p.name for p in tmp_path.iterdir() if p.name != "page") == ["run.csv"]
     bench.assert_safe()
@@ -312,6 +325,7 @@ CHILD = """
 import sys
 sys.path.insert(0, {here!r})
 from ftlm import rig
+from ftlm.rig import recording
 if {kind!r} == "virtual":
     board = rig.VirtualBoard(page={page!r}, real_time=True)
 else:
@@ -360,7 +374,7 @@ def test_a_killed_program_leaves_the_motors_off(kind, tmp_path):
     page.close()
     kept = ftlm.load(out.with_name("run.csv.partial"))
     assert kept.length >= 3
-    assert "did not end" in kept.warnings[0]
+    assert "did not end" in kept.notes[0]
 
 
 @pytest.mark.parametrize("kind", ["virtual", "q8"])
@@ -408,7 +422,7 @@ def test_a_command_that_is_stopped_says_where_its_run_is(number, code, tmp_path)
     process.send_signal(number)
     _, said = process.communicate(timeout=60)
     assert process.returncode == code
-    assert f"what was recorded is in {out}" in said
+    assert f"the motors are at 0 V; {ftlm.load(out).length} rows were recorded until then and are in {out}" in said
     assert ftlm.load(out).metadata["faults"] == ["stopped by " + ("Ctrl-C" if code == 130 else "SIGTERM")]
     assert not partial.exists()
 
@@ -645,7 +659,7 @@ def test_a_counter_that_wraps_is_a_fault(tmp_path, monkeypatch):
 
 
 def test_a_switch_that_is_tripped_already_stops_the_start(bench, tmp_path):
-    bench.inject("limit switch", -100, 3)
+    bench.trip_at_rest(3)
     with pytest.raises(ftlm.RigFault, match="limit switch 3 is tripped") as fault:
         rig.record(bench.board, arm=True, duration=1.0, out=tmp_path / "run.csv")
     assert "nothing was recorded" in str(fault.value)
@@ -800,3 +814,172 @@ def test_the_stand_in_sees_lists_wrong_types_and_unknown_calls(hardware):
     assert len(hardware.violations) >= 4
     with pytest.raises(AttributeError):
         hil.read_analog(np.arange(2, dtype=np.uint32), 2, np.zeros(2))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Starts and ends of a recording
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (("dead encoder", 9, 1.0, 0.0), "'dead encoder' on channel 9; the fault has the channels 0 to 1"),
+        (("saturated gauge", 2, 1.0, 0.0), "on channel 2; the fault has the channels 0 to 1"),
+        (("limit switch", 4, 1.0, 0.0), "on channel 4; the fault has the channels 0 to 3"),
+        (("lost samples", 1, 1.0, 0.0), "on channel 1; the fault has the channel 0 only"),
+        (("dead encoder", -1, 1.0, 0.0), "on channel -1"),
+        (("dead encoder", 0.5, 1.0, 0.0), "on channel 0.5"),
+        (("dead encoder", 0, float("nan"), 0.0), "at nan s; give a time of the run"),
+        (("dead encoder", 0, -1.0, 0.0), "at -1.0 s; give a time of the run"),
+        (("dead encoder", 0, float("inf"), 0.0), "at inf s"),
+        (("deflection", 0, 1.0, float("nan")), r"with the number nan; give more bend \[rad\]"),
+        (("late", 0, 1.0, -1.0), "with the number -1.0; give delay"),
+        (("dead encodr", 0, 1.0, 0.0), "'dead encodr' is not known; use 'dead encoder' or"),
+        (("dead encoder", 0), "is not .name, channel, time"),
+        (3, "is not .name, channel, time"),
+    ],
+)
+def test_a_fault_that_could_not_be_the_one_that_was_named_is_refused(fault, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        rig.VirtualBoard(inject=(fault,))
+    board = rig.VirtualBoard(page=None)
+    board.inject = (fault,)
+    with pytest.raises(ftlm.ModelError, match=words):
+        rig.record(board, duration=0.1)
+
+
+def test_a_first_write_that_fails_leaves_nothing_in_the_way(bench, tmp_path, monkeypatch):
+    def full(descriptor, content):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(recording.os, "write", full)
+        with pytest.raises(ftlm.DataError, match="No space left"):
+            rig.record(bench.board, arm=True, duration=0.1, out=tmp_path / "run.csv")
+    assert [p.name for p in tmp_path.iterdir() if p.name != "page"] == []
+    assert rig.record(bench.board, arm=True, duration=0.1, out=tmp_path / "run.csv").length == 51
+
+
+def test_ctrl_c_at_any_line_of_the_start_leaves_nothing_behind(tmp_path, request):
+    """Whenever it comes: one KeyboardInterrupt, handlers as before, no file, no process."""
+    kept = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, kept))
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    lines, stop = 0, 0
+
+    def local(frame, event, argument):
+        nonlocal lines
+        lines += event == "line"
+        if event == "line" and lines == stop:
+            signal.raise_signal(signal.SIGINT)
+        return local
+
+    def tracer(frame, event, argument):
+        return local if f"ftlm{os.sep}rig" in frame.f_code.co_filename else None
+
+    def record():
+        nonlocal lines
+        lines, traced = 0, sys.gettrace()
+        sys.settrace(tracer)
+        try:
+            rig.record(duration=0.004, parameters="linear", out=tmp_path / "run.csv", force=True)
+        finally:
+            sys.settrace(traced)
+
+    record()
+    count = lines
+    assert count > 300
+    for stop in range(1, count, count // 25):
+        (tmp_path / "run.csv").unlink(missing_ok=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            record()
+            assert ftlm.load(tmp_path / "run.csv").length == 3
+        assert not (tmp_path / "run.csv.partial").exists(), stop
+        assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before, stop
+
+
+@pytest.mark.parametrize("script", ["import time; time.sleep(60)", "raise ValueError('no clock')"])
+def test_a_watchdog_that_does_not_start_is_said_in_words(script, tmp_path, monkeypatch, capfd):
+    fake = tmp_path / "watchdog.py"
+    fake.write_text(script, encoding="utf-8")
+    monkeypatch.setattr(watchdog, "__file__", str(fake))
+    monkeypatch.setattr(watchdog.start, "__kwdefaults__", {"patience": 0.5})
+    with pytest.raises(SystemExit) as ended:
+        app(["record", "--duration", "1", "-o", str(tmp_path / "run.csv")], standalone_mode=True)
+    assert ended.value.code == 5
+    said = capfd.readouterr().err
+    assert "the watchdog process" in said
+    assert "check the Python installation" in said
+    assert "Traceback" not in said
+    assert [p.name for p in tmp_path.iterdir()] == ["watchdog.py"]
+
+
+SIGNALLED = """
+import os, sys
+from ftlm import cli, rig
+from ftlm.data.run import Run
+from ftlm.rig import recording
+
+first, second = {first}, {second}
+flush, to_csv, describe = recording._Recorder.flush, Run.to_csv, recording.describe_interruption
+
+
+def flushed(self):
+    if self.done >= 32:
+        os.kill(os.getpid(), first)
+    flush(self)
+
+
+def written(self, *given, **named):
+    os.kill(os.getpid(), second)
+    to_csv(self, *given, **named)
+    os.kill(os.getpid(), second)
+
+
+def described(ended):
+    os.kill(os.getpid(), second)
+    return describe(ended)
+
+
+recording._Recorder.flush, Run.to_csv, recording.describe_interruption = flushed, written, described
+recording.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+sys.argv = ["ftlm", "record", "--real-time", "--duration", "25", "--watchdog", "1", "-o", {out!r}]
+cli.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (signal.SIGTERM, signal.SIGTERM),
+        (signal.SIGHUP, signal.SIGHUP),
+        (signal.SIGTERM, signal.SIGINT),
+        (signal.SIGINT, signal.SIGTERM),
+    ],
+)
+def test_further_signals_while_a_run_is_saved_do_not_lose_it(first, second, tmp_path):
+    out = tmp_path / "run.csv"
+    script = SIGNALLED.format(first=int(first), second=int(second), out=str(out))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 128 + first, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "rows were recorded until then and are in" in done.stderr
+    run = ftlm.load(out)
+    assert run.length >= 32
+    assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
+
+
+def test_a_signal_while_a_finished_run_is_saved_comes_after_it(tmp_path, monkeypatch):
+    real = recording.save_run
+
+    def save(*given, **named):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return real(*given, **named)
+
+    monkeypatch.setattr(recording, "save_run", save)
+    with pytest.raises(SystemExit) as ended:
+        rig.record(duration=0.1, out=tmp_path / "run.csv")
+    assert ended.value.code == 128 + signal.SIGTERM
+    loaded = ftlm.load(tmp_path / "run.csv")
+    assert loaded.length == 51
+    assert loaded.metadata["faults"] == []

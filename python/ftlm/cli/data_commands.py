@@ -24,6 +24,7 @@ from ftlm.progress import Progress
 from ftlm.rig import recording as experiment
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.quanser import driver_state
+from ftlm.rig.rig import SignalHandlers
 from ftlm.structure.parser import equation
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import available_threads
@@ -173,7 +174,9 @@ def record(
     low, high = parse_numbers("--band", band, 2)
     shift = None if offset is None else parse_numbers("--offset", offset, 2)
     stream = live.stream(rig, parameters, rate, limit)
+    signals = SignalHandlers()
     try:
+        signals.install()
         with Progress("recording", quiet=as_json) as progress:
             run = experiment.record(
                 rig,
@@ -200,11 +203,14 @@ def record(
                 progress=live_reporter(stream, rate, progress),
             )
     except (KeyboardInterrupt, SystemExit) as ended:
+        signals.ignore()
         what = experiment.describe_interruption(ended)
-        motors = "; ".join(getattr(ended, "__notes__", [])) or "the motors are at 0 V"
-        print(f"ftlm: {what}; {motors}; what was recorded is in {out}", file=sys.stderr)
+        *troubles, rows = getattr(ended, "__notes__", None) or ["nothing was recorded"]
+        print(f"ftlm: {'; '.join([what, *(troubles or ['the motors are at 0 V']), rows])}", file=sys.stderr)
         code = ended.code if isinstance(ended, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
+    finally:
+        signals.restore()
     if stream is not None:
         print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
     if as_json:

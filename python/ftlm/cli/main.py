@@ -22,7 +22,7 @@ from ftlm.cli.estimation_commands import (
     select,
     status,
 )
-from ftlm.cli.framework import Command
+from ftlm.cli.framework import EXIT_INTERRUPTED, Command
 from ftlm.cli.model_commands import compare, export, plot, report, resid, simulate
 from ftlm.cli.other_commands import app as page
 from ftlm.cli.other_commands import demo, orders, reproduce
@@ -91,4 +91,9 @@ def main() -> None:
         # A terminal that knows no Greek must not take a result away after an hour's work.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    app()
+    try:
+        app()
+    except KeyboardInterrupt:
+        # It came before a command or after one.
+        print("ftlm: interrupted", file=sys.stderr)
+        sys.exit(EXIT_INTERRUPTED)

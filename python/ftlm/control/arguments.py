@@ -28,6 +28,11 @@ def checked_rate(rate: object) -> float:
     return value
 
 
+def same_rate(first: float, second: float) -> bool:
+    """Whether two sampling rates are equal, up to rounding."""
+    return abs(first - second) <= 1e-9 * second
+
+
 def select_outputs(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Return the given outputs, or all without a list."""
     if given is None:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from ftlm._core import __version__
+from ftlm.control.arguments import same_rate
 from ftlm.control.fractional_pid import DiscretePid, FractionalPid
 from ftlm.control.lqg import Lqg, Observer
 from ftlm.control.realization import MAX_POLES, Realisation
@@ -176,7 +177,7 @@ def save_controller(
     elif isinstance(controller, Lqg):
         written = _lqg(controller)
     else:
-        raise ModelError(f"controller is a {type(controller).__name__}; give a Realised or an Lqg")
+        raise ModelError(f"controller is a {type(controller).__name__}; give a DiscretePid or an Lqg")
     kind = "pid" if isinstance(written, PidFile) else "lqg"
     file = ControllerFile(
         "ftlm-controller", CONTROLLER_SCHEMA, f"ftlm {__version__}", str(model), ALGORITHM_TEXTS[kind], written
@@ -248,8 +249,9 @@ def _lqg(controller: Lqg) -> LqgFile:
     )
 
 
-#: Angles that the rig measures, in the order of the rig.
+#: Angles that the rig measures, and currents of its motors, in the order of the rig.
 ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
+MOTOR_INPUTS = ("I1", "I2")
 
 
 class JointControllers:
@@ -264,7 +266,8 @@ class JointControllers:
     Raises
     ------
     ModelError
-        Another type of controller, or one that needs a signal that the arm does not measure.
+        Another type of controller, one that needs a signal that the arm does not measure or drives the other motor, or
+        two sampling rates.
     """
 
     def __init__(self, first: DiscretePid | Lqg | None, second: DiscretePid | Lqg | None = None) -> None:
@@ -272,14 +275,28 @@ class JointControllers:
         self._reads: list[list[int]] = []
         for j, loop in enumerate(self.loops):
             if not isinstance(loop, (DiscretePid, Lqg, type(None))):
-                raise ModelError("first and second are Realised or Lqg controllers, or None")
+                raise ModelError("first and second are DiscretePid or Lqg controllers, or None")
             names = loop.observer.measured if isinstance(loop, Lqg) else (ANGLE_NAMES[2 * j],)
             unknown = [n for n in names if n not in ANGLE_NAMES]
             if unknown:
                 raise ModelError(
                     f"the controller reads {', '.join(unknown)}; the arm measures {', '.join(ANGLE_NAMES)}"
                 )
+            driven = loop.observer.realisation.input if isinstance(loop, Lqg) else None
+            if driven in MOTOR_INPUTS and driven != MOTOR_INPUTS[j]:
+                raise ModelError(
+                    f"the controller of joint {j + 1} commands {driven}, the current of joint {2 - j}; give it as the "
+                    f"{('second', 'first')[j]} one"
+                )
             self._reads.append([ANGLE_NAMES.index(n) for n in names])
+        rates = [loop.rate for loop in self.loops if loop is not None]
+        if len(rates) == 2 and not same_rate(*rates):
+            raise ModelError(
+                f"the controllers have the rates {rates[0]:g} and {rates[1]:g} Hz; make both for one rate, that of the "
+                "rig"
+            )
+        #: Sampling rate of both controllers [Hz]; None without a controller.
+        self.rate = rates[0] if rates else None
 
     def reset(self) -> None:
         """Reset both controllers."""

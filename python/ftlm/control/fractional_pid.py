@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -283,6 +284,8 @@ MAX_BROKEN_SHARE = 0.05
 MIN_PHASE_MARGIN_SHARE = 0.5
 #: Lowest crossover as a share of the rate; below, margins are not computable in floating point.
 MIN_CROSSOVER_SHARE = 1e-6
+#: Factor above the requested crossover from which the loop gain must be below 1.
+LAST_CROSSOVER_TOLERANCE = 1.01
 #: Relative plant gains at which the phase margin is evaluated.
 GAIN_VARIATIONS = (0.7, 1.4)
 
@@ -361,9 +364,9 @@ def fractional_pid(
     output, input : str, optional
         Controlled output and manipulated input; may be omitted for a model with one of them.
     crossover
-        Gain crossover frequency [rad/s].
+        Gain crossover frequency [rad/s], the highest one of the loop.
     phase_margin
-        Phase margin [degrees], 10 to 80.
+        Phase margin there [degrees], 10 to 80.
     rate
         Sampling rate [Hz]; one sample of delay and the zero-order hold are included.
     samples
@@ -384,13 +387,15 @@ def fractional_pid(
     ------
     ModelError
         An unstable model (an integrator is allowed), friction, or too much uncertainty: more than 5 % of the samples
-        make the loop unstable or halve its phase margin. Requirements that no nonnegative gains meet.
+        make the loop unstable or halve its phase margin. Requirements that no nonnegative gains meet, or not without
+        another crossover above the requested one.
 
     Notes
     -----
     At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear in the
     three gains and hold exactly. Among all orders whose largest sensitivity over all samples is at most 1.5 (or
-    within 5 % of the smallest), those with the largest loop gain at a tenth of the crossover are selected. Monje,
+    within 5 % of the smallest), those with the largest loop gain at a tenth of the crossover are selected. If their
+    loop gain is 1 again above the crossover, only orders without another crossover there are compared. Monje,
     Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
@@ -421,10 +426,19 @@ def fractional_pid(
             "another phase margin"
         )
     fine = nyquist_frequencies(wc, plant.rate)
-    acting = best.response(fine)
+    above = fine > LAST_CROSSOVER_TOLERANCE * wc
+    high = plant.response(fine[above])
+
+    def is_last(pid: FractionalPid) -> bool:
+        """Whether the loop gain stays below 1 above the crossover."""
+        return bool(np.all(np.abs(pid.response(fine[above]) * high) < 1.0))
+
+    chosen = best if is_last(best) else _best(target, slope, wc, w, curves, is_last)
+    acting = (chosen or best).response(fine)
+    lam = (chosen or best).lam if (chosen or best).ki > 0 else 0.0
 
     def loop_margins(one: Plant, factor: float = 1.0) -> Margins:
-        order = one.integral_order() + (best.lam if best.ki > 0 else 0.0)
+        order = one.integral_order() + lam
         return margins_of(factor * acting * one.response(fine), fine, order, one.count_unstable_poles())
 
     nominal = loop_margins(plant)
@@ -432,6 +446,12 @@ def fractional_pid(
         raise ModelError(
             f"the loop with a phase margin of {asked:g} degrees at {wc:g} rad/s is not stable on this model: its gain "
             "is 1 elsewhere too, at a resonance; move the crossover away from it"
+        )
+    if chosen is None:
+        raise ModelError(
+            f"the loop with a crossover of {wc:g} rad/s crosses a gain of 1 again on this model, last at "
+            f"{nominal.crossover:.4g} rad/s, whatever the orders; move the crossover above the resonance, or further "
+            "below it"
         )
     margins = tuple(map(loop_margins, drawn))
     broken = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_SHARE * asked)]
@@ -446,7 +466,7 @@ def fractional_pid(
     flat = tuple(loop_margins(plant, factor).phase for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1]))
     others = [replace(plant, output=o) for o in model.outputs if o != plant.output]
     moved = (plant, *(p for p in others if p.has_response()))
-    return PidDesign(best, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), moved)
+    return PidDesign(chosen, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), moved)
 
 
 def plant_of(
@@ -475,7 +495,14 @@ def plant_of(
     return Plant(model, names[0], names[1], checked_rate(rate), coupling, sensor)
 
 
-def _best(target: complex, slope: float, wc: float, w: Floats, curves: Complex) -> FractionalPid | None:
+def _best(
+    target: complex,
+    slope: float,
+    wc: float,
+    w: Floats,
+    curves: Complex,
+    is_allowed: Callable[[FractionalPid], bool] = lambda _: True,
+) -> FractionalPid | None:
     """Controller with the largest low-frequency gain among those that meet all conditions with low sensitivity."""
     found: list[tuple[float, float, FractionalPid]] = []
     centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
@@ -484,7 +511,7 @@ def _best(target: complex, slope: float, wc: float, w: Floats, curves: Complex) 
         for lam in np.unique(around[0]).tolist():
             for mu in np.unique(around[1]).tolist():
                 pid = _solve_gains(target, slope, wc, lam, mu)
-                if pid is None:
+                if pid is None or not is_allowed(pid):
                     continue
                 worst = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * curves)))
                 found.append((worst, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid))

@@ -54,8 +54,8 @@ class Margins:
         if not self.stable:
             return "not stable"
         return (
-            f"crossover {self.crossover:.4g} rad/s, phase margin {self.phase:.3g} degrees, gain margin "
-            f"{self.gain:.3g}, largest sensitivity {self.sensitivity:.3g}"
+            f"highest crossover {self.crossover:.4g} rad/s, smallest phase margin {self.phase:.3g} degrees, gain "
+            f"margin {self.gain:.3g}, largest sensitivity {self.sensitivity:.3g}"
         )
 
 

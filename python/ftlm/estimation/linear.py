@@ -351,6 +351,7 @@ class Streaming:
         known = [name in inputs for name in self.signals]
         equations = [(structure_tuple(e, self.signals), [t.fixed for t in e.terms]) for e in structure.equations]
         rows = max(2, round(longest / step) + 1)
+        self.step = step
         self._core = _core.Streaming(step, rows, known, equations, innovation_length, prior_covariance)
 
     def push(self, samples: Floats) -> None:

@@ -13,13 +13,19 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ftlm.control.arguments import same_rate
+from ftlm.control.controller_file import MOTOR_INPUTS, JointControllers
+from ftlm.control.fractional_pid import DiscretePid
+from ftlm.control.lqg import Lqg
+from ftlm.control.stability_margins import LoopDesign
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
+from ftlm.rig.excitation import finite_number
 from ftlm.rig.recording import Experiment, check_times
 from ftlm.rig.rig import MAX_RUN_DURATION_S, Board, Rig
-from ftlm.utils.parameters import parameter
+from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, check_seed, error_text
 
 #: Controller: function of time [s], measured angles [rad] and reference [rad] that returns two currents [A].
@@ -28,6 +34,7 @@ Controller: TypeAlias = Callable[[float, Floats, Floats], Sequence[float] | Floa
 REFERENCE_SIGNALS = ("reference1", "reference2")
 #: Bound on the JSON description of a controller in the metadata of a run.
 MAX_CONTROLLER_JSON_CHARACTERS = 100_000
+DEFAULT_RATE_HZ = 500.0
 #: Default joint angle at which a limit switch opens [rad], if the board states none.
 DEFAULT_TRAVEL_RAD = (math.pi / 2, math.pi / 2)
 
@@ -39,7 +46,7 @@ def control(
     *,
     duration: float | None = None,
     limit: float = 30.0,
-    rate: float = 500.0,
+    rate: float | None = None,
     seed: int = 0,
     parameters: str | os.PathLike[str] | ArmParameters = "effective",
     offset: tuple[float, float] | None = None,
@@ -65,14 +72,18 @@ def control(
         ``controller(time, angles, reference)`` with the time [s], an array of theta11, theta12, theta21, theta22 [rad]
         as recorded, and the reference of both joints [rad] at that time. It returns both currents [A], within 0.94 and
         1.2. A ``reset()`` method is called before the run; the result of a ``to_dict()`` method is stored in the run's
-        `metadata`.
+        `metadata`. A controller with an attribute `rate` [Hz] runs at this rate only. An :class:`ftlm.control.Lqg`
+        drives the motor of its input; a :class:`ftlm.control.DiscretePid` belongs into a
+        :class:`ftlm.control.JointControllers`.
     reference : array_like
         Joint angles [rad]: shape (rows, 2), one row per sample; or a pair that is held for `duration`.
     rig : {"virtual", "q8"} or Board, default "virtual"
         The simulated arm, the arm on a Q8-USB board, or a user-defined board.
     duration : float, optional
         Duration [s]; default that of the reference.
-    limit, rate, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board, out, force, live, progress
+    rate : float, optional
+        Sampling rate [Hz]; default that of the controller, or 500.
+    limit, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board, out, force, live, progress
         See :func:`ftlm.rig.record`.
     name : str
         Name of the run.
@@ -85,8 +96,8 @@ def control(
     Raises
     ------
     ModelError
-        An argument out of range, a reference beyond the arm's travel, or hardware without ``arm=True``; the arm has not
-        moved.
+        An argument out of range, a controller for another rate, a reference beyond the arm's travel, or hardware
+        without ``arm=True``; the arm has not moved.
     DataError
         An invalid reference array, or a file that exists already; the arm has not moved.
     RigFault
@@ -100,17 +111,19 @@ def control(
     deadlines, or when a write is 50 ms late. Without real time only the watchdog applies, with a timeout of 2 s.
     """
     if not callable(controller):
+        hint = "; a design is run by its controller" if isinstance(controller, LoopDesign) else ""
         raise ModelError(
             f"controller is a {type(controller).__name__}; pass what is called as controller(time, angles, reference) "
-            "and returns two currents [A]"
+            f"and returns two currents [A]{hint}"
         )
+    controller = _of_both_joints(controller)
+    rate = _rate_of(controller, rate)
     given = _numbers(reference)
     if duration is None:
         if given.ndim == 1:
             raise ModelError(
                 f"a reference that is held needs {parameter('duration')} [s]; or give it as rows, one a sample"
             )
-        _, _, rate = check_times(MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, rate)
         duration = (len(given) - 1) / rate
     duration, limit, rate = check_times(duration, limit, rate)
     seed = check_seed(seed)
@@ -145,6 +158,33 @@ def control(
         progress,
     )
     return asked.record_run(loop, {"control": told})
+
+
+def _of_both_joints(controller: Controller) -> Controller:
+    """Return a controller that can be called with time, angles and reference; raise for a PID of one joint."""
+    if isinstance(controller, Lqg) and controller.observer.realisation.input in MOTOR_INPUTS:
+        second = controller.observer.realisation.input == MOTOR_INPUTS[1]
+        return JointControllers(None, controller) if second else JointControllers(controller)
+    if isinstance(controller, (Lqg, DiscretePid)):
+        raise ModelError(
+            f"controller is a {type(controller).__name__} of one joint; pass JointControllers(controller) for joint 1 "
+            "or JointControllers(None, controller) for joint 2, of ftlm.control"
+        )
+    return controller
+
+
+def _rate_of(controller: Controller, rate: float | None) -> float:
+    """Return the sampling rate [Hz]; raise if it is not that of the controller."""
+    own = finite_number(getattr(controller, "rate", None))
+    _, _, checked = check_times(
+        MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, (own or DEFAULT_RATE_HZ) if rate is None else rate
+    )
+    if own is not None and not same_rate(checked, own):
+        raise ModelError(
+            f"{setting('rate')} {checked:g} Hz is not the {own:g} Hz that the controller is made for; leave "
+            f"{parameter('rate')} out, or make a controller for {checked:g} Hz"
+        )
+    return checked
 
 
 class ControllerSource:

@@ -18,7 +18,14 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.errors import RigFault
-from ftlm.rig.rig import RIG_COLUMNS, WATCHDOG_EXPIRED_MESSAGE, check_rate, check_watchdog, missing_expiration_state
+from ftlm.rig.rig import (
+    RIG_COLUMNS,
+    WATCHDOG_EXPIRED_MESSAGE,
+    OutputGate,
+    check_rate,
+    check_watchdog,
+    missing_expiration_state,
+)
 from ftlm.utils.validation import Floats
 
 #: Highest rate of the board's normal update mode [Hz]; above it the fast mode is used.
@@ -118,6 +125,7 @@ class QuanserBoard:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.card = card
+        self.gate = OutputGate()
         self.clock = clock
         self._sleep = sleep
         self._hil: Any = None
@@ -157,7 +165,7 @@ class QuanserBoard:
     def configure(self, rate: float) -> None:
         """Set ranges, directions and encoders, zero the outputs, and create one reader for simultaneous sampling."""
         check_rate(rate)
-        self._rate = rate
+        self._rate, self._samples, self._origin, self._rows = rate, 0, math.inf, []
         speed = "normal" if rate <= MAX_NORMAL_RATE_HZ else "fast"
         low_in, low_out = np.full(len(ANALOG_IN), -10.0), np.full(len(ANALOG_OUT), -10.0)
         with self._translate_errors("configuring the board") as hil:
@@ -229,7 +237,9 @@ class QuanserBoard:
         """Enable or disable the amplifiers."""
         if self._hil is None:
             return
-        with self._translate_errors("switching the amplifiers") as hil:
+        with self.gate.lock, self._translate_errors("switching the amplifiers") as hil:
+            if on:
+                self.gate.check()
             self._run_unless_expired(
                 lambda: hil.write_digital(
                     ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_ON if on else ENABLE_STATES_OFF
@@ -241,7 +251,7 @@ class QuanserBoard:
         """Write output voltages; 0 V is accepted even if the watchdog has locked the board."""
         if self._hil is None:
             return
-        with self._translate_errors("writing"):
+        with self.gate.lock, self._translate_errors("writing"):
             self._run_unless_expired(lambda: self._write(volts), done=volts == (0.0, 0.0))
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
@@ -302,8 +312,9 @@ class QuanserBoard:
 
     def close(self) -> None:
         """Close the board."""
-        if self._hil is not None:
+        with self.gate.lock:
             hil, self._hil = self._hil, None
+        if hil is not None:
             with self._translate_errors("closing the board", hil):
                 hil.close()
 
@@ -330,7 +341,9 @@ class QuanserBoard:
         return since - self._origin
 
     def _reload_and_write(self, guard: _core.Guard, volts: tuple[float, float]) -> None:
-        with self._translate_errors("writing", guard=guard) as hil:
+        with self.gate.lock, self._translate_errors("writing", guard=guard) as hil:
+            # A run that goes on in another thread after shutdown must not feed the watchdog either.
+            self.gate.check()
             if not hil.watchdog_reload():
                 self._is_expired = True
                 guard.fail(WATCHDOG_EXPIRED_MESSAGE)
@@ -338,8 +351,12 @@ class QuanserBoard:
             self._write(volts)
 
     def _write(self, volts: tuple[float, float]) -> None:
-        self._volts[:] = volts
-        self._hil.write_analog(ANALOG_OUT, len(ANALOG_OUT), self._volts)
+        with self.gate.lock:
+            if volts != (0.0, 0.0):
+                self.gate.check()
+            if self._hil is not None:
+                self._volts[:] = volts
+                self._hil.write_analog(ANALOG_OUT, len(ANALOG_OUT), self._volts)
 
     def _run_unless_expired(self, act: Callable[[], None], *, done: bool) -> None:
         """Perform an action; ignore its error if the watchdog has expired and has already `done` it.
@@ -354,8 +371,8 @@ class QuanserBoard:
 
     def _has_expired(self) -> bool:
         """Whether the watchdog has expired; False if the board cannot be asked."""
-        if not self._watched:
-            return False
+        if not self._watched or self._hil is None:
+            return self._is_expired
         try:
             self._is_expired = self._is_expired or not self._hil.watchdog_reload()
         except self._error:

@@ -22,7 +22,7 @@ from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.excitation import CURRENT_SIGNALS, Excitation, finite_number
 from ftlm.rig.quanser import QuanserBoard
-from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig
+from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, check_thread, describe_signal
 from ftlm.rig.virtual_board import VirtualBoard
 from ftlm.utils.files import RUN_MESSAGES, check_free
 from ftlm.utils.parameters import parameter, setting
@@ -63,10 +63,9 @@ class PartialRecording:
         #: Number of complete rows on disk.
         self.kept = 0
         self._descriptor: int | None = None
-        if self.path is None:
-            return
+        self._opened = False
         inputs = (*CURRENT_SIGNALS, *told)
-        header = Header(
+        self._header = Header(
             name,
             step,
             0.0,
@@ -77,15 +76,27 @@ class PartialRecording:
             ("the recording did not end: the program died, or the disk was full",),
             about | {"faults": ["the recording did not end"]},
         )
-        lines = f"{header.line()}{','.join([CSV_TIME, *self._columns])}\n"
+
+    def open(self) -> None:
+        """Create the file.
+
+        Raises
+        ------
+        DataError
+            The file cannot be written; none is left.
+        """
+        if self.path is None:
+            return
+        lines = f"{self._header.line()}{','.join([CSV_TIME, *self._columns])}\n"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         try:
             # Replace a symbolic link itself, not its target.
             self.path.unlink(missing_ok=True)
+            self._opened = True
             self._descriptor = os.open(self.path, flags, 0o666)
             self._append(lines.encode())
         except OSError as error:
-            self.close()
+            self.remove()
             reason = error.strerror or error
             raise DataError(
                 f"{str(self.path)!r} cannot be written ({reason}); check the folder and the space left"
@@ -125,18 +136,23 @@ class PartialRecording:
             raise
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, and delete it if it has no row: it would block the next recording."""
+        if self.kept == 0:
+            self.remove()
+        self._close_descriptor()
+
+    def remove(self) -> None:
+        """Close and delete the file, once the run has its final file."""
+        self._close_descriptor()
+        if self.path is not None and self._opened:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+
+    def _close_descriptor(self) -> None:
         if self._descriptor is not None:
             with contextlib.suppress(OSError):
                 os.close(self._descriptor)
             self._descriptor = None
-
-    def remove(self) -> None:
-        """Close and delete the file, once the run has its final file."""
-        self.close()
-        if self.path is not None:
-            with contextlib.suppress(OSError):
-                self.path.unlink()
 
 
 def save_run(
@@ -160,7 +176,9 @@ def save_run(
                 place += f" and are in {target}"
             except DataError as error:
                 partial.close()
-                place += f"; {partial.kept} of them are in {partial.path}"
+                place += (
+                    f"; {partial.kept} of them are in {partial.path}" if partial.kept else "; none could be written"
+                )
                 fault = RigFault(f"{error}; {place}")
                 if ended is not None:
                     fault = RigFault(f"{'; '.join(faults)}; {place}")
@@ -169,6 +187,7 @@ def save_run(
     else:
         partial.remove()
     if ended is not None and not isinstance(ended, RigFault):
+        ended.add_note(place)
         raise ended
     if ended is not None or faults or run is None:
         fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {place}")
@@ -282,7 +301,7 @@ def record(
         The rig stopped the run. The message states the cause; `run` and the file hold the recorded samples.
     BaseException
         Ctrl-C, SIGTERM, or an exception of `progress`, raised after shutdown and after the file is written; its notes
-        list errors during shutdown.
+        list errors during shutdown, and where the rows are. In another thread than the main one, Ctrl-C is a RigFault.
     """
     seed = check_seed(seed)
     duration, limit, rate = check_times(duration, limit, rate)
@@ -378,6 +397,7 @@ class Experiment:
                 f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
                 f"with {parameter('arm', True)}"
             )
+        check_thread(board)
         if not is_run_name(self.name):
             raise DataError(f"{setting('name')} {short_repr(self.name)} cannot name a run")
         target = None if self.out is None else Path(self.out)
@@ -404,21 +424,36 @@ class Experiment:
             sensor_filter=STOCK_FILTER if self.sensor_filter else None,
         )
         step, live = 1.0 / self.rate, self.live
+        if live is not None and not math.isclose(live.step, step, rel_tol=1e-9):
+            raise ModelError(
+                f"{setting('live')} a stream with a step of {live.step:g} s, and the rig has {step:g} s; make it for "
+                "the rig's rate"
+            )
         columns = [] if live is None else [_column_of(signal_name) for signal_name in live.signals]
         partial = PartialRecording(target, self.name, step, about, tuple(source.extra_signals))
         recorder = _Recorder(
             partial, source, self.progress, live, columns, _BLOCK_ROWS_REAL_TIME if paced else _BLOCK_ROWS_FAST
         )
-        ended, faults = _run_commands(link, recorder)
-        about |= {"missed_deadlines": link.guard.missed_deadlines, "faults": faults}
-        if live is not None:
-            about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.live_error}
+        # Until the file is written, a second signal must not end the program.
+        link.signals.deaf |= {_Recorder.collect.__code__}
         try:
+            link.signals.keep()
+            partial.open()
+            ended, faults = _run_commands(link, recorder)
+            about |= {"missed_deadlines": link.guard.missed_deadlines, "faults": faults}
+            if live is not None:
+                about["live"] = {
+                    "coefficients": live.coefficients,
+                    "pulses": live.pulses,
+                    "trouble": recorder.live_error,
+                }
             run = recorder.finish(self.name, about, faults, step)
-            return save_run(run, target, recorder.partial, force=self.force, ended=ended, faults=faults)
-        except BaseException:
-            recorder.partial.close()
-            raise
+            saved = save_run(run, target, partial, force=self.force, ended=ended, faults=faults)
+        finally:
+            partial.close()
+            link.signals.release()
+        link.signals.deliver()
+        return saved
 
 
 class FixedCommands:
@@ -470,10 +505,8 @@ def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None,
 def describe_interruption(ended: KeyboardInterrupt | SystemExit) -> str:
     """Describe the interruption of a run by a signal or an exit."""
     if isinstance(ended, KeyboardInterrupt):
-        return "stopped by Ctrl-C"
-    number = ended.code - 128 if isinstance(ended.code, int) else 0
-    known = {int(s): s.name for s in signal.Signals}
-    return f"stopped by {known.get(number, 'an exit of the program')}"
+        return describe_signal(signal.SIGINT)
+    return describe_signal(ended.code - 128 if isinstance(ended.code, int) else 0)
 
 
 class _Recorder:
@@ -491,9 +524,9 @@ class _Recorder:
         self.partial, self.source, self.progress = partial, source, progress
         self.live, self.columns, self.block = live, columns, block
         self.live_error: str | None = None
-        self.blocks: list[Floats] = []
-        self.waiting: list[Floats] = []
-        self.done = 0
+        self.taken: list[Floats] = []
+        #: Number of blocks passed on, and of their rows.
+        self.blocks = self.done = 0
 
     def follow(self, rig: Rig) -> None:
         """Run the commands of the source and store the rows in blocks."""
@@ -503,25 +536,25 @@ class _Recorder:
                 try:
                     rig.run(commands)
                 finally:
-                    rows = rig.take()
-                    self.waiting.append(rows)
-                if sum(map(len, self.waiting)) >= self.block:
+                    rows = self.collect(rig)
+                rig.signals.deliver()
+                if sum(map(len, self.taken[self.blocks :])) >= self.block:
                     self.flush()
                 commands = self.source.next_commands(rows)
         finally:
             self.flush()
 
-    def flush(self) -> None:
-        """Store the pending rows."""
-        rows, self.waiting = np.concatenate([np.empty((0, len(RIG_COLUMNS) + 1)), *self.waiting]), []
-        if len(rows):
-            self.keep(rows)
+    def collect(self, rig: Rig) -> Floats:
+        """Return the rows since the last call, which the run keeps; no signal may come between."""
+        self.taken.append(rig.take())
+        return self.taken[-1]
 
-    def keep(self, rows: Floats) -> None:
-        """Store rows, first in memory, then on disk."""
-        told = [values[self.done : self.done + len(rows), None] for values in self.source.extra_signals.values()]
-        rows = np.hstack([rows[:, : len(RIG_COLUMNS)], *told])
-        self.blocks.append(rows)
+    def flush(self) -> None:
+        """Pass pending rows on to the partial file, the live estimate and the progress callback."""
+        pending, self.blocks = self.taken[self.blocks :], len(self.taken)
+        rows = self._columns(pending, self.done)
+        if not len(rows):
+            return
         self.done += len(rows)
         self.partial.write(rows)
         if self.live is not None and self.live_error is None:
@@ -533,10 +566,16 @@ class _Recorder:
         if self.progress is not None:
             self.progress(self.done, self.source.rows)
 
+    def _columns(self, blocks: list[Floats], start: int) -> Floats:
+        """Return the columns of the run for blocks of rows that begin at row `start`."""
+        rows = np.concatenate([np.empty((0, len(RIG_COLUMNS) + 1)), *blocks])[:, : len(RIG_COLUMNS)]
+        told = [values[start : start + len(rows), None] for values in self.source.extra_signals.values()]
+        return np.hstack([rows, *told])
+
     def finish(self, name: str, about: dict[str, Any], faults: list[str], step: float) -> Run | None:
         """Return the run; None if fewer than three rows were recorded."""
         told = tuple(self.source.extra_signals)
-        rows = np.concatenate(self.blocks) if self.blocks else np.empty((0, len(RIG_COLUMNS) + len(told)))
+        rows = self._columns(self.taken, 0)
         if len(rows) < 3:
             return None
         data = {column: rows[:, k] for k, column in enumerate((*RIG_COLUMNS, *told))}

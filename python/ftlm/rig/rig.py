@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import faulthandler
 import math
+import os
+import select
 import signal
 import threading
 import weakref
@@ -19,28 +23,183 @@ from ftlm.utils.validation import Floats, error_text, real_number
 
 #: Termination signals, including those of a closed terminal.
 _TERMINATION_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+#: Longest time for which a new signal handler of the program stays unnoticed [ms].
+_HANDLER_CHECK_INTERVAL_MS = 20.0
+
+
+class OutputGate:
+    """Lock of every write to a board; once closed, only 0 V can be written, by any thread.
+
+    :class:`Rig` assigns a gate to its board for each session. A user-defined board writes under `lock`, and calls
+    :meth:`check` there before any other voltage and before the amplifiers are enabled.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        #: Why the gate is closed; None while it is open.
+        self.reason: str | None = None
+        #: Whether a thread is within :meth:`Board.run`.
+        self.running = False
+
+    def close(self, reason: str) -> None:
+        """Close the gate for good; the first reason is kept."""
+        with self.lock:
+            self.reason = self.reason or reason
+
+    def check(self) -> None:
+        """Raise RigFault if the gate is closed."""
+        if self.reason is not None:
+            raise RigFault(self.reason)
+
+
+class InterruptWatch:
+    """Thread that stops the motors on a termination signal while their run is not in the main thread.
+
+    Python calls signal handlers in the main thread only, which may wait for the run. :mod:`faulthandler` instead writes
+    from within the signal itself, here to a pipe that the thread reads, and then passes the signal on to Python.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._boards: list[Board] = []
+        #: Ends of the pipe of each signal, and the system's handler while it is that of faulthandler.
+        self._pipes: dict[int, tuple[int, int]] = {}
+        self._handlers: dict[int, bytes] = {}
+
+    @property
+    def available(self) -> bool:
+        """Whether the platform can report signals to the thread."""
+        return hasattr(faulthandler, "register")
+
+    def add(self, board: Board) -> None:
+        """Stop this board on the next termination signal that Python handles; any other one ends the program."""
+        with self._lock:
+            self._boards.append(board)
+            if self._pipes or not self.available:
+                return
+            for name in _TERMINATION_SIGNALS:
+                if hasattr(signal, name):
+                    ends = os.pipe()
+                    os.set_blocking(ends[1], False)
+                    self._pipes[getattr(signal, name)] = ends
+            self._register()
+            threading.Thread(target=self._watch, name="ftlm signals", daemon=True).start()
+
+    def remove(self, board: Board) -> None:
+        """Forget a board."""
+        with self._lock, contextlib.suppress(ValueError):
+            self._boards.remove(board)
+
+    def reset(self) -> None:
+        """Stop watching in a forked child, which has neither the thread nor the motors."""
+        self._lock = threading.Lock()
+        self._boards = []
+        self._stop()
+
+    def _stop(self) -> None:
+        for number, ends in self._pipes.items():
+            # A handler that is no function of Python has replaced that of faulthandler already.
+            if number in self._handlers and callable(signal.getsignal(number)):
+                faulthandler.unregister(number)
+            for end in ends:
+                os.close(end)
+        self._handlers, self._pipes = {}, {}
+
+    def _register(self) -> None:
+        """Register each signal whose handler the program has set since, which replaces that of faulthandler."""
+        for number, (_, write_end) in self._pipes.items():
+            if callable(signal.getsignal(number)) and _system_handler(number) != self._handlers.get(number):
+                faulthandler.unregister(number)
+                faulthandler.register(number, write_end, all_threads=False, chain=True)
+                self._handlers[number] = _system_handler(number)
+
+    def _watch(self) -> None:
+        numbers = {ends[0]: number for number, ends in self._pipes.items()}
+        poll = select.poll()
+        for end in numbers:
+            poll.register(end, select.POLLIN)
+        while True:
+            ready = poll.poll(_HANDLER_CHECK_INTERVAL_MS)
+            with self._lock:
+                self._register()
+                boards = list(self._boards)
+                if not boards:
+                    self._stop()
+                    return
+            for end, _ in ready:
+                os.read(end, 1 << 16)
+                for board in boards:
+                    _stop_motors(board, describe_signal(numbers[end]))
+
+
+def _system_handler(number: int) -> bytes:
+    """Address of the function that handles a signal, the first member of the system's structure."""
+    action = ctypes.create_string_buffer(1024)
+    ctypes.CDLL(None).sigaction(number, None, action)
+    return action.raw[: ctypes.sizeof(ctypes.c_void_p)]
+
+
+INTERRUPT_WATCH = InterruptWatch()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=INTERRUPT_WATCH.reset)
+
+
+def check_thread(board: Board) -> None:
+    """Raise if hardware is to run in a thread in which Ctrl-C cannot stop its motors."""
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if board.hardware and not in_main_thread and not INTERRUPT_WATCH.available:
+        raise ModelError(
+            f"the {board.name} is to run in the thread {threading.current_thread().name!r}, where Ctrl-C cannot stop "
+            "its motors on this system; run it in the main thread"
+        )
+
+
+def describe_signal(number: int) -> str:
+    """Describe the end of a run by a signal."""
+    if number == signal.SIGINT:
+        return "stopped by Ctrl-C"
+    names = {int(s): s.name for s in signal.Signals}
+    return f"stopped by {names.get(number, 'an exit of the program')}"
+
+
+def _stop_motors(board: Board, reason: str) -> None:
+    """Close the gate of a board, write 0 V and disable the amplifiers."""
+    board.gate.close(reason)
+    with contextlib.suppress(Exception):
+        board.write((0.0, 0.0))
+    with contextlib.suppress(Exception):
+        board.enable(False)
 
 
 class SignalHandlers:
     """Handlers of termination signals between start-up and shutdown of a rig.
 
-    Handlers are installed in the main thread only, because Python delivers signals to no other. The object holds no
-    reference to a rig, so that the handler table does not keep one alive.
+    In the main thread a signal closes the output gate and raises; elsewhere `INTERRUPT_WATCH` stops the motors. The
+    object holds no reference to a rig, so that the handler table does not keep one alive.
 
     Parameters
     ----------
     deaf
         Code objects that no signal may interrupt; signals that arrive while they run are deferred.
+    board
+        Board whose motors a signal stops, or None.
     """
 
-    def __init__(self, deaf: frozenset[CodeType]) -> None:
-        self._deaf = deaf
+    def __init__(self, deaf: frozenset[CodeType] = frozenset(), board: Board | None = None) -> None:
+        self.deaf = deaf
+        self._board = board
         self._before: dict[int, Any] = {}
         self._waiting: int | None = None
+        self._watched = self._kept = self._deferring = False
 
     def install(self) -> None:
         """Replace the current handlers; a Ctrl-C that the program ignores stays ignored."""
+        if self._before or self._watched:
+            return
         if threading.current_thread() is not threading.main_thread():
+            if self._board is not None:
+                self._watched = True
+                INTERRUPT_WATCH.add(self._board)
             return
         for name in _TERMINATION_SIGNALS:
             number = getattr(signal, name, None)
@@ -50,8 +209,45 @@ class SignalHandlers:
             self._before[number] = signal.getsignal(number)
             signal.signal(number, self._handle)
 
+    def keep(self) -> None:
+        """Install the handlers until :meth:`release`; signals after the first one, or after shutdown, are deferred."""
+        self._kept = True
+        self.install()
+
     def restore(self) -> None:
+        """Restore all previous handlers, or defer further signals until :meth:`release`."""
+        if self._kept:
+            self._deferring = True
+        else:
+            self._restore()
+
+    def release(self) -> None:
+        """Restore all previous handlers; :meth:`deliver` raises what was deferred."""
+        self._kept, self._deferring = False, True
+        self._restore()
+        self._deferring = False
+
+    def ignore(self) -> None:
+        """Ignore further signals, because the process is about to exit."""
+        for number in self._before:
+            signal.signal(number, signal.SIG_IGN)
+        self._before = {}
+
+    def deliver(self) -> None:
+        """Raise the exception of a deferred signal, unless it has to wait for :meth:`release`."""
+        if self._deferring:
+            return
+        number, self._waiting = self._waiting, None
+        if number is not None and (number == signal.SIGINT or self._before):
+            signal.raise_signal(number)
+        elif number is not None:
+            _end(number)
+
+    def _restore(self) -> None:
         """Restore all previous handlers; signals are blocked meanwhile, if the system supports it."""
+        if self._board is not None and self._watched:
+            self._watched = False
+            INTERRUPT_WATCH.remove(self._board)
         if not self._before or threading.current_thread() is not threading.main_thread():
             return
         mask = getattr(signal, "pthread_sigmask", None)
@@ -64,26 +260,24 @@ class SignalHandlers:
             if mask is not None:
                 mask(signal.SIG_SETMASK, kept)
 
-    def deliver(self) -> None:
-        """Raise the exception of a deferred signal."""
-        number, self._waiting = self._waiting, None
-        if number == signal.SIGINT:
-            signal.raise_signal(number)
-        elif number is not None:
-            _end(number)
-
     def _handle(self, number: int, frame: FrameType | None) -> None:
         at = frame
-        while at is not None:
-            if at.f_code in self._deaf:
-                self._waiting = number
-                return
+        while at is not None and at.f_code not in self.deaf:
             at = at.f_back
-        before = self._before.get(number)
-        if number == signal.SIGINT and callable(before):
-            before(number, frame)
+        if self._deferring or at is not None:
+            self._waiting = number
             return
-        _end(number)
+        before = self._before.get(number)
+        try:
+            if number == signal.SIGINT and callable(before):
+                before(number, frame)
+            else:
+                _end(number)
+        except BaseException:
+            self._deferring = self._kept
+            if self._board is not None:
+                self._board.gate.close(describe_signal(number))
+            raise
 
 
 def _end(number: int) -> None:
@@ -189,6 +383,8 @@ class Board(Protocol):
 
     name: str
     hardware: bool
+    #: Gate of the session, assigned by :class:`Rig`.
+    gate: OutputGate
 
     def open(self) -> None:
         """Open the board."""
@@ -239,12 +435,14 @@ class Board(Protocol):
 def shut_down(board: Board) -> list[str]:
     """Run the shutdown sequence; return the error messages of its steps.
 
-    Each step is tried even if an earlier one failed, and is repeated once if it is interrupted (a second Ctrl-C). If
-    0 V cannot be written or the amplifiers cannot be disabled, the watchdog is left to expire, which does both. If none
-    of the three is confirmed, the watchdog keeps running and the board stays open, because stopping or closing them
-    could leave the motors under current.
+    The output gate is closed first: from then on no other thread can write anything but 0 V. Each step is tried even if
+    an earlier one failed, and is repeated once if it is interrupted (a second Ctrl-C). If 0 V cannot be written or the
+    amplifiers cannot be disabled, the watchdog is left to expire, which does both. If none of the three is confirmed,
+    the watchdog keeps running and the board stays open, because stopping or closing them could leave the motors under
+    current.
     """
     troubles: list[str] = []
+    _try_step("closing the output gate", lambda: board.gate.close("the rig was shut down"), troubles)
     zero = _try_step("writing 0 V", lambda: board.write((0.0, 0.0)), troubles)
     off = _try_step("disabling the amplifiers", lambda: board.enable(False), troubles)
     _try_step("stopping the task", board.stop, troubles)
@@ -342,14 +540,21 @@ class Rig:
         self.guard = self.limits.guard(1.0 / rate, sensor_filter)
         self.shutdown_errors: list[str] = []
         self._samples = 0
-        self._signals = SignalHandlers(UNINTERRUPTIBLE_CODE)
+        self._gate = OutputGate()
+        #: Handlers of termination signals of the session.
+        self.signals = SignalHandlers(UNINTERRUPTIBLE_CODE, board)
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
     def __enter__(self) -> Rig:
         board = self.board
+        check_thread(board)
+        earlier: OutputGate | None = getattr(board, "gate", None)
+        if earlier is not None and earlier.running:
+            raise RigFault(f"{board.name}: another thread has not returned from a run on this board; wait for it")
+        board.gate = self._gate
         try:
-            self._finalizer = weakref.finalize(self, _shut_down_and_restore, board, self._signals)
-            self._signals.install()
+            self._finalizer = weakref.finalize(self, _shut_down_and_restore, board, self.signals)
+            self.signals.install()
             board.open()
             board.configure(self.rate)
             board.set_expiration()
@@ -372,7 +577,7 @@ class Rig:
         self._leave()
         if kind is None:
             # A signal that arrived during shutdown takes effect now.
-            self._signals.deliver()
+            self.signals.deliver()
         return False
 
     def _leave(self) -> None:
@@ -397,14 +602,21 @@ class Rig:
             self.fail(f"the time limit of {self.limit:g} s is over; ask for a longer one")
         self._samples += len(commands)
         try:
+            with self._gate.lock:
+                self._gate.check()
+                self._gate.running = True
             self.board.run(self.guard, commands)
         except BaseException as error:
             # Write 0 V immediately, because the caller may stay in the with statement.
             with contextlib.suppress(Exception):
                 self.board.write((0.0, 0.0))
-            if not isinstance(error, FtlmError):
+            # Whatever a call meets on a board that was shut down meanwhile, the shutdown is its cause.
+            reason = self._gate.reason if isinstance(error, Exception) else None
+            if reason is None and not isinstance(error, FtlmError):
                 raise
-            self.guard.fail(error_text(error))
+            self.guard.fail(reason or error_text(error))
+        finally:
+            self._gate.running = False
         self._check()
 
     def fail(self, why: str, cause: BaseException | None = None) -> NoReturn:

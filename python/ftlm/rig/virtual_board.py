@@ -11,11 +11,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ftlm import _core
-from ftlm.errors import RigFault
+from ftlm.errors import ModelError, RigFault
 from ftlm.rig import watchdog
 from ftlm.rig.arm_parameters import PARAMETER_SETS, ArmParameters
-from ftlm.rig.rig import WATCHDOG_EXPIRED_MESSAGE, check_rate, check_watchdog, missing_expiration_state
-from ftlm.utils.validation import Floats, check_seed
+from ftlm.rig.excitation import finite_number
+from ftlm.rig.rig import (
+    MAX_RUN_DURATION_S,
+    REST_DURATION_S,
+    WATCHDOG_EXPIRED_MESSAGE,
+    OutputGate,
+    check_rate,
+    check_watchdog,
+    missing_expiration_state,
+)
+from ftlm.utils.validation import Floats, check_choice, check_seed, short_repr, whole_number
 
 #: Faults that can be injected: name, and meaning of its number.
 FAULT_INJECTIONS = {
@@ -26,6 +35,8 @@ FAULT_INJECTIONS = {
     "late": "delay of that sample [s]",
     "lost samples": "",
 }
+#: Number of channels of a fault; of any other it is one.
+_FAULT_CHANNELS = {"dead encoder": 2, "saturated gauge": 2, "limit switch": 4, "deflection": 2}
 #: Shortest watchdog timeout of runs without real time [s]; they cannot be late, only the program can terminate.
 _MIN_FAST_WATCHDOG_S = 2.0
 
@@ -48,6 +59,11 @@ class VirtualBoard:
         File of the output registers; it is kept if given.
     inject
         Injected faults: (name in FAULT_INJECTIONS, channel from 0, time [s], number).
+
+    Raises
+    ------
+    ModelError
+        An unknown fault, a channel that the arm does not have, or a time or number out of range.
     """
 
     parameters: ArmParameters = field(default_factory=lambda: PARAMETER_SETS["effective"])
@@ -60,6 +76,7 @@ class VirtualBoard:
     hardware: bool = False
 
     def __post_init__(self) -> None:
+        self.gate = OutputGate()
         self._page: watchdog.RegisterPage | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._arm: _core.VirtualArm | None = None
@@ -69,6 +86,10 @@ class VirtualBoard:
         self.seed = check_seed(self.seed)
         self._random = np.random.default_rng(self.seed)
         self._rate = 0.0
+        if not isinstance(self.inject, (tuple, list)):
+            raise ModelError(f"inject = {short_repr(self.inject)} is no tuple of faults")
+        for fault in self.inject:
+            _checked_injection(fault)
 
     def open(self) -> None:
         """Create the output stage."""
@@ -82,9 +103,8 @@ class VirtualBoard:
         check_rate(rate)
         self._rate = rate
         self._arm = self.parameters.arm(1.0 / rate, self.horizon + 2.0)
-        for what, channel, seconds, number in self.inject:
-            sample = round((seconds + 0.2) * rate)
-            self._arm.inject(what, channel, sample, number)
+        for what, channel, seconds, number in map(_checked_injection, self.inject):
+            self._arm.inject(what, channel, round((seconds + REST_DURATION_S) * rate), number)
         self.write((0.0, 0.0))
 
     def set_expiration(self) -> None:
@@ -119,19 +139,23 @@ class VirtualBoard:
 
     def enable(self, on: bool) -> None:
         """Enable or disable the amplifiers."""
-        if not on:
-            # Disabling is always possible, because the real watchdog releases the lines as well.
-            if self._page is not None:
+        with self.gate.lock:
+            if on:
+                page = self._access()
+                self.gate.check()
+                page.set("enabled", 1)
+            elif self._page is not None:
+                # Disabling is always possible, because the real watchdog releases the lines as well.
                 self._page.set("enabled", 0)
-            return
-        self._access().set("enabled", 1)
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Write output voltages; 0 V is always possible, even after the watchdog has expired or terminated."""
-        if volts == (0.0, 0.0) and self._page is not None and (self._page.has_expired or self._has_lost_watchdog()):
-            self._page.write_heartbeat(self._beat, 0.0, 0.0)
-            return
-        self._output_volts(*volts)
+        """Write output voltages; 0 V is always possible, without a heartbeat if nothing else is any more."""
+        with self.gate.lock:
+            page, closed = self._page, self.gate.reason is not None
+            if volts == (0.0, 0.0) and page is not None and (closed or page.has_expired or self._has_lost_watchdog()):
+                page.write_heartbeat(self._beat, 0.0, 0.0)
+            else:
+                self._output_volts(*volts)
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
         """Sample with outputs at 0 V."""
@@ -181,8 +205,9 @@ class VirtualBoard:
 
     def close(self) -> None:
         """Remove the output stage."""
-        if self._page is not None:
+        with self.gate.lock:
             page, self._page = self._page, None
+        if page is not None:
             page.close()
             if self.page is None:
                 with contextlib.suppress(OSError):
@@ -206,12 +231,34 @@ class VirtualBoard:
 
     def _output_volts(self, volts1: float, volts2: float) -> tuple[tuple[float, float], bool]:
         """Write output voltages; return them and whether the amplifiers are enabled."""
-        page = self._access()
-        if self._has_lost_watchdog():
-            raise RigFault(
-                "virtual rig: the watchdog's process has died, and nothing would stop the motors should the program "
-                "die too; see what ended it, and start again"
-            )
-        self._beat += 1
-        page.write_heartbeat(self._beat, volts1, volts2)
-        return (volts1, volts2), bool(page.get("enabled"))
+        with self.gate.lock:
+            page = self._access()
+            self.gate.check()
+            if self._has_lost_watchdog():
+                raise RigFault(
+                    "virtual rig: the watchdog's process has died, and nothing would stop the motors should the "
+                    "program die too; see what ended it, and start again"
+                )
+            self._beat += 1
+            page.write_heartbeat(self._beat, volts1, volts2)
+            return (volts1, volts2), bool(page.get("enabled"))
+
+
+def _checked_injection(fault: object) -> tuple[str, int, float, float]:
+    """Return an injected fault; raise for an unknown name, or a channel, time or number out of range."""
+    if not isinstance(fault, (tuple, list)) or len(fault) != 4:
+        raise ModelError(f"inject has {short_repr(fault)}, which is not (name, channel, time [s], number)")
+    name, channel, time_s, number = fault
+    check_choice("the injected fault", name, FAULT_INJECTIONS)
+    count, meaning = _FAULT_CHANNELS.get(name, 1), FAULT_INJECTIONS[name]
+    where, when, value = whole_number(channel), finite_number(time_s), finite_number(number)
+    if where is None or not 0 <= where < count:
+        there = "has the channel 0 only" if count == 1 else f"has the channels 0 to {count - 1}"
+        raise ModelError(f"inject has {name!r} on channel {short_repr(channel)}; the fault {there}")
+    if when is None or not 0 <= when <= MAX_RUN_DURATION_S:
+        raise ModelError(
+            f"inject has {name!r} at {short_repr(time_s)} s; give a time of the run, from 0 to {MAX_RUN_DURATION_S:g} s"
+        )
+    if value is None or (name == "late" and value < 0):
+        raise ModelError(f"inject has {name!r} with the number {short_repr(number)}; give {meaning or '0'}")
+    return name, where, when, value

@@ -125,14 +125,20 @@ def start(page: RegisterPage, *, keep: bool, patience: float = 10.0) -> subproce
     """
     command = [sys.executable, "-I", "-S", __file__, str(page.path), "keep" if keep else "remove"]
     # A separate session, so that Ctrl-C does not reach the watchdog.
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+    nothing = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
     until = time.monotonic() + patience
-    while not page.get("ready"):
-        if process.poll() is not None or time.monotonic() > until:
-            process.kill()
-            process.wait()
-            raise OSError("the watchdog process of the virtual rig did not start")
-        time.sleep(0.002)
+    try:
+        while not page.get("ready"):
+            if process.poll() is not None:
+                raise OSError(f"the watchdog process ended at its start (exit code {process.returncode})")
+            if time.monotonic() > until:
+                raise OSError(f"the watchdog process did not start within {patience:g} s")
+            time.sleep(0.002)
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
     return process
 
 
