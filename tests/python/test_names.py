@@ -38,6 +38,7 @@ FIRST_WORDS = IRREGULAR & {
 #: Nouns and verbs that end as participles and adverbs do.
 NOUNS = frozenset(
     """
+    embed encoding spelling breed shed weed indeed learning family
     seed speed need feed string ring spring sampling damping spacing timing warning setting settings meaning
     heading padding mapping logging reading testing rounding bearing ceiling filling opening coupling scaling
     smoothing weighting plotting streaming indexing ordering loading screening pruning reply apply only
@@ -75,9 +76,7 @@ def begins_badly(text):
     word = first[1].lower()
     if first[1] == "What" or (word == "whether" and (first[2] or "").lower() == "what"):
         return True
-    return (
-        word not in NOUNS and (word in IRREGULAR - {"between", "once", "only"} or word.endswith("ed")) and len(word) > 3
-    )
+    return word not in NOUNS and (word in FIRST_WORDS or re.fullmatch(r"[a-z]{2,}ed", word) is not None)
 
 
 def is_one_word_constant(name):

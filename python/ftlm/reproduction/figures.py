@@ -24,7 +24,7 @@ from ftlm.validation.comparison import Comparison, metrics
 LINE_POINTS = 500
 #: Largest drawn excursion relative to the reference line, and largest drawn error of the recursion relative to its last
 #: value. Diverging lines would hide all others.
-FARTHEST, FARTHEST_ERROR = 4.0, 1000.0
+MAX_POLE_DISTANCE, FARTHEST_ERROR = 4.0, 1000.0
 
 
 def reference_label(*, simulated: bool) -> str:
@@ -35,7 +35,7 @@ def reference_label(*, simulated: bool) -> str:
 def mask_excursions(values: Floats, measured: Floats) -> Floats:
     """Replace values far from the measured ones by NaN; the chart marks the gap."""
     middle = float(np.mean(measured))
-    limit = FARTHEST * float(np.max(np.abs(measured - middle)))
+    limit = MAX_POLE_DISTANCE * float(np.max(np.abs(measured - middle)))
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values - middle) <= limit, values, np.nan)
 
