@@ -24,7 +24,7 @@ from ftlm.validation.comparison import Comparison, metrics
 LINE_POINTS = 500
 #: Largest drawn excursion relative to the reference line, and largest drawn error of the recursion relative to its last
 #: value. Diverging lines would hide all others.
-MAX_POLE_DISTANCE, FARTHEST_ERROR = 4.0, 1000.0
+MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
 
 
 def reference_label(*, simulated: bool) -> str:
@@ -35,7 +35,7 @@ def reference_label(*, simulated: bool) -> str:
 def mask_excursions(values: Floats, measured: Floats) -> Floats:
     """Replace values far from the measured ones by NaN; the chart marks the gap."""
     middle = float(np.mean(measured))
-    limit = MAX_POLE_DISTANCE * float(np.max(np.abs(measured - middle)))
+    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(measured - middle)))
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values - middle) <= limit, values, np.nan)
 
@@ -113,11 +113,11 @@ def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *,
     drawn = {}
     for p, trace in traces.items():
         with np.errstate(invalid="ignore"):
-            near = np.where(trace.error <= FARTHEST_ERROR * ends, trace.error, np.nan)
+            near = np.where(trace.error <= MAX_ERROR_RATIO * ends, trace.error, np.nan)
         drawn[p] = replace(trace, error=near if np.isfinite(near).any() else trace.error)
     figure = trace_chart([(f"p = {p}", trace) for p, trace in drawn.items()], title=title, log_x=log_x)
     gaps = any(np.isnan(t.error).any() for t in drawn.values())
-    words = f"Errors above {FARTHEST_ERROR:g} times the last ones are not drawn."
+    words = f"Errors above {MAX_ERROR_RATIO:g} times the last ones are not drawn."
     return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
 
 
