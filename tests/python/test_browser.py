@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.report import html_report as model_page
+from ftlm.report.html_report import model_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None and not os.environ.get("CI"):
