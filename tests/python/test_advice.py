@@ -171,7 +171,7 @@ def test_a_channel_that_was_zeroed_is_told_from_a_machine_at_rest():
     zeroed[:200] = 0.0
     sentence = str(made(0.01, u, zeroed).advice())
     assert "exactly 0 rad from 0 s to 2 s (200 rows)" in sentence
-    assert "window(2, None)" in sentence
+    assert "window=(2.0, None)" in sentence
     # Simulated without noise, at rest until the input moves: nothing is wrong with it.
     late = u.copy()
     late[:200] = 0.0

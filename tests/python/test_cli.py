@@ -467,4 +467,6 @@ def test_the_list_of_commands_is_whole_sentences_and_no_help_names_a_type_of_pyt
         assert not re.search(r"<(list|str|int|float|bool)", told), name
         for line in re.findall(r"<[^>]*>", told):
             assert "|" in line, (name, line)
-    assert "Sampling step [s] of files" in CliRunner().invoke(app, ["identify", "-h"], env={"COLUMNS": "120"}).output
+    assert (
+        "Sampling interval [s] of files" in CliRunner().invoke(app, ["identify", "-h"], env={"COLUMNS": "120"}).output
+    )
