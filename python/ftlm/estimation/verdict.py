@@ -85,11 +85,10 @@ class Validation(Comparison):
 
     Parameters
     ----------
-    output_error, equation_error, per_run, simulated, measured, step, m, initial, warnings, times, output_samples,
-    offsets
+    output_error, equation_error, per_run, simulated, measured, step, m, initial, warnings, times
         See :class:`ftlm.Comparison`.
-    without_equation_error
-        See there.
+    output_samples, offsets, without_equation_error
+        See :class:`ftlm.Comparison`.
     verdict
         Verdict on the model after this validation.
     """
