@@ -216,4 +216,4 @@ def test_on_the_command_line(tmp_path):
     assert said["delays"]["u"] == pytest.approx(DELAY, abs=4 * said["standard_errors"]["delay_u"])
     done = CliRunner().invoke(cli.app, [*command, "u=0.2..0.4"])
     assert done.exit_code != 0
-    assert "neither seconds nor LEAST:LARGEST" in done.output
+    assert "neither seconds nor LOW:HIGH" in done.output

@@ -180,12 +180,12 @@ def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
     assert claim.holds is None
     assert "K0" in claim.ruling.factors
     for contest in reproduction.panel.contests:
-        assert set(contest.lattice) == {1.0, 1e10}
+        assert set(contest.order_grid) == {1.0, 1e10}
         assert set(contest.genetic) == set(contest.evolution) == {0, 1}
         if contest.output.endswith("1"):
             # The hubs: the data alone beat every seed of either, K0 = 1 none of the genetic algorithm's best.
-            assert contest.lattice[1e10] < min(*contest.genetic.values(), *contest.evolution.values())
-            assert contest.lattice[1.0] > 10 * contest.lattice[1e10]
+            assert contest.order_grid[1e10] < min(*contest.genetic.values(), *contest.evolution.values())
+            assert contest.order_grid[1.0] > 10 * contest.order_grid[1e10]
     # Bounds of a rival are wider or narrower than the maker's values as the data have it.
     bounds = reproduction.stages[1].rivals["theta11"].genetic_run.bounds
     assert bounds["a1"][1] != pytest.approx(2 * 628.889, rel=0.01)
@@ -243,7 +243,7 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     panel = reproduction.panel
     falling = {1: 4.0, 3: 3.0, 5: 2.0, 7: 1.0}
     trials = tuple(replace(t, errors=falling, arrived=falling, nr=0.1, manual=0.2) for t in panel.trials)
-    contests = tuple(replace(c, lattice=dict.fromkeys(c.lattice, 1e-9)) for c in panel.contests)
+    contests = tuple(replace(c, order_grid=dict.fromkeys(c.order_grid, 1e-9)) for c in panel.contests)
     freed = tuple(
         replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
         for f in panel.order_comparisons
@@ -502,7 +502,7 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
         (["--square", "strange.csv"], 3, "a stage of the arm needs I1, theta11 and theta12"),
         (["--square", "whole.csv", "--sine", "strange.csv"], 3, "lacks I1, theta12, which the square run"),
         (["--increment", "0"], 2, "step"),
-        (["--evaluations", "5"], 2, "evaluations = 5 is less than two generations"),
+        (["--evaluations", "5"], 2, "--evaluations 5 is less than two generations"),
         (["--square", "gone.csv"], 3, "gone.csv"),
     ],
 )

@@ -25,7 +25,7 @@ WORDS = "D^2 y = a y + d D y + c0 s + c1 D s + c2 D^2 s + c3 v"
 class Alone:
     """Work done one after another."""
 
-    def quietly(self, work, items):
+    def map_items(self, work, items):
         return [work(item) for item in items]
 
 
