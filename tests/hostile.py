@@ -657,19 +657,19 @@ class Sound:
 
     def stage_search_follow(self):
         search = self.one_of("StageSearch")
-        return search, (search.wanted(), 1, self.progress())
+        return search, (search.pending_spans(), 1, self.progress())
 
     def stage_search_take(self):
         search = self.one_of("StageSearch")
-        if not search.wanted():
+        if not search.pending_spans():
             search = self.one_of("StageSearch", new=True)
-        values, kinds = search.follow(search.wanted(), 1, None)
+        values, kinds = search.follow(search.pending_spans(), 1, None)
         return search, (values, kinds, 1)
 
     def stage_search_outcome(self):
         search = self.one_of("StageSearch")
-        while search.wanted():
-            search.take(*search.follow(search.wanted(), 1, None), 1)
+        while search.pending_spans():
+            search.take(*search.follow(search.pending_spans(), 1, None), 1)
         return search, ()
 
     def points_new(self):

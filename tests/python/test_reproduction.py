@@ -223,8 +223,8 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
     freed = {(f.arm, f.stage): f for f in reproduction.panel.order_comparisons}
     for stage in (1, 2):
         put_in, whole = freed["fractional", stage], freed["whole orders", stage]
-        assert whole.away == []
-        assert put_in.away
+        assert whole.fractional_orders == []
+        assert put_in.fractional_orders
         for o, nr in put_in.free.items():
             assert nr < 0.5 * put_in.whole[o]
             assert whole.free[o] == pytest.approx(whole.whole[o], rel=0.02)
@@ -233,7 +233,7 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
         if t.arm == "whole orders":
             assert t.nr > t.manual
     # Of a measured run nobody chose the truth.
-    own = replace(reproduction.panel, trials=(), freed=(freed["fractional", 1], freed["fractional", 2]))
+    own = replace(reproduction.panel, trials=(), order_comparisons=(freed["fractional", 1], freed["fractional", 2]))
     measured = replace(reproduction, simulated=False, panel=own)
     assert by_words(claims(measured), "better than whole ones").verdict == "holds"
     assert by_words(claims(measured), "closer to the run than the manual's").verdict == "cannot be told"
@@ -242,7 +242,7 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
 def test_verdicts_turn_when_the_numbers_do(reproduction):
     panel = reproduction.panel
     falling = {1: 4.0, 3: 3.0, 5: 2.0, 7: 1.0}
-    trials = tuple(replace(t, errors=falling, arrived=falling, nr=0.1, manual=0.2) for t in panel.trials)
+    trials = tuple(replace(t, errors=falling, convergence_steps=falling, nr=0.1, manual=0.2) for t in panel.trials)
     contests = tuple(replace(c, order_grid=dict.fromkeys(c.order_grid, 1e-9)) for c in panel.contests)
     freed = tuple(
         replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
@@ -496,7 +496,7 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
     [
         (["-o", "there.html"], 3, "there.html exists; choose another name"),
         (["-o", "no/folder.html"], 3, "no is no folder; make it first"),
-        (["--save", "full"], 3, "full/square.csv exists (1 such files); choose another folder, or force=True"),
+        (["--save", "full"], 3, "full/square.csv exists (1 such files); choose another folder, or --force"),
         (["--save", "there.html"], 3, "there.html cannot be made"),
         (["--sine", "strange.csv"], 2, "--sine is given without --square"),
         (["--square", "strange.csv"], 3, "a stage of the arm needs I1, theta11 and theta12"),

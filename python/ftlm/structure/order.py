@@ -196,10 +196,10 @@ def order_axis(name: str, low: float, high: float, step: float) -> tuple[float, 
     """Values of one order from ``low`` to ``high`` in increments of ``step``, both ends included."""
     low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
     if not (math.isfinite(step) and step > 0):
-        raise ModelError(f"order {name}: step {step:g} is not positive; the paper's is 0.05")
+        raise ModelError(f"order {name}: increment {step:g} is not positive; the paper's is 0.05")
     if step < ORDER_RESOLUTION:
         raise ModelError(
-            f"order {name}: step {step:g} is below {ORDER_RESOLUTION:g}, to which orders are kept; raise the step"
+            f"order {name}: increment {step:g} is below {ORDER_RESOLUTION:g}, to which orders are kept; raise the increment"
         )
     _check_range(name, low)
     _check_range(name, high)
@@ -209,6 +209,6 @@ def order_axis(name: str, low: float, high: float, step: float) -> tuple[float, 
     if steps > MAX_AXIS_VALUES:
         raise ModelError(
             f"order {name}: {low:g}:{high:g}:{step:g} has {steps:.3g} values, more than {MAX_AXIS_VALUES}; raise "
-            "the step"
+            "the increment"
         )
     return tuple(round(low + i * step, 9) + 0.0 for i in range(int(steps + 1e-6) + 1))
