@@ -16,7 +16,7 @@ import pytest
 
 import ftlm
 from ftlm.errors import ConvergenceError, DataError, ModelError
-from ftlm.order_search import schedule as rounds
+from ftlm.order_search import batches
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 
@@ -43,7 +43,7 @@ def expected(run):
 
 @pytest.fixture(autouse=True)
 def forget():
-    rounds._cached_searches.clear()
+    batches._cached_searches.clear()
 
 
 @contextlib.contextmanager
@@ -163,7 +163,7 @@ def test_a_worker_keeps_few_searches_ready(run):
     with ThreadPoolExecutor(1) as pool:
         for m in (16, 32, 64):
             search(run, pool, m=m)
-    assert len(rounds._cached_searches) == rounds.MAX_CACHED_SEARCHES
+    assert len(batches._cached_searches) == batches.MAX_CACHED_SEARCHES
 
 
 def test_an_error_of_the_search_is_the_one_of_one_machine(run):

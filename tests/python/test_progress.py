@@ -16,9 +16,9 @@ import ftlm
 from ftlm import progress
 from ftlm.cli import framework as wait
 from ftlm.cli.main import app
+from ftlm.order_search.batches import EquationProblem
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import SearchSettings
-from ftlm.order_search.schedule import EquationProblem
 from ftlm.order_search.search import announce_time, expected_seconds, make_job, run_job
 from ftlm.progress import TOTAL_PARTS, Progress, ShareTracker, Stoppable, format_duration_estimate, format_time_left
 from ftlm.reproduction import cross_validation as unseen

@@ -409,8 +409,8 @@ def search_stage(run, path=None, *, structure=None, order_grid=None, **options):
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Some candidates a frame, so that a small store has many."""
-    monkeypatch.setattr("ftlm.order_search.schedule.MIN_BLOCK_CANDIDATES", 16)
-    monkeypatch.setattr("ftlm.order_search.schedule.CHECKPOINT_INTERVAL_S", 0.0)
+    monkeypatch.setattr("ftlm.order_search.batches.MIN_BLOCK_CANDIDATES", 16)
+    monkeypatch.setattr("ftlm.order_search.batches.CHECKPOINT_INTERVAL_S", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -522,7 +522,7 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
 def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage_expected, tmp_path, monkeypatch):
     path = tmp_path / "s.ftlm"
     path.write_bytes(stage_store)
-    monkeypatch.setattr("ftlm.order_search.schedule.CoupledProblem.build_evaluator", None)
+    monkeypatch.setattr("ftlm.order_search.batches.CoupledProblem.build_evaluator", None)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert ftlm.search_status(path)["stage"].complete
     held = msgspec.structs.asdict(read_store(path).sections[0].joined)

@@ -18,10 +18,7 @@ from ftlm import _core
 from ftlm.data.run import Run, as_runs
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.model.model import Model
-from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
-from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
-from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
-from ftlm.order_search.schedule import (
+from ftlm.order_search.batches import (
     CoreRecord,
     CoupledProblem,
     EquationProblem,
@@ -31,6 +28,9 @@ from ftlm.order_search.schedule import (
     search_coupled,
     search_equation,
 )
+from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
+from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
+from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import (
     InitialTuple,

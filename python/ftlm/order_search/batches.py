@@ -1,4 +1,4 @@
-"""Search problems: data of an order search as arguments of the core, in this process and in workers."""
+"""Batches of an order search: evaluation in this process or on an executor, bookkeeping and checkpoints."""
 
 from __future__ import annotations
 
