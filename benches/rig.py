@@ -26,7 +26,7 @@ from ftlm.rig.arm_parameters import MAX_SUBSTEP_S
 from ftlm.rig.rig import Limits, Rig
 from ftlm.rig.virtual_board import VirtualBoard
 
-PATIENT = Limits(late=60.0, missed=10**9, standstill=1e9)
+PATIENT = Limits(max_write_delay=60.0, max_missed_deadlines=10**9, standstill=1e9)
 CHILD = """
 import sys
 from ftlm import rig

@@ -116,7 +116,7 @@ def kills(count, seed=0, of=search):
                 lines = [first, *child.stdout]
             told = [line.split() for line in lines if line.endswith("\n") and line.strip()]
             if not finished:
-                held = ftlm.search_status(path)[name].done
+                held = ftlm.search_status(path)[name].done_count
                 # A stage tells what is in the store only: all since then is lost.
                 ages = [
                     killed - float(when)
@@ -168,7 +168,7 @@ def control_c(arguments, path, frames):
 def rounds_in(path):
     """Stretches of rounds in a store, done or begun, of its first search."""
     section = read_store(path).sections[0]
-    return len(section.done) + len(section.open)
+    return len(section.frames) + len(section.open)
 
 
 def interruptions(count):

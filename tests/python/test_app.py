@@ -487,7 +487,7 @@ def scripted(page, key, content, folder):
 def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
     (key,) = used.desk.models
     printed = scripted(used, key, content, tmp_path)
-    assert printed.splitlines()[0].startswith(used.desk.models[key].told["verdict"]["level"].upper())
+    assert printed.splitlines()[0].startswith(used.desk.models[key].description["verdict"]["level"].upper())
     model = ftlm.load_model(tmp_path / "lag-model.json")
     assert model.coefficients["a0"] == pytest.approx(-2, abs=0.1)
 
@@ -503,10 +503,10 @@ def test_a_choice_is_that_of_the_same_lines_and_knows_runs_in_motion(page, conte
     (model,) = page.desk.models.values()
     assert model.state == "made", model.error
     assert page.desk.files[key].preview["length"] == 300
-    assert model.told["fits"][0]["validation"] > 95
-    assert "Candidates" in model.told["choice"]["table"]
+    assert model.description["fits"][0]["validation"] > 95
+    assert "Candidates" in model.description["choice"]["table"]
     printed = scripted(page, model.key, content, tmp_path)
-    assert printed.splitlines()[0] == model.told["choice"]["reason"]
+    assert printed.splitlines()[0] == model.description["choice"]["reason"]
 
 
 def test_a_report_opens_where_it_reaches_nothing(used):
@@ -525,8 +525,8 @@ def test_a_model_is_shown_verdict_first(used):
         shown.index(part) for part in ('class="first', 'class="equation"', "fit of the free run", "<svg", "Script")
     ]
     assert order == sorted(order)
-    assert model.told["fits"][0]["validation"] > 90
-    assert model.told["runs"] == ["lag", "lag"]
+    assert model.description["fits"][0]["validation"] > 90
+    assert model.description["runs"] == ["lag", "lag"]
     assert view.comparison(used.desk).strip() == ""
 
 
@@ -537,9 +537,9 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
         2,
         first.recipe,
         state="made",
-        told={
-            **first.told,
-            "verdict": {**first.told["verdict"], "level": "do not use"},
+        description={
+            **first.description,
+            "verdict": {**first.description["verdict"], "level": "do not use"},
         },
     )
     best = desks.Model(
@@ -547,10 +547,10 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
         3,
         first.recipe,
         state="made",
-        told={
-            **first.told,
-            "verdict": {**first.told["verdict"], "level": "trust"},
-            "fits": [{**first.told["fits"][0], "validation": 99.9}],
+        description={
+            **first.description,
+            "verdict": {**first.description["verdict"], "level": "trust"},
+            "fits": [{**first.description["fits"][0], "validation": 99.9}],
         },
     )
     desk = Session(used.desk.folder)
@@ -929,11 +929,11 @@ def test_errors_speak_of_what_the_page_has(words, shown):
 def test_progress_is_told_in_shares_and_words():
     model = desks.Model("k", 1, LONG, state="running")
     desks._record_progress(model, {"phase": "fitting"})
-    assert (model.phase, model.share, model.left) == ("fitting", None, "")
+    assert (model.phase, model.share, model.time_left) == ("fitting", None, "")
     model.phase_started_at -= 10
     desks._record_progress(model, {"done": 500, "total": 1000})
     assert model.share == 0.5
-    assert re.fullmatch(r"about \d+ s left", model.left)
+    assert re.fullmatch(r"about \d+ s left", model.time_left)
     desks._record_progress(model, {"done": 5, "total": 0})
     assert model.share == 0.5
     # Candidates are counted: more of them come up, and no share may go back.
@@ -941,7 +941,7 @@ def test_progress_is_told_in_shares_and_words():
     desks._record_progress(model, {"done": 9, "total": 10})
     desks._record_progress(model, {"done": 10, "total": 20})
     assert model.share is None
-    assert model.left == "10 of 20 candidates known so far are fitted"
+    assert model.time_left == "10 of 20 candidates known so far are fitted"
 
 
 # -------------------------------------------------------------------------------------- clients that keep it waiting

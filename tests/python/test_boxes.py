@@ -63,7 +63,7 @@ def test_boxes_keep_the_table_of_squared_equation_errors(run, tmp_path):
     assert whole.excluded_by_box > whole.candidates // 4
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 19 // 20])
-    assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
+    assert 0 < ftlm.search_status(path)["y"].done_count < whole.candidates
     assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
 
 
@@ -80,7 +80,7 @@ def test_boxes_give_the_same_bits_for_any_threads_in_a_store_and_when_cut(run, w
     data = path.read_bytes()
     # What is searched, and where, stands first and is most of it.
     path.write_bytes(data[: len(data) * 17 // 20])
-    assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
+    assert 0 < ftlm.search_status(path)["y"].done_count < whole.candidates
     assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
 
 
@@ -110,7 +110,7 @@ def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tm
     # What is searched, and where, stands first and is most of it.
     for share in (0.88, 0.97):
         path.write_bytes(data[: int(len(data) * share)])
-        assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
+        assert 0 < ftlm.search_status(path)["y"].done_count < whole.candidates
         assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
 
     def stop(done, total):

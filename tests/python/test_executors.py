@@ -120,7 +120,7 @@ def test_a_broken_pool_is_an_error_in_words_and_loses_nothing_finished(run, expe
 
         with pytest.raises(ConvergenceError, match=r"the executor lost its work .* start a new one"):
             search(run, pool, store=path, progress=kill)
-    assert 0 < ftlm.search_status(path)["y"].done < 19_295
+    assert 0 < ftlm.search_status(path)["y"].done_count < 19_295
     assert bytes_of(search(run, store=path)) == expected
 
 

@@ -62,7 +62,7 @@ def test_a_finished_store_is_read_to_the_bit(folder, expected, tmp_path):
 def test_a_half_finished_store_goes_on(folder, expected, tmp_path):
     shutil.copy(folder / "half.ftlm", tmp_path)
     status = ftlm.search_status(tmp_path / "half.ftlm")["y"]
-    assert 0 < status.done < status.candidates == expected["candidates"]
+    assert 0 < status.done_count < status.candidates == expected["candidates"]
     assert status.version == folder.name
     found = ftlm.resume_search(tmp_path / "half.ftlm")["y"]
     # The processor that began it may have rounded otherwise in the last place.
@@ -88,7 +88,7 @@ def test_a_store_under_an_order_law_that_was_cut_goes_on(folder, tmp_path):
     whole = (folder / "law.ftlm").read_bytes()
     path.write_bytes(whole[: len(whole) * 3 // 5])
     status = ftlm.search_status(path)["stage"]
-    assert 0 < status.done < status.candidates
+    assert 0 < status.done_count < status.candidates
     expected = json.loads((folder / "law.json").read_text(encoding="utf-8"))
     found = ftlm.resume_search(path)["stage"]
     # The processor that began it may have rounded otherwise in the last place.

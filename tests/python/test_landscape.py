@@ -39,14 +39,14 @@ def test_refitted_the_cost_is_that_of_the_covariance(fit):
     ratio = found.scores[near] / wanted[near]
     assert np.all((ratio > 0.4) & (ratio < 2.5))
     assert np.corrcoef(np.log(found.scores.ravel()), np.log(wanted.ravel()))[0, 1] > 0.9
-    assert found.others.startswith("All other numbers refitted")
+    assert found.other_orders_note.startswith("All other numbers refitted")
 
 
 def test_held_the_cost_is_never_lower(fit):
     refitted, held = (output_error_landscape(fit, refit=r) for r in (True, False))
     assert np.all(held.scores >= refitted.scores - 0.5)
     assert held.scores.max() > 2 * refitted.scores.max()
-    assert "held at the optimum" in held.others
+    assert "held at the optimum" in held.other_orders_note
 
 
 def test_the_pair_least_told_apart_is_named(fit):

@@ -178,7 +178,7 @@ def trials_of(found, prior, arm="fractional"):
 def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
     claim = by_words(claims(reproduction), "than the genetic algorithm")
     assert claim.holds is None
-    assert "K0" in claim.ruling.factors
+    assert "K0" in claim.claim_verdict.factors
     for contest in reproduction.panel.contests:
         assert set(contest.order_grid) == {1.0, 1e10}
         assert set(contest.genetic) == set(contest.evolution) == {0, 1}
@@ -194,9 +194,12 @@ def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
 def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
     claim = by_words(claims(reproduction), "larger p converges faster")
     assert claim.verdict == "turns with K0"
-    assert [(level, held == count) for level, count, held in claim.ruling.levels] == [("1", True), ("10¹⁰", False)]
+    assert [(level, held == count) for level, count, held in claim.claim_verdict.levels] == [
+        ("1", True),
+        ("10¹⁰", False),
+    ]
     # With K0 = 1 deflections arrive at once, whatever p is, and are no cases.
-    assert claim.ruling.levels[0] == ("1", 4, 4)
+    assert claim.claim_verdict.levels[0] == ("1", 4, 4)
     assert "no cases: 4 of 16" in claim.evidence
     strong, weak = (trials_of(reproduction, prior) for prior in (1.0, 1e10))
     for output in ("theta11", "theta21"):
@@ -210,7 +213,7 @@ def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
 def test_larger_p_has_a_smaller_error_on_some_angles_with_one_prior(reproduction):
     claim = by_words(claims(reproduction), "larger innovation length")
     assert claim.verdict.startswith("turns with")
-    assert set(claim.ruling.factors) == {"K0", "the angle"}
+    assert set(claim.claim_verdict.factors) == {"K0", "the angle"}
     for t in reproduction.panel.trials:
         if t.prior == 1e10:
             assert max(t.errors.values()) < 1.01 * min(t.errors.values())
@@ -225,9 +228,9 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
         put_in, whole = freed["fractional", stage], freed["whole orders", stage]
         assert whole.fractional_orders == []
         assert put_in.fractional_orders
-        for o, nr in put_in.free.items():
-            assert nr < 0.5 * put_in.whole[o]
-            assert whole.free[o] == pytest.approx(whole.whole[o], rel=0.02)
+        for o, nr in put_in.free_nr.items():
+            assert nr < 0.5 * put_in.integer_nr[o]
+            assert whole.free_nr[o] == pytest.approx(whole.integer_nr[o], rel=0.02)
     # On the maker's arm the manual is better than any p, on one of fractional orders a hub's p = 7 is.
     for t in reproduction.panel.trials:
         if t.arm == "whole orders":
@@ -245,12 +248,12 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     trials = tuple(replace(t, errors=falling, convergence_steps=falling, nr=0.1, manual=0.2) for t in panel.trials)
     contests = tuple(replace(c, order_grid=dict.fromkeys(c.order_grid, 1e-9)) for c in panel.contests)
     freed = tuple(
-        replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
+        replace(f, free_nr={o: 0.1 * v for o, v in f.integer_nr.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
         for f in panel.order_comparisons
     )
     stage = reproduction.stages[1]
     swapped = {**stage.candidates, "published, output error": stage.candidates["output error"]}
-    other = replace(stage, candidates=swapped, near=stage.candidates["output error"])
+    other = replace(stage, candidates=swapped, printed_orders=stage.candidates["output error"])
     ran = tuple(
         replace(r, angle_deviation=r.implied_deviation, stability=replace(r.stability, stable=True))
         for r in reproduction.ran
@@ -349,7 +352,7 @@ def test_the_demonstration_s_plant_is_what_its_runs_are_made_of(stage):
 
 
 def test_errors_are_told_apart(reproduction):
-    near = reproduction.stages[1].near.estimation
+    near = reproduction.stages[1].printed_orders.estimation
     assert near.equation_error["theta12"].nr < 0.1
     assert near.output_error["theta12"].nr > 10
     euler = reproduction.stages[1].candidates["integer, Euler"].estimation.output_error["theta11"]
@@ -476,7 +479,8 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
     stages = {}
     for number, stage in reproduction.stages.items():
         candidates = {
-            n: replace(c, validation=None, alone=dict(list(c.alone.items())[:1])) for n, c in stage.candidates.items()
+            n: replace(c, validation=None, input_driven=dict(list(c.input_driven.items())[:1]))
+            for n, c in stage.candidates.items()
         }
         rivals = {
             o: replace(r, models={n: replace(c, validation=None) for n, c in r.models.items()})

@@ -41,7 +41,7 @@ class Bad:
 
 def borne(monkeypatch):
     """A busy machine may be late in real time; that is not what is tested here."""
-    monkeypatch.setattr(recording, "Limits", lambda: rig.Limits(late=60.0, missed=10**9))
+    monkeypatch.setattr(recording, "Limits", lambda: rig.Limits(max_write_delay=60.0, max_missed_deadlines=10**9))
 
 
 def run_with(bench, controller, **options):

@@ -22,7 +22,7 @@ from ftlm.rig.rig import shut_down
 from quanser_stand_in import Board
 
 HERE = Path(__file__).parent
-WILD = rig.Limits(deflection=(9.0, 9.0), fastest=1e6, missed=10**6)
+WILD = rig.Limits(deflection=(9.0, 9.0), fastest=1e6, max_missed_deadlines=10**6)
 LOOSE = rig.ArmParameters(**{**rig.ArmParameters.of("effective").__dict__, "travel": (1e6, 1e6)})
 
 
@@ -334,7 +334,7 @@ else:
     sys.modules |= Board("linear", page={page!r}).modules()
     board = QuanserBoard()
 # A busy machine may be late before it is struck; that is not what is tested here.
-rig.recording.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+rig.recording.Limits = lambda: rig.Limits(max_write_delay=60.0, max_missed_deadlines=10**9)
 rig.record(board, arm=True, input="sine", amplitude=0.2, duration=25.0, watchdog=1.0, out={out!r})
 """
 
@@ -398,7 +398,7 @@ def test_a_frozen_program_leaves_the_motors_off_and_wakes_to_a_fault(kind, tmp_p
 COMMAND = """
 import sys
 from ftlm import cli, rig
-rig.recording.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+rig.recording.Limits = lambda: rig.Limits(max_write_delay=60.0, max_missed_deadlines=10**9)
 sys.argv = ["ftlm", "record", "--real-time", "--duration", "25", "--watchdog", "1", "-o", {out!r}]
 cli.main()
 """
@@ -546,7 +546,7 @@ def test_no_write_is_outside_the_limits(kind, count, tmp_path, monkeypatch):
     # Stretches of steady full current, which only the heat limit stops.
     commands[count // 2 :] = np.where(rng.random((count - count // 2, 1)) < 0.999, 1e3, -1e3)
     limits = rig.Limits(
-        deflection=(1e9, 1e9), fastest=1e9, missed=10**6, thermal_time=0.2, saturation=1e9, standstill=1e9
+        deflection=(1e9, 1e9), fastest=1e9, max_missed_deadlines=10**6, thermal_time=0.2, saturation=1e9, standstill=1e9
     )
     with bench.rig(limits=limits) as link:
         link.run(commands)
@@ -942,7 +942,7 @@ def described(ended):
 
 
 recording._Recorder.flush, Run.to_csv, recording.describe_interruption = flushed, written, described
-recording.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+recording.Limits = lambda: rig.Limits(max_write_delay=60.0, max_missed_deadlines=10**9)
 sys.argv = ["ftlm", "record", "--real-time", "--duration", "25", "--watchdog", "1", "-o", {out!r}]
 cli.main()
 """

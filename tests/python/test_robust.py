@@ -436,7 +436,10 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     assert not [w for w in robust.warnings if "huber" in w]
     assert robust.settings["loss"] == "huber"
     assert robust.settings["outliers"] == 4
-    assert f"loss: huber ({robust.settings['lowered']} of 398 residuals down-weighted, 4 of them" in robust.details()
+    assert (
+        f"loss: huber ({robust.settings['downweighted_count']} of 398 residuals down-weighted, 4 of them"
+        in robust.details()
+    )
     # The noise is that of the usual samples, and the figures are those of all.
     y = noisy(1)[1]
     assert robust.fit.noise["y"] == pytest.approx(0.01 * np.std(y), rel=0.15)

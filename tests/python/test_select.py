@@ -225,7 +225,7 @@ def test_long_records_are_fitted_by_those_alone_that_may_lead():
     assert prescreen([motor(0)], starts, 2, work) == [0, 1, 2, 3]
     rubbing = ftlm.equation("D^2 y = d D y + a y + b u - fc*sign(D y)")
     assert prescreen(runs, [*starts, (rubbing, [{**at, "fc": 0.1}])], 2, work) == [0, 1, 2, 3, 4]
-    assert work.done == work.known == 0
+    assert work.done_count == work.known_count == 0
 
 
 def test_a_run_of_its_own_judges(runs):

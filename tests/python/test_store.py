@@ -74,7 +74,7 @@ def job_of(run, structure, order_grid, *, m, top=20, pruning=True):
 
 
 def rows_of(contents):
-    parts = [frame.part for frame in contents.sections[0].done.values()]
+    parts = [frame.part for frame in contents.sections[0].frames.values()]
     parts += [half.checkpoint[2] for half in contents.sections[0].open.values()]
     return [row for rows, _, _ in parts for row in rows]
 
@@ -257,11 +257,11 @@ def test_control_c_at_a_terminal_ends_a_search_that_can_be_resumed(tmp_path):
     assert said.replace("\r\n", "\n").endswith(f"ftlm: interrupted; go on with: ftlm resume {path}\n")
     assert "Traceback" not in said
     status = ftlm.search_status(path)["y"]
-    assert 0 < status.done < status.candidates
+    assert 0 < status.done_count < status.candidates
     assert (status.truncated, status.corruption) == (0, None)
     with Store(path) as kept:
         assert kept.notes == []
-        assert kept.contents.sections[0].processed_count == status.done
+        assert kept.contents.sections[0].processed_count == status.done_count
 
 
 def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, expected, tmp_path):
@@ -296,7 +296,7 @@ def test_a_half_done_stretch_of_another_visiting_order_is_done_again(run, whole,
     """Its candidates would be followed twice or never: the table is that of an uninterrupted search all the same."""
     _, digest, end = frames.next_frame(memoryview(whole), len(FILE_SIGNATURE), bytes(frames.DIGEST_BYTES))
     _, (wave, *_), _ = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_problem().plan()
-    found = contents_of("whole", memoryview(whole)).sections[0].done[0].part
+    found = contents_of("whole", memoryview(whole)).sections[0].frames[0].part
     # A row that would win, were it believed.
     rows = ((found[0][0][0], 0.0, *found[0][0][2:]),)
     place = (0, 5, 256, 256, math.inf)
@@ -307,7 +307,7 @@ def test_a_half_done_stretch_of_another_visiting_order_is_done_again(run, whole,
     assert bytes_of(search(run, path)) == expected
     section = read_store(path).sections[0]
     assert not section.open
-    assert section.processed_count == sum(sum(f.part[1][1:]) for f in section.done.values()) > 0
+    assert section.processed_count == sum(sum(f.part[1][1:]) for f in section.frames.values()) > 0
 
 
 def test_what_stood_before_a_stretch_was_begun_anew_does_not_count():
@@ -353,7 +353,7 @@ def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, e
     path = tmp_path / "s.ftlm"
     path.write_bytes(whole)
     with Store(path) as kept:
-        second = kept.contents.sections[0].done[1]
+        second = kept.contents.sections[0].frames[1]
     assert second.last == 3
     damaged = bytearray(whole)
     # Within the first round's frame: the last two frames follow it.
@@ -461,7 +461,7 @@ def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, sma
 def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, tmp_path):
     path = tmp_path / "cut.ftlm"
     path.write_bytes(stage_store)
-    right = read_store(path).sections[0].done
+    right = read_store(path).sections[0].frames
     assert len(right) > 10
     begun = 0
     for size in range(0, len(stage_store), 7):
@@ -469,8 +469,8 @@ def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, 
         with contextlib.suppress(ftlm.DataError):
             found = read_store(path)
             begun = begun or size
-            assert found.sections[0].done.items() <= right.items()
-            assert found.sections[0].joined is None
+            assert found.sections[0].frames.items() <= right.items()
+            assert found.sections[0].table is None
             assert found.corruption is None
             assert found.end + found.truncated_bytes == size
     assert 0 < begun < len(stage_store) - 9 * 128
@@ -479,28 +479,28 @@ def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, 
 def test_a_store_of_a_stage_flipped_anywhere_never_gives_a_wrong_verdict(stage_store, tmp_path):
     path = tmp_path / "flipped.ftlm"
     path.write_bytes(stage_store)
-    right = read_store(path).sections[0].done
+    right = read_store(path).sections[0].frames
     for at in range(0, len(stage_store), 7):
         flipped = bytearray(stage_store)
         flipped[at] ^= 0x10
         path.write_bytes(flipped)
         with contextlib.suppress(ftlm.DataError):
             found = read_store(path)
-            assert found.sections[0].done.items() <= right.items()
-            assert found.sections[0].joined is None
+            assert found.sections[0].frames.items() <= right.items()
+            assert found.sections[0].table is None
             assert found.end <= at
 
 
 def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expected, tmp_path):
     path = tmp_path / "cut.ftlm"
     path.write_bytes(stage_store)
-    everything = ftlm.search_status(path)["stage"].done
-    joined = len(msgspec.msgpack.encode(read_store(path).sections[0].joined)) + 24
+    everything = ftlm.search_status(path)["stage"].done_count
+    joined = len(msgspec.msgpack.encode(read_store(path).sections[0].table)) + 24
     begun = len(stage_store) - joined - everything * 9
     # Without its table alone it is joined anew, to the same bytes.
     path.write_bytes(stage_store[: len(stage_store) - joined])
     assert ftlm.search_status(path)["stage"].complete
-    assert read_store(path).sections[0].joined is None
+    assert read_store(path).sections[0].table is None
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert path.read_bytes() == stage_store
     done = []
@@ -510,7 +510,7 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
             status = ftlm.search_status(path)["stage"]
         except ftlm.DataError:
             break
-        done.append(status.done)
+        done.append(status.done_count)
         assert not status.complete
         threads = 1 + len(done) % 3
         assert bytes_of(ftlm.resume_search(path, threads=threads)["stage"]) == stage_expected
@@ -525,7 +525,7 @@ def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage
     monkeypatch.setattr("ftlm.order_search.batches.CoupledProblem.build_evaluator", None)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert ftlm.search_status(path)["stage"].complete
-    held = msgspec.structs.asdict(read_store(path).sections[0].joined)
+    held = msgspec.structs.asdict(read_store(path).sections[0].table)
     whole = read_store(path)
     for number, change in enumerate(
         (
@@ -560,7 +560,7 @@ def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pi
         with pytest.raises(KeyboardInterrupt):
             search_stage(stage_run, path, progress=stop)
         # What was told is in the store.
-        assert ftlm.search_status(path)["stage"].done == told[-1]
+        assert ftlm.search_status(path)["stage"].done_count == told[-1]
     assert bytes_of(search_stage(stage_run, path)) == stage_expected
 
 
@@ -835,7 +835,7 @@ def test_a_read_only_folder_is_an_error_and_leaves_the_store_whole(run, whole, e
             for again in (lambda: search(run, path), lambda: ftlm.resume_search(path)):
                 with pytest.raises(ftlm.DataError, match=r"cannot be opened: Permission denied; choose another file"):
                     again()
-            assert 0 < ftlm.search_status(path)["y"].done < 19_295
+            assert 0 < ftlm.search_status(path)["y"].done_count < 19_295
         assert [p.name for p in folder.iterdir()] == ["s.ftlm"]
         assert path.read_bytes() == half
         # The file may be written, but nothing beside it: damage is not salvaged without a copy of it.

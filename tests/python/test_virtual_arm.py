@@ -252,7 +252,7 @@ def test_a_stage_that_cannot_be_is_refused(changes, words):
         ({"inertia_ratio": 0.2}, "its leading matrix is singular or worse"),
         ({"inertia_ratio": -0.1}, "inertia_ratio = -0.1 is outside [0, inf]"),
         ({"reach": float("nan")}, "reach = nan is outside [0, inf]"),
-        ({"turned": 1.5}, "turned = 1.5 is outside [0, 1]"),
+        ({"rotating_share": 1.5}, "rotating_share = 1.5 is outside [0, 1]"),
         ({"form": "published"}, "form = 'published' knows the stages apart alone: set coupling = 0"),
         ({"current_offset": (float("nan"), 0.0)}, "current offset is not finite at index 0"),
     ],

@@ -300,7 +300,7 @@ class WebApplication:
                 self._desk.remove_model(key)
                 return HttpResponse(200, "{}")
             case "GET", ["report" | "model" | "script" | "page"]:
-                if model.state != STATE_MADE or model.told is None:
+                if model.state != STATE_MADE or model.description is None:
                     raise RefusedError(404, "this model is not made yet")
                 return self._download(key, what[0], Path(model.recipe.estimation.file).stem)
         raise RefusedError(405 if what in ([], ["stop"], ["resume"]) else 404, "not in this way")
@@ -315,7 +315,7 @@ class WebApplication:
             "script": ("script.py", TEXT_TYPE),
         }[what]
         if what == "script":
-            content = str((model.told or {})["script"]).encode("utf-8", "replace")
+            content = str((model.description or {})["script"]).encode("utf-8", "replace")
         else:
             suffix = "json" if what == "model" else "html"
             try:

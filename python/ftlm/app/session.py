@@ -92,9 +92,9 @@ class Model:
         Identifier on the page, serial number, fit request.
     state
         ``"waiting"``, ``"running"``, ``"made"``, ``"failed"`` or ``"stopped"``.
-    phase, share, started_at, phase_started_at, left, took
+    phase, share, started_at, phase_started_at, time_left, took
         Current phase, finished share of it, start times of the fit and of the phase, time left as text, duration [s].
-    told
+    description
         Content of the page about the model.
     error
         Reason why there is no model.
@@ -112,9 +112,9 @@ class Model:
     share: float | None = None
     started_at: float = 0.0
     phase_started_at: float = 0.0
-    left: str = ""
+    time_left: str = ""
     took: float = 0.0
-    told: dict[str, Any] | None = None
+    description: dict[str, Any] | None = None
     error: str = ""
     version: int = 0
     task: Task | None = None
@@ -323,7 +323,7 @@ class Session:
                 f"{' or '.join(sorted(_file_names(model.recipe)))} is no longer on the page; drop it, and ask anew"
             )
         self._check_queue()
-        model.state, model.phase, model.error, model.share, model.left = STATE_WAITING, "waiting", "", None, ""
+        model.state, model.phase, model.error, model.share, model.time_left = STATE_WAITING, "waiting", "", None, ""
         model.version += 1
         self._start_job(self._make(model))
         return model
@@ -349,7 +349,7 @@ class Session:
                     model.state, model.error = STATE_FAILED, self.without_paths(str(failed))
             else:
                 if model.state == STATE_RUNNING:
-                    model.state, model.told = STATE_MADE, told
+                    model.state, model.description = STATE_MADE, told
             model.took += time.monotonic() - model.started_at
             model.task = None
             model.version += 1
@@ -411,11 +411,11 @@ def _file_names(recipe: FitRequest) -> set[str]:
 def _record_progress(model: Model, said: Mapping[str, Any]) -> None:
     """Store a progress report of a task process in its model."""
     if "phase" in said:
-        model.phase, model.share, model.left = str(said["phase"]), None, ""
+        model.phase, model.share, model.time_left = str(said["phase"]), None, ""
         model.phase_started_at = time.monotonic()
     elif said.get("total") and model.phase.startswith(SELECTION_PHASE):
         # Candidates come up as others are fitted: a share of those known so far would go back.
-        model.left = f"{said['done']} of {said['total']} candidates known so far are fitted"
+        model.time_left = f"{said['done']} of {said['total']} candidates known so far are fitted"
     elif said.get("total"):
         share = min(max(float(said["done"]) / float(said["total"]), 0.0), 1.0)
         passed = time.monotonic() - model.phase_started_at
@@ -423,7 +423,7 @@ def _record_progress(model: Model, said: Mapping[str, Any]) -> None:
         if share > 0.02 and passed > 1.0:
             # What is measured takes the place of what was expected.
             model.phase = model.phase.partition(", about")[0]
-            model.left = format_time_left(passed * (1.0 - share) / share)
+            model.time_left = format_time_left(passed * (1.0 - share) / share)
 
 
 def safe_name(name: str) -> str:

@@ -73,8 +73,8 @@ def _templates() -> Environment:
     return environment
 
 
-def _render_template(template: str, **told: Any) -> str:
-    return _templates().get_template(template).render(**told)
+def _render_template(template: str, **context: Any) -> str:
+    return _templates().get_template(template).render(**context)
 
 
 @cache
@@ -117,18 +117,18 @@ def page(desk: Session) -> str:
 
 def file(shown: File) -> str:
     """Return a file with its columns and assumptions."""
-    told = shown.preview
-    chosen = {} if told is None else told["options"]
+    preview = shown.preview
+    chosen = {} if preview is None else preview["options"]
     facts = {
         "name": shown.name,
         "run": shown.is_run,
-        "offers": [] if told is None else told["offers"],
+        "offers": [] if preview is None else preview["offers"],
         "outputs": list(chosen.get("outputs", {})),
     }
     return _render_template(
         "file.html.j2",
         file=shown,
-        told=told,
+        preview=preview,
         chosen=chosen,
         layout=chosen.get("layout", {}),
         facts=json.dumps(facts),
@@ -143,21 +143,21 @@ def file(shown: File) -> str:
 
 def model(shown: Model) -> str:
     """Return a model in any state."""
-    return _render_template("model.html.j2", model=shown, told=shown.told, recipe=shown.recipe)
+    return _render_template("model.html.j2", model=shown, description=shown.description, recipe=shown.recipe)
 
 
 def comparison(desk: Session) -> str:
     """Return a table of the models, the most trustworthy first."""
-    made = [m for m in desk.models.values() if m.state == STATE_MADE and m.told is not None]
-    made.sort(key=lambda m: (_VERDICT_RANKS.get((m.told or {})["verdict"]["level"], 3), -_worst_fit(m)))
-    outputs = list(dict.fromkeys(f["output"] for m in made for f in (m.told or {})["fits"]))
-    fits = {m.key: {f["output"]: f for f in (m.told or {})["fits"]} for m in made}
+    made = [m for m in desk.models.values() if m.state == STATE_MADE and m.description is not None]
+    made.sort(key=lambda m: (_VERDICT_RANKS.get((m.description or {})["verdict"]["level"], 3), -_worst_fit(m)))
+    outputs = list(dict.fromkeys(f["output"] for m in made for f in (m.description or {})["fits"]))
+    fits = {m.key: {f["output"]: f for f in (m.description or {})["fits"]} for m in made}
     return _render_template("comparison.html.j2", models=made, outputs=outputs, fits=fits)
 
 
 def _worst_fit(shown: Model) -> float:
     """Worst fit of a model, on validation data if there are any."""
-    fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (shown.told or {})["fits"]]
+    fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (shown.description or {})["fits"]]
     return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
 
 
@@ -171,7 +171,7 @@ def state(desk: Session) -> dict[str, Any]:
                 "busy": m.is_busy,
                 "phase": m.phase if m.state == STATE_RUNNING else m.state,
                 "share": m.share,
-                "left": m.left,
+                "left": m.time_left,
             }
             for m in desk.models.values()
         },

@@ -101,7 +101,7 @@ class RobustLossSummary:
 
     Parameters
     ----------
-    lowered
+    downweighted_count
         Residuals beyond 1.345 standard deviations, which are downweighted (18 % of normal noise).
     outliers
         Residuals beyond five standard deviations.
@@ -109,7 +109,7 @@ class RobustLossSummary:
         Total number of residuals.
     """
 
-    lowered: int
+    downweighted_count: int
     outliers: int
     samples: int
 

@@ -321,7 +321,7 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
             )
         unit = (found.units[k] if found.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
         blank = trouble is not None and trouble.blank
-        columns.append(Column(name, name, path, column, problem, blank=blank, timestamps=moments, stated=unit))
+        columns.append(Column(name, name, path, column, problem, blank=blank, timestamps=moments, file_unit=unit))
     return columns
 
 

@@ -252,7 +252,7 @@ def _columns(path: Path, array: _Array) -> list[Column]:
     if array.since is not None:
         return [_timestamp_column(path, array)]
     if 1 in matrix.shape:
-        return [Column(name, name, path, values.ravel(order="F"), stated=array.unit)]
+        return [Column(name, name, path, values.ravel(order="F"), file_unit=array.unit)]
     rows, count = matrix.shape
     if count > rows:
         problem = DataError(

@@ -273,8 +273,8 @@ def time_header(clock: Column) -> str:
     """Return the header of a time column, with its unit; ``time`` for the first column of a matrix."""
     if clock.matrix is not None:
         return "time"
-    below = clock.stated and split_time_header(clock.variable)[1] is None and not split_unit(clock.variable)[1]
-    return f"{clock.variable} [{clock.stated}]" if below else clock.variable
+    below = clock.file_unit and split_time_header(clock.variable)[1] is None and not split_unit(clock.variable)[1]
+    return f"{clock.variable} [{clock.file_unit}]" if below else clock.variable
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:

@@ -310,7 +310,7 @@ def _split_name_and_unit(column: Column) -> tuple[str, str]:
     bare, unit = split_unit(column.name_with_unit)
     if unit:
         return bare, unit
-    bare, unit = column.name.strip(), column.stated
+    bare, unit = column.name.strip(), column.file_unit
     if unit:
         return bare, unit
     if bare.casefold().endswith("_rad_s"):
@@ -335,7 +335,7 @@ def _unit_kind(unit: str) -> str | None:
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
     """Recognize a column by its name, with or without unit, such as ``Re(Z)`` or ``dB``; None if unknown."""
-    whole, stated = column.name.strip(), column.stated
+    whole, stated = column.name.strip(), column.file_unit
     own = whole if _unit_kind(whole) else stated if _unit_kind(stated) else ""
     for text, unit in ((whole, own), _split_name_and_unit(column)):
         word = re.sub(

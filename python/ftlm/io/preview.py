@@ -429,7 +429,7 @@ class _FilePreview:
             for name, spec in asked.items():
                 column = self.pool.find(spec, f"signal {name!r}")
                 roles[column.name] = (role, name)
-                unit = known_unit(column.stated, column.name_with_unit)
+                unit = known_unit(column.file_unit, column.name_with_unit)
                 if unit and name not in wanted.units and header is None:
                     wanted.units[name] = unit
         said = []
@@ -513,7 +513,7 @@ def _first_bad_cell(column: Column) -> str:
 
 def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
     role, signal = roles.get(column.name, ("", ""))
-    unit, values = column.stated, column.values
+    unit, values = column.file_unit, column.values
     if column.timestamps is not None:
         return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.timestamps.first}")
     if values is None or not values.size or not _has_numbers(column):

@@ -61,13 +61,13 @@ class Column:
     matrix: str | None = None
     blank: bool = False
     timestamps: Timestamps | None = None
-    stated: str = ""
+    file_unit: str = ""
 
     @property
     def name_with_unit(self) -> str:
         """Name with the unit after a slash, as in ``I/A``, rewritten in brackets."""
         bare, unit = split_slash_unit(self.name)
-        return f"{bare} [{unit}]" if unit and unit == self.stated else self.name
+        return f"{bare} [{unit}]" if unit and unit == self.file_unit else self.name
 
     def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
         """Return the numbers, or raise the problem of the column; `blank` accepts empty cells."""
@@ -142,7 +142,9 @@ class Pool:
         column = self._columns.get(name)
         if column is None:
             # Accept a name without its unit in brackets, if it is unique.
-            bare = [c for c in self._columns.values() if split_unit(c.name_with_unit) == (spec, c.stated) and c.stated]
+            bare = [
+                c for c in self._columns.values() if split_unit(c.name_with_unit) == (spec, c.file_unit) and c.file_unit
+            ]
             column = bare[0] if len(bare) == 1 else None
         if column is None:
             raise DataError(
@@ -202,8 +204,8 @@ class Pool:
         dated = [c for c in own if c.timestamps is not None]
         if dated:
             return dated, f"the time is column {dated[0].name!r}, which holds dates or times of day"
-        if own and own[0].stated and is_time_unit(own[0].stated):
-            return own[:1], f"the time is the first column, {own[0].name!r}, by its unit {own[0].stated}"
+        if own and own[0].file_unit and is_time_unit(own[0].file_unit):
+            return own[:1], f"the time is the first column, {own[0].name!r}, by its unit {own[0].file_unit}"
         return [], ""
 
 

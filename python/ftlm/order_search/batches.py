@@ -219,7 +219,7 @@ class CandidateBlock:
     first: int
     last: int
     start: Checkpoint | None = None
-    sent: bool = False
+    with_problem: bool = False
     attempts: int = 0
 
 
@@ -300,9 +300,9 @@ def _result(future: Future[Any], stretch: CandidateBlock) -> tuple[float, Any] |
         if stretch.attempts >= MAX_ATTEMPTS:
             raise _executor_error(error) from error
         return None
-    if timed is None and not stretch.sent:
+    if timed is None and not stretch.with_problem:
         # The worker has not got what the search is computed from: it goes along the next time.
-        stretch.sent = True
+        stretch.with_problem = True
         return None
     if not isinstance(timed, tuple) or len(timed) != 2:
         raise _executor_error(TypeError(f"a task came back with {type(timed).__name__}"))
@@ -346,7 +346,7 @@ class SearchState(ABC, Generic[Done, Table]):
 
     def payload(self, stretch: CandidateBlock) -> SearchProblem[Table] | None:
         """Search problem to send with a block, or None unless a worker reported that it lacks it."""
-        return self.work if stretch.sent else None
+        return self.work if stretch.with_problem else None
 
     @abstractmethod
     def batches(self) -> Iterator[tuple[int, int]]:
@@ -550,7 +550,7 @@ def search_coupled(
     """Search coupled equations under an order law, like :func:`search_equation`; a finished search is only read."""
     if store is None and executor is None:
         return work.search(progress)
-    joined = None if store is None else store.contents.sections[number].joined
+    joined = None if store is None else store.contents.sections[number].table
     if joined is not None:
         return _table(work, joined)
     table = _run_batches(CoupledSearchState(work), store, number, executor, progress)
@@ -604,8 +604,8 @@ def equation_state(work: EquationProblem, section: Section) -> tuple[int, float 
 
 def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | None]:
     """Number of candidates of a coupled search, as far as a checkpoint file determines it, and the best score."""
-    if section.joined is not None:
-        return section.processed_count, _table(work, section.joined)["rows"][0][1]
+    if section.table is not None:
+        return section.processed_count, _table(work, section.table)["rows"][0][1]
     course = CoupledSearchState(work)
     for first, end in course.batches():
         for held in _stored_frames(section, first, end):
@@ -635,14 +635,14 @@ def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
 
 def _stored_frames(section: Section | None, first: int, end: int) -> list[Any]:
     """Return the stored frames of a batch."""
-    return [] if section is None else [frame for at, frame in section.done.items() if first <= at < end]
+    return [] if section is None else [frame for at, frame in section.frames.items() if first <= at < end]
 
 
 def _pending_blocks(section: Section | None, first: int, end: int) -> Iterator[CandidateBlock]:
     """Yield the blocks of a batch to evaluate: partial ones from their checkpoint, and the gaps between."""
     known: list[CandidateBlock] = []
     if section is not None:
-        known = [CandidateBlock(at, frame.last) for at, frame in section.done.items()]
+        known = [CandidateBlock(at, frame.last) for at, frame in section.frames.items()]
         known += [CandidateBlock(at, half.last, half.checkpoint) for at, half in section.open.items()]
     at = first
     for stretch in sorted(known, key=lambda s: s.first):

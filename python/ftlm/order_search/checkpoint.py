@@ -420,22 +420,22 @@ class Section:
     """
 
     law: bool = False
-    done: dict[int, Rounds | Verdicts] = field(default_factory=dict)
+    frames: dict[int, Rounds | Verdicts] = field(default_factory=dict)
     open: dict[int, PartialBlock] = field(default_factory=dict)
-    joined: CoupledTable | None = None
+    table: CoupledTable | None = None
     _firsts: list[int] = field(default_factory=list)
 
     def add_frame(self, frame: Frame) -> None:
         """Add a frame; raise ModelError for a duplicate, an empty block, or another kind of search."""
-        if self.joined is not None or (isinstance(frame, CoupledTable) and not self.law):
+        if self.table is not None or (isinstance(frame, CoupledTable) and not self.law):
             raise ModelError("a table stands where none belongs")
         if isinstance(frame, CoupledTable):
-            self.joined = frame
+            self.table = frame
             return
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
             raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
         place = bisect.bisect_left(self._firsts, frame.last)
-        if place and self.done[self._firsts[place - 1]].last > frame.first:
+        if place and self.frames[self._firsts[place - 1]].last > frame.first:
             raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
         if isinstance(frame, PartialRounds):
             self._add_partial_rounds(frame)
@@ -444,7 +444,7 @@ class Section:
         if isinstance(frame, Verdicts) and (len(frame.values), len(frame.kinds)) != (8 * count, count):
             raise ModelError(f"candidates {frame.first} to {frame.last} have other verdicts")
         self.open.pop(frame.first, None)
-        self.done[frame.first] = frame
+        self.frames[frame.first] = frame
         self._firsts.insert(place, frame.first)
 
     def _add_partial_rounds(self, frame: PartialRounds) -> None:
@@ -463,13 +463,13 @@ class Section:
     @property
     def processed_count(self) -> int:
         """Number of candidates evaluated or excluded."""
-        done = (len(f.kinds) if isinstance(f, Verdicts) else sum(f.part[1][1:7]) for f in self.done.values())
+        done = (len(f.kinds) if isinstance(f, Verdicts) else sum(f.part[1][1:7]) for f in self.frames.values())
         return sum(done) + sum(sum(half.counts[1:7]) for half in self.open.values())
 
     @property
     def best(self) -> float | None:
         """Smallest raw score so far, for the search of one equation."""
-        rows = [row for frame in self.done.values() if isinstance(frame, Rounds) for row in frame.part[0]]
+        rows = [row for frame in self.frames.values() if isinstance(frame, Rounds) for row in frame.part[0]]
         return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
 
 

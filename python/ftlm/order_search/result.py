@@ -238,7 +238,7 @@ class StoreStatus:
     candidates
         Total number of candidates. Under an order law those of the single equations, as far as known: one that was
         stopped early may have to be evaluated further.
-    done
+    done_count
         Number of candidates evaluated or excluded.
     best
         Best score so far: error (45) for norm l1, RMSE for l2; None before the first.
@@ -256,7 +256,7 @@ class StoreStatus:
 
     name: str
     candidates: int
-    done: int
+    done_count: int
     best: float | None
     settings: dict[str, Any]
     runs: tuple[str, ...]
@@ -267,15 +267,15 @@ class StoreStatus:
     @property
     def complete(self) -> bool:
         """Whether the search is complete."""
-        return self.done == self.candidates
+        return self.done_count == self.candidates
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {**asdict(self), "complete": self.complete}
 
     def __str__(self) -> str:
-        share = 100 * self.done / self.candidates
-        text = f"{self.name}: {self.done} of {self.candidates} candidates done ({share:.1f} %)"
+        share = 100 * self.done_count / self.candidates
+        text = f"{self.name}: {self.done_count} of {self.candidates} candidates done ({share:.1f} %)"
         text += "" if self.best is None else f", best score {self.best:.6g}"
         text += f", runs {', '.join(self.runs)}"
         if self.truncated:

@@ -635,5 +635,5 @@ def _remaining_fraction(job: Job, store: Store, number: int) -> float:
     """Fraction of a search that a checkpoint file does not contain."""
     section = store.contents.sections[number]
     if job.structure.has_order_law:
-        return 0.0 if section.joined is not None else 1.0
+        return 0.0 if section.table is not None else 1.0
     return 1.0 - min(section.processed_count / _candidates(job), 1.0)

@@ -219,8 +219,8 @@ def settings_text(settings: Mapping[str, Any]) -> str:
 def robust_loss_text(settings: Mapping[str, Any]) -> str:
     """Return a summary of the robust loss as text."""
     return (
-        f"{settings['lowered']} of {settings['samples']} residuals down-weighted, {settings['outliers']} of them "
-        "beyond five deviations"
+        f"{settings['downweighted_count']} of {settings['samples']} residuals down-weighted, "
+        f"{settings['outliers']} of them beyond five deviations"
     )
 
 

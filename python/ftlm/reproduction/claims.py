@@ -207,7 +207,7 @@ class Claim:
     ----------
     claim
         Text of the claim.
-    ruling
+    claim_verdict
         Verdict with the cases that it follows from.
     brief
         Main number, in one line.
@@ -216,28 +216,28 @@ class Claim:
     """
 
     claim: str
-    ruling: ClaimVerdict
+    claim_verdict: ClaimVerdict
     brief: str
     evidence: str
 
     @property
     def verdict(self) -> str:
         """Verdict as text: holds, does not hold, depends on …, not decidable by simulation."""
-        return str(self.ruling)
+        return str(self.claim_verdict)
 
     @property
     def holds(self) -> bool | None:
         """Whether the claim holds in every case; None if it depends on a factor or is not decidable."""
-        return {"holds": True, "does not hold": False}.get(self.ruling.word)
+        return {"holds": True, "does not hold": False}.get(self.claim_verdict.word)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the claim for JSON."""
         return {
             "claim": self.claim,
             "verdict": self.verdict,
-            "turns with": list(self.ruling.factors),
-            "cases": self.ruling.cases,
-            "held": self.ruling.holding_cases,
+            "turns with": list(self.claim_verdict.factors),
+            "cases": self.claim_verdict.cases,
+            "held": self.claim_verdict.holding_cases,
             "brief": self.brief,
             "evidence": self.evidence,
         }
@@ -427,12 +427,14 @@ def _claims_of_tables(found: ReproductionData) -> list[Claim]:
             "Tables 4 and 5 can be computed again from what the paper says.",
             again,
             "as equation errors, K0 chosen for each angle, a and NR come within a mean factor of "
-            + ", ".join(f"{t.away:.2f} ({symbol(o)})" for o, t in tables.items())
+            + ", ".join(f"{t.ratio:.2f} ({symbol(o)})" for o, t in tables.items())
             + "; b, d, g over printed, p = 7: "
             + numbers_by_angle({o: [t.ratios[c][-1] for c in "bdg"] for o, t in tables.items()}, 3),
             "the nearest reading of each angle, the factor by which a and NR are away in the mean, and that with K0 = "
             "1: "
-            + "; ".join(f"{symbol(o)}: {t.reading}: {t.away:.3g}, {t.away_at_one:.3g}" for o, t in tables.items())
+            + "; ".join(
+                f"{symbol(o)}: {t.reading}: {t.ratio:.3g}, {t.ratio_at_unit_prior:.3g}" for o, t in tables.items()
+            )
             + ". K0 was chosen by a and NR; the least and the largest ratio of each column to the printed one are "
             + "; ".join(
                 f"{symbol(o)} " + ", ".join(f"{c} {min(q):.3g} to {max(q):.3g}" for c, q in t.ratios.items())
@@ -573,15 +575,15 @@ def _claim_of_orders(found: ReproductionData) -> Claim:
     freed = found.panel.order_comparisons
     cases = [
         case(
-            f.free[o] < (1 - MIN_RELATIVE_DIFFERENCE) * f.whole[o] and bool(f.fractional_orders),
+            f.free_nr[o] < (1 - MIN_RELATIVE_DIFFERENCE) * f.integer_nr[o] and bool(f.fractional_orders),
             the_arm=f.arm,
             the_angle=symbol(o),
         )
         for f in freed
-        for o in f.free
+        for o in f.free_nr
     ]
     ruling = combine_cases(cases, of_the_machine=found.simulated)
-    each = [f"{f.arm}: {numbers_by_angle({o: (f.whole[o], f.free[o]) for o in f.free}, 3)}" for f in freed]
+    each = [f"{f.arm}: {numbers_by_angle({o: (f.integer_nr[o], f.free_nr[o]) for o in f.free_nr}, 3)}" for f in freed]
     rubbing = [
         f"{symbol(n)} = {f.orders[n][0]:.3g}"
         for f in freed
@@ -601,7 +603,10 @@ def _claim_of_orders(found: ReproductionData) -> Claim:
 
 
 def _claim_of_near_orders(found: ReproductionData) -> Claim:
-    near = {o: (s.near.estimation.equation_error[o].nr, s.near.estimation.output_error[o].nr) for s, o in found.angles}
+    near = {
+        o: (s.printed_orders.estimation.equation_error[o].nr, s.printed_orders.estimation.output_error[o].nr)
+        for s, o in found.angles
+    }
     ruling = combine_cases(
         _of_angles({o: out < MAX_ERROR_RATIO * eq and out < MAX_EXPLAINING_NR for o, (eq, out) in near.items()}),
         of_the_machine=found.simulated,

@@ -211,7 +211,7 @@ class OrderComparison:
     ----------
     arm, stage
         Arm and stage of the record.
-    whole, free
+    integer_nr, free_nr
         NR of the output error by angle, with integer and with free orders.
     orders
         Estimate and 95 % interval of every free order.
@@ -219,8 +219,8 @@ class OrderComparison:
 
     arm: str
     stage: int
-    whole: dict[str, float]
-    free: dict[str, float]
+    integer_nr: dict[str, float]
+    free_nr: dict[str, float]
     orders: dict[str, tuple[float, float, float]]
 
     @property
@@ -233,8 +233,8 @@ class OrderComparison:
         return {
             "arm": self.arm,
             "stage": self.stage,
-            "whole nr": {n: finite(v) for n, v in self.whole.items()},
-            "free nr": {n: finite(v) for n, v in self.free.items()},
+            "whole nr": {n: finite(v) for n, v in self.integer_nr.items()},
+            "free nr": {n: finite(v) for n, v in self.free_nr.items()},
             "orders": {n: list(map(finite, v)) for n, v in self.orders.items()},
             "not whole": self.fractional_orders,
         }

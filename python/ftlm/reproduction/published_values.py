@@ -190,9 +190,9 @@ class AsPrinted:
         Closest interpretation.
     rows
         Rows by p, with the signs of that interpretation.
-    away
+    ratio
         Geometric mean of the ratios of a and NR to the printed values, over four rows.
-    away_at_one
+    ratio_at_unit_prior
         The same ratio with K0 = 1 and the best of the other settings.
     rank, among
         Rank of the printed orders by the equation error (45) among neighboring orders, at p = 7.
@@ -205,8 +205,8 @@ class AsPrinted:
     output: str
     reading: Interpretation
     rows: dict[int, Row]
-    away: float
-    away_at_one: float
+    ratio: float
+    ratio_at_unit_prior: float
     rank: int
     among: int
     best: dict[str, float]
@@ -246,8 +246,8 @@ class AsPrinted:
             "terms": self.reading.terms,
             "filtered": self.reading.filtered,
             "sign reversed": self.reading.reversed,
-            "away": finite(self.away),
-            "away at K0 = 1": finite(self.away_at_one),
+            "away": finite(self.ratio),
+            "away at K0 = 1": finite(self.ratio_at_unit_prior),
             "rank of the printed orders": self.rank,
             "among": self.among,
             "best orders": self.best,

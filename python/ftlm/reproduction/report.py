@@ -86,7 +86,7 @@ def _verdict_section(found: ReproductionData) -> Section:
         [
             typeset(c.claim),
             Markup("<strong>{}</strong>").format(typeset(c.verdict)),
-            figures.share_picture(c.ruling),
+            figures.share_picture(c.claim_verdict),
             typeset(c.brief),
         ]
         for c in told
@@ -109,7 +109,7 @@ def _verdict_section(found: ReproductionData) -> Section:
         warnings=[missing] * (found.sine is None),
         fold="The numbers behind every verdict",
         folded_paragraphs=behind,
-        folded=[tables.panel_table(found), tables.order_comparison_table(found)],
+        folded_tables=[tables.panel_table(found), tables.order_comparison_table(found)],
     )
 
 
@@ -125,12 +125,12 @@ def _ran_section(found: ReproductionData) -> Section:
         [words],
         figures=figures.printed_model_charts(found),
         fold="All printed models",
-        folded=[tables.printed_runs_table(found)],
+        folded_tables=[tables.printed_runs_table(found)],
     )
 
 
 def _printed_section(found: ReproductionData) -> Section:
-    far = ", ".join(f"{t.away:.2f} ({symbol(o)})" for o, t in found.as_printed.items())
+    far = ", ".join(f"{t.ratio:.2f} ({symbol(o)})" for o, t in found.as_printed.items())
     others = "; ".join(
         f"{number(t.ratios['b'][-1], 3)}, {number(t.ratios['d'][-1], 3)}, {number(t.ratios['g'][-1], 3)} ({symbol(o)})"
         for o, t in found.as_printed.items()
@@ -145,7 +145,7 @@ def _printed_section(found: ReproductionData) -> Section:
         f"Among neighbouring orders the printed ones have the places {ranks}.",
     ]
     shown = [tables.printed_reading_table(found, stage) for stage in found.stages.values()]
-    return Section("As printed (Tables 4 and 5)", words, fold="Ours beside printed", folded=shown)
+    return Section("As printed (Tables 4 and 5)", words, fold="Ours beside printed", folded_tables=shown)
 
 
 def _stage_section(found: ReproductionData, stage: Stage) -> Section:
@@ -161,7 +161,7 @@ def _stage_section(found: ReproductionData, stage: Stage) -> Section:
         [words, *equations],
         figures=figures.stage_figures(stage, simulated=found.simulated),
         fold=f"Table {3 + number}, estimates with intervals, fits" + (", warnings" if warned else ""),
-        folded=[
+        folded_tables=[
             tables.model_table(stage, title),
             estimates,
             tables.fits_table(stage),
@@ -189,7 +189,11 @@ def _rival_section(found: ReproductionData) -> Section:
     ]
     heading = "The genetic algorithm (Tables 6 and 7, Figure 11)"
     return Section(
-        heading, [words], figures=figures.rival_figures(found), fold="Tables 6 and 7, seeds, bounds", folded=folded
+        heading,
+        [words],
+        figures=figures.rival_figures(found),
+        fold="Tables 6 and 7, seeds, bounds",
+        folded_tables=folded,
     )
 
 
@@ -208,7 +212,7 @@ def _weak_section(found: ReproductionData) -> Section:
         figures=charts,
         small=True,
         fold="Coefficient a by p",
-        folded=[tables.saturation_table(found)],
+        folded_tables=[tables.saturation_table(found)],
     )
 
 
@@ -219,11 +223,15 @@ def _near_section(found: ReproductionData) -> Section:
     )
     charts = []
     for stage in found.stages.values():
-        output, drawn = stage.outputs[1], [("printed orders", stage.near.estimation)]
+        output, drawn = stage.outputs[1], [("printed orders", stage.printed_orders.estimation)]
         of = f"the orders of Table {3 + stage.number} with the best coefficients for this run"
         charts.append(figures.fit_chart(drawn, output, f"{symbol(output)}: {of}", simulated=found.simulated))
     return Section(
-        "Orders close to one another", [words], figures=charts, fold="Both errors", folded=[tables.near_table(found)]
+        "Orders close to one another",
+        [words],
+        figures=charts,
+        fold="Both errors",
+        folded_tables=[tables.near_table(found)],
     )
 
 
@@ -301,14 +309,14 @@ def reproduction_page(found: ReproductionData, path: str | os.PathLike[str], *, 
         Section(
             "Parameters (Table 3)",
             fold="Table 3 and what follows from it",
-            folded=[tables.parameters_table(), tables.integer_table()],
+            folded_tables=[tables.parameters_table(), tables.integer_table()],
         ),
         Section(
             "Symbols and steps",
             ["Figures 1 and 3 are pictures of the authors' arm and are not shown."],
             figures=[figures.flow_chart()],
             fold="Tables 1 and 2",
-            folded=[tables.symbols_table(), tables.steps_table()],
+            folded_tables=[tables.symbols_table(), tables.steps_table()],
         ),
         _runs_section(found),
     ]

@@ -318,7 +318,7 @@ class StageWork:
         if self.off is not None and exact.validation is not None:
             off = self._by_euler(exact.model, self.off, exact.validation)
             alone[self.off.name] = off.output_error
-        return replace(exact, label=label, estimation=on, validation=off, alone=alone)
+        return replace(exact, label=label, estimation=on, validation=off, input_driven=alone)
 
     def _by_euler(self, model: Model, run: Run, exact: Comparison) -> Comparison:
         """Return the comparison with Euler's response in place of the exact one."""

@@ -43,7 +43,7 @@ class Candidate:
         Both errors on the estimation run, with the inputs that the method uses.
     validation
         Both errors on the other run; None without one.
-    alone
+    input_driven
         Output error from the currents alone, by run and output.
     result
         The identification; None for a model that was not identified.
@@ -53,7 +53,7 @@ class Candidate:
     model: Model
     estimation: Comparison
     validation: Comparison | None
-    alone: dict[str, dict[str, Metrics]]
+    input_driven: dict[str, dict[str, Metrics]]
     result: Identification | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -65,7 +65,7 @@ class Candidate:
             "intervals": {} if result is None else {n: list(map(finite, i)) for n, i in result.intervals.items()},
             "estimation": self.estimation.to_dict(),
             "validation": None if self.validation is None else self.validation.to_dict(),
-            "alone": {run: {o: f.to_dict() for o, f in figures.items()} for run, figures in self.alone.items()},
+            "alone": {run: {o: f.to_dict() for o, f in figures.items()} for run, figures in self.input_driven.items()},
             "settings": {} if result is None else result.settings,
             "warnings": [] if result is None else list(result.warnings),
         }
@@ -159,7 +159,7 @@ class Stage:
         Coefficients by output and p with a weak prior, at the orders of p = 7.
     rivals
         Optimizer comparisons by output; empty without PyGAD or for a run that does not start at rest.
-    near
+    printed_orders
         Model with the printed orders and least-squares coefficients on this run.
     by_equation
         Model with the orders of the smallest equation error on the grid.
@@ -175,7 +175,7 @@ class Stage:
     weak_traces: dict[str, dict[int, MultiInnovationTrace]]
     weak: dict[str, dict[int, dict[str, float]]]
     rivals: dict[str, Rival]
-    near: Candidate
+    printed_orders: Candidate
     by_equation: Candidate
     derived: DroppedDerivative
     landscape: Landscape | None
@@ -194,7 +194,7 @@ class Stage:
         """Return the stage results for JSON."""
         return {
             "models": {label: c.to_dict() for label, c in self.candidates.items()},
-            "printed orders": self.near.to_dict(),
+            "printed orders": self.printed_orders.to_dict(),
             "weak prior": {o: {str(p): c for p, c in each.items()} for o, each in self.weak.items()},
             "genetic": {o: r.to_dict() for o, r in self.rivals.items()},
             "smallest equation error": self.by_equation.to_dict(),

@@ -303,7 +303,7 @@ def fits_table(stage: Stage) -> Table:
     def row(label: str, c: Candidate, output: str) -> list[Cell]:
         errors = c.estimation.equation_error[output].nr, c.estimation.output_error[output].nr
         driven = [None if part is None else part.output_error[output].fit for part in (c.estimation, c.validation)]
-        alone = [figures[output].fit for figures in c.alone.values()]
+        alone = [figures[output].fit for figures in c.input_driven.values()]
         return [label, *errors, *driven, *alone, *[None] * (2 - len(alone))]
 
     return by_angle(
@@ -319,7 +319,7 @@ def near_table(found: ReproductionData) -> Table:
     """Table of both errors at the printed orders, and at those of the smallest equation error."""
     rows: list[list[Cell]] = []
     for stage in found.stages.values():
-        for label, candidate in (("printed", stage.near), ("smallest equation error", stage.by_equation)):
+        for label, candidate in (("printed", stage.printed_orders), ("smallest equation error", stage.by_equation)):
             for output in stage.outputs:
                 orders, _ = letters_of(equation_of(candidate, output))
                 both = candidate.estimation.equation_error[output].nr, candidate.estimation.output_error[output].nr
@@ -573,9 +573,9 @@ def order_comparison_table(found: ReproductionData) -> Table:
     """Table of integer and free orders on every arm."""
     rows: list[list[Cell]] = []
     for f in found.panel.order_comparisons:
-        for output in f.free:
+        for output in f.free_nr:
             away = ", ".join(f"{symbol(n)} {f.orders[n][0]:.3g}" for n in f.fractional_orders) or "none"
-            rows.append([f"{f.arm}, {symbol(output)}", f.whole[output], f.free[output], away])
+            rows.append([f"{f.arm}, {symbol(output)}", f.integer_nr[output], f.free_nr[output], away])
     return Table(
         "Whole and free orders of (14)–(15), from the current alone",
         ("arm, angle", "NR, whole orders", "NR, free orders", "orders whose interval excludes the whole one"),

@@ -88,7 +88,7 @@ class ArmParameters:
     reach
         Coupling ratio H/J_22, where H is the length of link 1 times the first moment of mass of link 2. It is 1 for
         equally long links with the mass at the tip.
-    turned
+    rotating_share
         Share of J_21 that rotates with link 1. A rotor behind a gear contributes only by the inverse of the gear ratio.
     current_offset
         Current offset of each motor while the amplifiers are enabled [A]; a property of a run, not of the arm.
@@ -114,7 +114,7 @@ class ArmParameters:
     coupling: float = 1.0
     inertia_ratio: float = INERTIA_RATIO
     reach: float = LINK_COUPLING_RATIO
-    turned: float = ROTATING_INERTIA_SHARE
+    rotating_share: float = ROTATING_INERTIA_SHARE
     current_offset: tuple[float, float] = (0.0, 0.0)
     strain_noise: tuple[float, float] = (0.015, 0.0134)
     current_noise: tuple[float, float] = (0.0012, 0.0012)
@@ -187,15 +187,20 @@ class ArmParameters:
         ModelError
             Parameters out of range, or inertias for which the kinetic energy of the arm is not positive definite.
         """
-        for name, highest in (("coupling", 1.0), ("turned", 1.0), ("inertia_ratio", math.inf), ("reach", math.inf)):
+        for name, highest in (
+            ("coupling", 1.0),
+            ("rotating_share", 1.0),
+            ("inertia_ratio", math.inf),
+            ("reach", math.inf),
+        ):
             value = getattr(self, name)
             if not (0.0 <= value <= highest and math.isfinite(value)):
                 raise ModelError(f"{name} = {value!r} is outside [0, {highest:g}]; correct the arm's parameters")
         if not self.stage2.r > 1.0:
             raise ModelError(f"r = {self.stage2.r!r} of stage 2 is not above 1, as (J_1 + J_2)/J_2 is")
-        hub = self.coupling * self.turned * self.inertia_ratio
+        hub = self.coupling * self.rotating_share * self.inertia_ratio
         arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.reach)
-        base, carried = -self.coupling * self.turned, -self.coupling * (1.0 + self.reach)
+        base, carried = -self.coupling * self.rotating_share, -self.coupling * (1.0 + self.reach)
         # Determinant of the inertia matrix, relative to that of uncoupled joints.
         if not 1.0 + hub * base + arm * carried > 0.0:
             raise ModelError(

@@ -335,9 +335,9 @@ class Limits:
         Longest standstill at that current [s].
     fastest
         Largest hub speed [rad/s]; a faster count is an encoder fault.
-    late
+    max_write_delay
         Longest delay of a write [s].
-    missed
+    max_missed_deadlines
         Tolerated number of consecutive missed deadlines.
     """
 
@@ -350,8 +350,8 @@ class Limits:
     moving_current: float = 0.25
     standstill: float = 0.5
     fastest: float = 20.0
-    late: float = 0.05
-    missed: int = 20
+    max_write_delay: float = 0.05
+    max_missed_deadlines: int = 20
 
     def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
         """Return the guard that enforces the limits at a sampling interval [s]."""
@@ -371,8 +371,8 @@ class Limits:
                 "moving_current": self.moving_current,
                 "standstill": self.standstill,
                 "fastest": self.fastest,
-                "late_limit": self.late,
-                "missed_limit": self.missed,
+                "late_limit": self.max_write_delay,
+                "missed_limit": self.max_missed_deadlines,
                 "filter": sensor_filter,
             }
         )

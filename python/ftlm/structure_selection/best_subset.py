@@ -340,8 +340,8 @@ def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
     """Return a subset as a change to a variant; None if it is invalid."""
     chosen = [ground.columns[k] for k in subset]
     whole = {**ground.variant.integer_order_values(), **{n: c.order for c in chosen for n in c.names}}
-    kept = ground.variant.kept | {c.coefficient for c in chosen}
-    variant = replace(ground.variant, kept=frozenset(kept)).with_integer_orders(whole)
+    kept = ground.variant.coefficients | {c.coefficient for c in chosen}
+    variant = replace(ground.variant, coefficients=frozenset(kept)).with_integer_orders(whole)
     if not ground.inside.is_valid(variant):
         return None
     return Change(describe_structure(ground.inside.build(variant)), variant)

@@ -23,7 +23,7 @@ class Variant:
 
     Parameters
     ----------
-    kept
+    coefficients
         Coefficients of the terms that it has.
     integer_orders
         Orders with integer values, by name; all others are free.
@@ -35,7 +35,7 @@ class Variant:
         Frictions that it has, by the names of :attr:`NestedStructures.frictions`.
     """
 
-    kept: frozenset[str]
+    coefficients: frozenset[str]
     integer_orders: tuple[tuple[str, float], ...]
     offset: bool
     inputs: frozenset[str] = frozenset()
@@ -118,7 +118,9 @@ class NestedStructures:
         structure, droppable = self.structure, set(self.droppable)
         equations = []
         for item in structure.equations:
-            terms = tuple(t for t in item.terms if t.coefficient not in droppable or t.coefficient in variant.kept)
+            terms = tuple(
+                t for t in item.terms if t.coefficient not in droppable or t.coefficient in variant.coefficients
+            )
             equations.append(self._with_frictions(replace(item, terms=terms), variant.frictions))
         names = {n for e in equations for n in e.order_names}
         signals = tuple(dict.fromkeys(n for e in equations for n in (e.output, *e.signals)))
@@ -240,17 +242,19 @@ class NestedStructures:
     def _with_term(self, variant: Variant, term: Term) -> Iterator[Change]:
         """Yield variants with one more term, its order at each of its integer values."""
         assert isinstance(term.coefficient, str)
-        kept = variant.kept | {term.coefficient}
+        kept = variant.coefficients | {term.coefficient}
         if not term.order.names:
-            grown = [replace(variant, kept=kept)]
+            grown = [replace(variant, coefficients=kept)]
         elif term.order.is_single and term.order.names[0] not in variant.integer_order_values():
             name = term.order.names[0]
-            grown = [replace(variant, kept=kept).with_integer_orders({name: v}) for v in self.integer_values(name)]
+            grown = [
+                replace(variant, coefficients=kept).with_integer_orders({name: v}) for v in self.integer_values(name)
+            ]
             if self._owns(term):
                 # Where every whole order is taken, it starts free.
-                grown = [v for v in grown if self.is_valid(v)] or [replace(variant, kept=kept)]
+                grown = [v for v in grown if self.is_valid(v)] or [replace(variant, coefficients=kept)]
         else:
-            grown = [replace(variant, kept=kept)]
+            grown = [replace(variant, coefficients=kept)]
         for one in grown:
             if self.is_valid(one):
                 yield Change(f"+ {self._term_in(one, term)}", one)
@@ -265,7 +269,7 @@ class NestedStructures:
         """Return the variant with every term that fits, each at an integer order that no other term of it has."""
         for item in self.structure.equations:
             for term in item.terms:
-                if term.coefficient in self.droppable and term.coefficient not in variant.kept:
+                if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
                     grown = [c.variant for c in self._with_term(variant, term)]
                     free = set(self.build(variant).order_names)
                     variant = next((v for v in grown if set(self.build(v).order_names) <= free), variant)
@@ -275,7 +279,7 @@ class NestedStructures:
         """Yield every variant with one more term, free order or offset."""
         for item in self.structure.equations:
             for term in item.terms:
-                if term.coefficient in self.droppable and term.coefficient not in variant.kept:
+                if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
                     yield from self._with_term(variant, term)
         present = {
             n
@@ -301,7 +305,7 @@ class NestedStructures:
                 own = term.signal == item.output
                 others = [t for t in item.terms if t is not term and (t.signal == item.output) == own]
                 if term.coefficient in self.droppable and others:
-                    less = replace(variant, kept=variant.kept - {str(term.coefficient)})
+                    less = replace(variant, coefficients=variant.coefficients - {str(term.coefficient)})
                     if self.is_valid(less):
                         yield Change(f"without {term}", less)
         for name in made.order_names:

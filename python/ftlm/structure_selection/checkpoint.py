@@ -248,8 +248,8 @@ class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Subset of the best-subset search on file."""
 
     words: str
-    kept: tuple[str, ...]
-    whole: tuple[tuple[str, float], ...]
+    coefficients: tuple[str, ...]
+    integer_orders: tuple[tuple[str, float], ...]
     offset: bool
     inputs: tuple[str, ...]
     rubs: tuple[str, ...]
@@ -260,12 +260,14 @@ class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def of(cls, one: ScreenedSubset) -> SubsetFile:
         """Serialize a subset."""
         v = one.change.variant
-        kept, inputs, rubs = (tuple(sorted(names)) for names in (v.kept, v.inputs, v.frictions))
+        kept, inputs, rubs = (tuple(sorted(names)) for names in (v.coefficients, v.inputs, v.frictions))
         return cls(one.change.words, kept, v.integer_orders, v.offset, inputs, rubs, dict(one.start), one.score)
 
     def to_subset(self) -> ScreenedSubset:
         """Deserialize the subset."""
-        variant = Variant(frozenset(self.kept), self.whole, self.offset, frozenset(self.inputs), frozenset(self.rubs))
+        variant = Variant(
+            frozenset(self.coefficients), self.integer_orders, self.offset, frozenset(self.inputs), frozenset(self.rubs)
+        )
         return ScreenedSubset(Change(self.words, variant), self.start, self.score)
 
 
@@ -290,7 +292,7 @@ Answer = FitError | FitFile | JudgementFile | SubsetsFile
 class StoredAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
     """Result of a step, with the digest of its arguments."""
 
-    asked: bytes
+    request: bytes
     answer: Answer
 
 
@@ -350,7 +352,7 @@ class Store:
             if isinstance(frame, Request):
                 self._check_same(request, frame)
             else:
-                self._known[frame.asked] = frame.answer
+                self._known[frame.request] = frame.answer
             offset = end
             self._log.end, self._log.digest = end, digest
         if self._log.end < len(data):

@@ -257,7 +257,7 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
         found,
         folds.description,
         _reason(winner, best, ranked),
-        work.done,
+        work.done_count,
         tuple(warnings),
     )
 

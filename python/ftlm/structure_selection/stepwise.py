@@ -146,13 +146,13 @@ class CandidateEvaluator:
     progress: Callable[[int, int], None] | None = None
     clock: Callable[[], float] = time.perf_counter
     store: Store | None = None
-    done: int = 0
-    known: int = 0
+    done_count: int = 0
+    known_count: int = 0
     trials: list[Trial] = field(default_factory=list)
 
     def map_candidates(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """Return the results for candidates, in their order, with progress reports."""
-        self.known += len(items)
+        self.known_count += len(items)
         return self._in_order(work, items, self._report_progress)
 
     def map_items(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
@@ -160,9 +160,9 @@ class CandidateEvaluator:
         return self._in_order(work, items, lambda: None)
 
     def _report_progress(self) -> None:
-        self.done += 1
+        self.done_count += 1
         if self.progress is not None:
-            self.progress(self.done, self.known)
+            self.progress(self.done_count, self.known_count)
 
     def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], told: Callable[[], None]) -> list[Made]:
         out: list[Made] = []
@@ -407,7 +407,7 @@ def _eliminate_from_full(
 ) -> tuple[Trial, FittedVariant] | None:
     """Eliminate one term at a time from the full structure at integer orders; return the best on the way."""
     full = inside.richest(low.change.variant)
-    if len(full.kept) - len(low.change.variant.kept) < 2:
+    if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
         return None
     structure = inside.build(full)
     starts = [
@@ -420,7 +420,11 @@ def _eliminate_from_full(
     found = _validate_variants(inside, work, [at])
     best, best_at = found[0], at
     while True:
-        changes = [c for c in inside.smaller(at.change.variant) if len(c.variant.kept) < len(at.change.variant.kept)]
+        changes = [
+            c
+            for c in inside.smaller(at.change.variant)
+            if len(c.variant.coefficients) < len(at.change.variant.coefficients)
+        ]
         ahead = _fit_changes(inside, work, at, changes)
         if not ahead:
             return best, best_at

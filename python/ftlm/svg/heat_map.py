@@ -29,7 +29,7 @@ class Landscape:
         Their values, ascending.
     scores
         Shape (y, x); infinite for pairs that are no candidates or whose simulation diverges.
-    others
+    other_orders_note
         Treatment of the other parameters, as text.
     score
         Name of the score.
@@ -41,7 +41,7 @@ class Landscape:
     x: Floats
     y: Floats
     scores: Floats
-    others: str = "Other orders as in the best model."
+    other_orders_note: str = "Other orders as in the best model."
     score: str = "score"
     correlation: float = math.nan
 
@@ -72,7 +72,7 @@ def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
     at = f"{symbol(across)} = {landscape.x[column]:g}, {symbol(upward)} = {landscape.y[row]:g}"
     described = f"Heat map of {landscape.score}. Best {number(low)} at {at}; worst {number(high)}."
     left_out = int(np.sum(~finite))
-    caption = f"Best: {at} (ring). Dark is good; colours are steps of the logarithm. {landscape.others}"
+    caption = f"Best: {at} (ring). Dark is good; colours are steps of the logarithm. {landscape.other_orders_note}"
     if landscape.score != "score":
         caption += f" Score: {landscape.score}."
     if left_out:

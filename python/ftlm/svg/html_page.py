@@ -154,7 +154,7 @@ class Section:
         Further warnings in a collapsed list.
     fold
         Title of the collapsed part; it is open in print.
-    folded_paragraphs, folded
+    folded_paragraphs, folded_tables
         Text and tables of the collapsed part.
     """
 
@@ -167,7 +167,7 @@ class Section:
     more: Sequence[str] = ()
     fold: str = "Numbers"
     folded_paragraphs: Sequence[str] = ()
-    folded: Sequence[Table] = ()
+    folded_tables: Sequence[Table] = ()
 
     def __post_init__(self) -> None:
         # A str is a sequence of characters; treat it as one paragraph.

@@ -35,29 +35,29 @@ class FileMessages:
 
     Parameters
     ----------
-    quoted
+    quotes_path
         Whether the path stands in quotes.
     folder
         Remedy if a folder has that name; empty if a folder counts as an existing file.
-    failed
+    failure
         Message of a failure, with a placeholder for its reason.
     """
 
-    quoted: bool = False
+    quotes_path: bool = False
     folder: str = ""
-    failed: str = "cannot be written: {}; choose another folder"
+    failure: str = "cannot be written: {}; choose another folder"
 
     def format_path(self, path: Path) -> str:
         """Return a path as text."""
-        return repr(str(path)) if self.quoted else str(path)
+        return repr(str(path)) if self.quotes_path else str(path)
 
 
 #: Wording for models, pages and tables; for runs; for outputs of commands.
 DEFAULT_MESSAGES = FileMessages()
 RUN_MESSAGES = FileMessages(
-    quoted=True,
+    quotes_path=True,
     folder="give the name of a file in it",
-    failed="cannot be written ({}); check the folder and the space left",
+    failure="cannot be written ({}); check the folder and the space left",
 )
 COMMAND_MESSAGES = FileMessages(folder="name a file in it")
 
@@ -159,7 +159,7 @@ def write_atomically(
             raise
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else None
-        raise DataError(f"{words.format_path(file)} {words.failed.format(why or error)}") from error
+        raise DataError(f"{words.format_path(file)} {words.failure.format(why or error)}") from error
     # The rename itself survives a power cut only when the folder is on disk too; not every system can do that.
     with contextlib.suppress(OSError):
         descriptor = os.open(file.parent, os.O_RDONLY)

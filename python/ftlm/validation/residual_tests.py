@@ -141,7 +141,7 @@ class FeedbackRegression:
     ----------
     past
         Earlier samples of the input and of the other inputs, and a constant.
-    now
+    current_input
         Input at the same sample, minus its first value in the run.
     future
         Input at the same sample and at later samples.
@@ -152,7 +152,7 @@ class FeedbackRegression:
     """
 
     past: Floats
-    now: Floats
+    current_input: Floats
     future: Floats
     residuals: Floats
     rows: int
@@ -191,7 +191,7 @@ class FeedbackRegression:
 
     def statistic(self, first: int) -> tuple[float, float] | None:
         """Statistic and limit of the inputs from ``first`` (0 or 1) samples ahead, at the more significant horizon."""
-        past = np.column_stack([self.past, self.now]) if first else self.past
+        past = np.column_stack([self.past, self.current_input]) if first else self.past
         future = self.future[:, first:]
         if self.rows < 2 * (past.shape[1] + future.shape[1]):
             return None
