@@ -221,7 +221,7 @@ BAD = [
     (("identify", "square.csv", *SEARCH, "--delay", "u=-1"), 2, "delay"),
     (("identify", "square.csv", *SEARCH, "--initial", "sleepy"), 2, "sleepy"),
     (("identify", "square.csv", *SEARCH, "--order-grid", "beta=0:1:0.1"), 2, "beta"),
-    (("identify", "square.csv", *SEARCH[:4], "--increment", "1e-7"), 2, "step"),
+    (("identify", "square.csv", *SEARCH[:4], "--increment", "1e-7"), 2, "raise the increment"),
     (("identify", "square.csv", *SEARCH, "--validation", "none.csv"), 3, "none.csv"),
     (("identify", "square.csv", *SEARCH, "-o", "nowhere/model.json"), 3, "nowhere"),
     (("identify", "square-foreign.csv", *SEARCH, "-u", "u=amps", "-y", "y=mm"), 3, "amps"),
