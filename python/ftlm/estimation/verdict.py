@@ -228,7 +228,8 @@ def result_findings(result: Identification) -> Iterator[ModelFinding]:
     endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
     if endless:
         yield of(_KINDS_BY_NAME["vague"], f"the runs do not bound {_join_names(endless)}")
-    hidden = dict.fromkeys(o for run in result.comparison.offsets for o, values in run.items() if not values)
+    runs = zip(result.comparison.offsets, result.comparison.initial, strict=False)
+    hidden = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
     if hidden:
         words = f"the offset of {_join_names(list(hidden))} is not told apart from what a run did before its start"
         yield of(_KINDS_BY_NAME["history"], words)

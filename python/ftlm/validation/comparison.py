@@ -154,7 +154,7 @@ class Comparison:
     offsets
         Unknown constants of the equations, one mapping per run: output -> ``"constant"`` [unit of D^alpha y] (and
         ``"ramp"`` [that unit/s]) -> value. Estimated on each run separately; empty for a model without an offset, and
-        for an output whose initial history makes the offset unidentifiable.
+        for an output whose initial history makes the offset unidentifiable or whose free run diverges.
     without_equation_error
         Outputs without an equation error, with the reason: friction acts on them, or samples are missing.
     """
@@ -348,13 +348,14 @@ def describe_missing_equation_errors(why: Mapping[str, str]) -> list[str]:
 def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
     """Return offsets of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
 
-    Empty for an equation whose run has an initial history: its powers of t make a constant unidentifiable.
+    Empty for an equation whose run has an initial history, since its powers of t make a constant unidentifiable, and
+    for one whose free run diverges, which determines no constant.
     """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
         alone = initial_exponents(item, "caputo", model.structure.offset)
         found = {round(e, 9) for e in initial[item.output] if e > -1}
-        if isinstance(model.structure.initial, str) and not found <= set(alone):
+        if not found or (isinstance(model.structure.initial, str) and not found <= set(alone)):
             out[item.output] = {}
             continue
         exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
@@ -368,10 +369,11 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
 def describe_offsets(comparison: Comparison) -> list[str]:
     """Describe the offsets of every run that has some, one line per output."""
     lines = []
-    for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
+    for (run, _, _), offsets, initial in zip(comparison.per_run, comparison.offsets, comparison.initial, strict=False):
         for output, values in offsets.items():
             if not values:
-                lines.append(f"offset in the equation of {output} in {run}: {HIDDEN_OFFSET_NOTE}")
+                note = HIDDEN_OFFSET_NOTE if initial[output] else "not estimated, since the free run diverges"
+                lines.append(f"offset in the equation of {output} in {run}: {note}")
                 continue
             ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
             lines.append(
