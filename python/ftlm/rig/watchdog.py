@@ -123,10 +123,16 @@ def start(page: RegisterPage, *, keep: bool, patience: float = 10.0) -> subproce
     OSError
         The process could not be started.
     """
-    command = [sys.executable, "-I", "-S", __file__, str(page.path), "keep" if keep else "remove"]
+    from ftlm.utils.resources import python_child  # noqa: PLC0415 — the watchdog itself imports nothing of ftlm
+
     # A separate session, so that Ctrl-C does not reach the watchdog.
-    nothing = subprocess.DEVNULL
-    process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
+    process = subprocess.Popen(
+        **python_child(Path(__file__), str(page.path.resolve()), "keep" if keep else "remove", site=False),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
     until = time.monotonic() + patience
     try:
         while not page.get("ready"):
