@@ -16,6 +16,7 @@ import pytest
 import ftlm
 from ftlm import _core, rig
 from ftlm.cli.main import app
+from ftlm.control import load_controller
 from ftlm.order_search import checkpoint as log
 from ftlm.order_search.checkpoint import read_store
 from ftlm.utils import files as output
@@ -209,6 +210,36 @@ def test_a_number_of_thousands_of_digits_is_an_error_in_words(written, tmp_path)
     path.write_text(f"step = {'9' * 5000}\n")
     with pytest.raises(ftlm.DataError, match="is not a TOML file"):
         ftlm.load(written, columns=path)
+
+
+SMALL_FILES = {
+    "model": lambda path, written: ftlm.load_model(path),
+    "controller": lambda path, written: load_controller(path),
+    "parameters": lambda path, written: rig.ArmParameters.of(path),
+    "columns": lambda path, written: ftlm.load(written, columns=path),
+}
+
+
+@pytest.mark.parametrize("kind", SMALL_FILES)
+def test_a_small_file_is_a_regular_file_of_little_size(kind, written, tmp_path):
+    pipe, device, folder, large, absent, closed = (tmp_path / f"{n}.toml" for n in ("p", "d", "f", "l", "a", "c"))
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    folder.mkdir()
+    with open(large, "wb") as stream:
+        stream.truncate(60 << 30)
+    closed.write_bytes(b"\xff\x00" * 100)
+    for path, words in (
+        (pipe, "is no regular file"),
+        (device, "is no regular file"),
+        (folder, "is no regular file"),
+        (large, "has 64424509440 bytes"),
+        (absent, "No such file"),
+        (closed, "c.toml"),
+    ):
+        with pytest.raises(ftlm.DataError, match=words) as refused:
+            SMALL_FILES[kind](path, written)
+        assert str(path) in str(refused.value)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
