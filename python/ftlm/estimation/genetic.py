@@ -473,8 +473,7 @@ class GeneticAlgorithm:
     ------
     ModelError
         Seeds that are none or too many, a population outside [8, 100000], evaluations of less than two generations,
-        bounds that are
-        no interval, an order grid or a norm that is none.
+        bounds that are no interval, an order grid or a norm that is none.
     """
 
     name: ClassVar[str] = "genetic"
