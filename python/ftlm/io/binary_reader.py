@@ -312,6 +312,9 @@ def numpy_array(stream: Any, name: str, found: Arrays) -> Any:
     content = stream.read(size)
     if len(content) != size:
         raise UnreadableError(f"{name!r} ends after {len(content)} of {size} bytes")
+    if stream.read(1):
+        # Its header may be damaged, and the numbers then be shifted.
+        raise UnreadableError(f"{name!r} has more than the {size} bytes that its header declares")
     return numpy.frombuffer(content, kind).reshape(shape, order="F" if order else "C")
 
 
