@@ -241,7 +241,7 @@ def test_every_process_is_started_in_one_way():
     assert sorted(users) == [
         "python/ftlm/app/subprocess_task.py",
         "python/ftlm/io/isolated_reader.py",
-        "python/ftlm/rig/watchdog.py",
+        "python/ftlm/rig/virtual_board.py",
         "python/ftlm/utils/resources.py",
     ]
 

@@ -158,7 +158,7 @@ class ArmParameters:
 
     @classmethod
     def _from_toml(cls, path: Path) -> ArmParameters:
-        told = _given(
+        told = _values_of(
             read_toml(path, "parameters of the arm", "a file of numbers by name, such as coupling = 0.5", _ArmFile)
         )
         base = told.pop("base", "effective")
@@ -168,7 +168,7 @@ class ArmParameters:
                 f"{join_names(PARAMETER_SETS)}"
             )
         start = PARAMETER_SETS[base]
-        stages = {name: _given(told.pop(name, _StageFile())) for name in ("stage1", "stage2")}
+        stages = {name: _values_of(told.pop(name, _StageFile())) for name in ("stage1", "stage2")}
         for where, table in (("the file", told), *stages.items()):
             _check_values(path, where, table)
         merged = {name: replace(getattr(start, name), **table) for name, table in stages.items()}
@@ -275,7 +275,7 @@ _ArmFile = msgspec.defstruct(
 )
 
 
-def _given(file: msgspec.Struct) -> dict[str, Any]:
+def _values_of(file: msgspec.Struct) -> dict[str, Any]:
     """Return the keys of a file that are in it."""
     return {key: value for key, value in msgspec.structs.asdict(file).items() if value is not UNSET}
 
