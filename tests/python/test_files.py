@@ -286,7 +286,7 @@ BAD_CALLS = {
     "columns step": ({"columns": {"step": "fast", "outputs": ["y"]}}, ["step='fast'"]),
     "columns table": ({"columns": {"inputs": 3, "outputs": ["y"]}}, ["inputs=", "int"]),
     "columns units": ({"columns": {"units": "deg", "outputs": ["y"]}}, ["units=", "str"]),
-    "columns missing": ({"columns": "no_such.toml"}, ["no_such.toml", "does not exist"]),
+    "columns missing": ({"columns": "no_such.toml"}, ["no_such.toml", "No such file"]),
     "window": ({**HEADED, "window": (0, 99)}, ["window", "99"]),
     "name": ({**HEADED, "name": "@x"}, ["name='@x'"]),
 }

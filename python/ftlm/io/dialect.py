@@ -200,6 +200,8 @@ def _encoding(given: object) -> str:
 _WORDS_BY_SEPARATOR = {character: word for word, character in SEPARATOR_CHARACTERS.items()}
 SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}
 _SEPARATOR_CANDIDATES = (";", "\t", ",", None)
+#: Most columns of a text file; opening so many takes a few seconds.
+MAX_COLUMNS = 100_000
 _COMMA_THOUSANDS_PATTERN = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _COMMA_PAIRS_PATTERN = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")
 #: Column name of the sparse comment column in LabVIEW files.
@@ -303,6 +305,7 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
             f"{source}: no table below the first {given.skip} lines; say another number with "
             f"{layout_parameter(skip=Placeholder('LINES'))}"
         )
+    _check_width(kept[-2:], source)
     separator, comma, mark, cut = _choose_separator(kept, given, source)
     width = _width(cut)
     first = 0 if given.skip is not None and given.header is not None else _first_row(cut, width)
@@ -320,6 +323,17 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     if names is not None:
         width = len(names)
     return TableDialect(separator, comma, names, line, units, begin, width, layout, assumed, mark)
+
+
+def _check_width(kept: Sequence[tuple[int, str]], source: str) -> None:
+    """Raise for lines with too many columns, whatever separates them."""
+    for at, line in kept:
+        count = max(len(line.split()), *(line.count(mark) + 1 for mark in _SEPARATOR_CANDIDATES if mark is not None))
+        if count > MAX_COLUMNS:
+            raise DataError(
+                f"{source}: line {at} has {count} cells, more than {MAX_COLUMNS}; save a part of the columns, or "
+                "transpose a file with samples in columns"
+            )
 
 
 def _split_lines(

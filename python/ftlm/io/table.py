@@ -108,8 +108,11 @@ class Pool:
                         f"column {name!r} is in {str(self._columns[name].source)!r} and {str(table.path)!r}; "
                         "rename one of the files"
                     )
-                matrix = None if column.matrix is None else prefix + column.matrix
-                self._columns[name] = replace(column, name=name, matrix=matrix)
+                if prefix:
+                    matrix = None if column.matrix is None else prefix + column.matrix
+                    self._columns[name] = replace(column, name=name, matrix=matrix)
+                else:
+                    self._columns[name] = column
 
     @property
     def columns(self) -> list[Column]:

@@ -22,7 +22,7 @@ from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.excitation import CURRENT_SIGNALS, Excitation, finite_number
 from ftlm.rig.quanser import QuanserBoard
-from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, check_thread, describe_signal
+from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, check_rate, check_thread, describe_signal
 from ftlm.rig.virtual_board import VirtualBoard
 from ftlm.utils.files import RUN_MESSAGES, check_free
 from ftlm.utils.parameters import parameter, setting
@@ -657,6 +657,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
         raise ModelError(f"{setting('duration')} {length:g} s is over the limit of {longest:g} s; {way_out}")
     if samples is None or samples <= 0:
         raise ModelError(f"{setting('rate')} {short_repr(rate)} Hz is not a positive number of samples per second")
+    check_rate(samples)
     if length * samples < 2:
         raise ModelError(
             f"{setting('duration')} {length:g} s holds fewer than three samples at {samples:g} Hz; make it longer"
