@@ -243,7 +243,8 @@ def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: Loa
                 f"{parameter('step')} is in s"
             )
         return _TimeColumn()
-    column, assumed = pool.time(wanted.time, used)
+    matrices = [column.matrix for column in used if column.matrix is not None]
+    column, assumed = pool.time(wanted.time, matrices, {column.name for column in used})
     label = f"{column.source.name}: column {column.name!r} (time)"
     facts: tuple[str, ...] = () if assumed is None else (str(assumed),)
     if column.timestamps is None:
