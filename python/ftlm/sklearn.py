@@ -15,7 +15,7 @@ from ftlm.estimation.methods import EstimationMethod
 from ftlm.structure.order import Values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_array
 
 try:
     _base, _validation = (importlib.import_module(f"sklearn.{part}") for part in ("base", "utils.validation"))
@@ -92,6 +92,8 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         DataError, ModelError, ConvergenceError
             See :func:`ftlm.identify`.
         """
+        for name, values in (("X", X), ("y", y)):
+            as_array(name, values)
         X, y = _validation.validate_data(
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=8
         )
@@ -110,6 +112,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
     def predict(self, X: Any) -> Floats:
         """Simulate rows of inputs; returns shape (n,) or (n, outputs), as y had."""
         _validation.check_is_fitted(self)
+        as_array("X", X)
         X = _validation.validate_data(self, X, reset=False, dtype=np.float64)
         before = 0
         if self.continues and not np.array_equal(X, self._fitted):

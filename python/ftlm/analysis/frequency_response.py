@@ -20,7 +20,7 @@ from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import Complex, Floats, check_choice
+from ftlm.utils.validation import Complex, Floats, as_floats, check_choice
 
 #: A sum of coefficient * s^power, by power.
 Polynomial: TypeAlias = dict[float, float]
@@ -205,7 +205,7 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
     """
     check_no_input_nonlinearity(model, "a frequency response")
     coupled = is_coupled(coupling)
-    omega = np.asarray(w, dtype=np.float64)
+    omega = as_floats("w", w)
     if omega.ndim != 1 or omega.size == 0:
         raise DataError(f"w has shape {omega.shape}; give a vector of frequencies in rad/s")
     bad = ~(np.isfinite(omega) & (omega >= 0))
@@ -362,7 +362,7 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
         A model so unstable that the response leaves the range of numbers.
     """
     check_no_input_nonlinearity(model, "a step response")
-    t = np.asarray(time, dtype=np.float64)
+    t = as_floats("time", time)
     if t.ndim != 1 or t.size < 3 or not np.all(np.isfinite(t)) or t[0] != 0:
         raise DataError("time must be a vector of at least three instants [s] that begins with 0, such as numpy.arange")
     step = float(t[-1]) / (t.size - 1)

@@ -19,7 +19,7 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, real_number, short_repr, whole_number
+from ftlm.utils.validation import Floats, as_floats, real_number, short_repr, whole_number
 
 #: Maximum errors of the approximation without a warning.
 MAX_GAIN_ERROR_DB, MAX_PHASE_ERROR_DEGREES = 1.0, 5.0
@@ -83,7 +83,7 @@ class Approximation:
 
     def frequency_response(self, w: Sequence[float] | Floats) -> NDArray[np.complex128]:
         """Response of the approximation, shape (outputs, inputs, W)."""
-        omega = np.asarray(w, dtype=np.float64)
+        omega = as_floats("w", w)
         system = 1j * omega[:, None, None] * np.eye(self.states) - self.a
         response = self.c @ np.linalg.solve(system, np.broadcast_to(self.b, (omega.size, *self.b.shape))) + self.d
         return np.asarray(np.moveaxis(response, 0, -1), dtype=np.complex128)

@@ -16,7 +16,7 @@ from ftlm.control.lqg import Lqg, Observer
 from ftlm.control.realization import MAX_POLES, Realisation
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.utils.files import JsonFormat, write_atomically
-from ftlm.utils.validation import Floats, error_text
+from ftlm.utils.validation import Floats, as_floats, error_text
 
 CONTROLLER_SCHEMA = 1
 #: Algorithm of each kind of controller, as text for implementations without ftlm.
@@ -310,6 +310,7 @@ class JointControllers:
 
     def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
         """Return both currents [A]."""
+        angles, reference = as_floats("angles", angles), as_floats("reference", reference)
         first, second = (
             0.0
             if loop is None

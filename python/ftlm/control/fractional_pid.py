@@ -17,7 +17,7 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr, whole_number
+from ftlm.utils.validation import Complex, Floats, as_complex, nearest, real_number, short_repr, whole_number
 
 #: Poles extend this factor beyond the band on both sides.
 POLE_RANGE_FACTOR = 30.0
@@ -61,7 +61,7 @@ class FractionalPid:
 
     def response(self, w: Floats | Complex) -> Complex:
         """Exact response at frequencies above 0 [rad/s]."""
-        s = 1j * np.asarray(w)
+        s = 1j * as_complex("w", w)
         return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
 
     def to_dict(self) -> dict[str, Any]:
@@ -181,7 +181,7 @@ class DiscretePid:
 
     def response(self, w: Floats | Complex) -> Complex:
         """Frequency response [rad/s] of the discrete-time controller without saturation."""
-        z = np.exp(1j * np.asarray(w) / self.rate)
+        z = np.exp(1j * as_complex("w", w) / self.rate)
         return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
 
     def reset(self) -> None:

@@ -17,7 +17,7 @@ from ftlm.model.model import Model
 from ftlm.utils.formatting import with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, check_choice, short_repr, whole_number
+from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, short_repr, whole_number
 
 #: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
 SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
@@ -118,14 +118,10 @@ class Shaper:
         ModelError
             As :meth:`impulses`.
         """
-        try:
-            given = np.asarray(reference)
-            good = given.dtype.kind in "fiu" and given.ndim in (1, 2) and given.size > 0
-        except (TypeError, ValueError):
-            good = False
-        if not good:
+        given = as_array("reference", reference)
+        if given.dtype.kind not in "fiu" or given.ndim not in (1, 2) or given.size == 0:
             raise DataError("reference is no array of numbers of shape (rows,) or (rows, columns)")
-        x = np.array(given, dtype=np.float64).reshape(len(given), -1)
+        x = as_floats("reference", given).reshape(len(given), -1)
         bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if bad.size:
             raise DataError(f"reference is not finite at row {bad[0]} ({bad.size} such rows in all)")
@@ -232,7 +228,7 @@ def input_shaper(
 
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
     """Amplitude of the vibration after the last impulse, relative to a single impulse of sum 1 at that time."""
-    w, z = np.broadcast_arrays(np.asarray(frequency, dtype=np.float64), np.asarray(damping, dtype=np.float64))
+    w, z = np.broadcast_arrays(as_floats("frequency", frequency), as_floats("damping", damping))
     pole = w * (-z + 1j * np.sqrt(np.maximum(1.0 - z * z, 0.0)))
     left = np.sum(amplitudes * np.exp(pole[..., None] * (times[-1] - times)), axis=-1)
     return np.asarray(np.abs(left), dtype=np.float64)

@@ -15,7 +15,7 @@ from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Complex, Floats, real_number, short_repr
+from ftlm.utils.validation import Complex, Floats, as_array, real_number, short_repr
 
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
 #: continuation, which the fading memory of a fractional model would never forget.
@@ -250,12 +250,8 @@ def inverse_dynamics(
 
 def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,)."""
-    try:
-        raw = np.asarray(path)
-        good = raw.dtype.kind in "fiu" and raw.ndim == 1 and 16 <= raw.size <= MAX_PATH_ROWS
-    except (TypeError, ValueError):
-        good = False
-    if not good:
+    raw = as_array("path", path)
+    if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
         raise DataError(f"path is no array of 16 to {MAX_PATH_ROWS} numbers, one a sample")
     rows = np.array(raw, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(rows))

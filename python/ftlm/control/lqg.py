@@ -19,7 +19,7 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model, check_model
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Complex, Floats, nearest, short_repr
+from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.
 UNKNOWN_INPUT = "unknown input"
@@ -110,7 +110,7 @@ class Observer:
         column = self.rows[:, 0]
         if self.realisation.poles[0] == 0 and np.any(column):
             at = int(np.argmax(np.abs(column)))
-            states[0] = measured[at] / column[at]
+            states[0] = as_floats("measured", measured)[at] / column[at]
         return states
 
     def __str__(self) -> str:
@@ -269,7 +269,7 @@ class Lqg:
         self.observer, self.tracked, self.limit = observer, tracked, check_limit(limit)
         realisation = observer.realisation
         self.rate = realisation.rate
-        gains = np.array(feedback, dtype=np.float64).reshape(1, -1)
+        gains = as_floats("feedback", feedback).reshape(1, -1).copy()
         if gains.shape[1] != realisation.states or not np.isfinite(gains).all():
             raise ModelError(f"feedback is no row of {realisation.states} finite numbers, one a state")
         self.feedback = gains
@@ -299,7 +299,7 @@ class Lqg:
 
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
         """Return the command for the measured outputs of a sample, in the observer's order, and a reference."""
-        y = np.asarray(measured, dtype=np.float64)
+        y = as_floats("measured", measured)
         with np.errstate(over="ignore", invalid="ignore"):
             if self._states is None:
                 self._states = np.append(self.observer.rest(y), 0.0)
@@ -315,7 +315,7 @@ class Lqg:
 
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
         """Frequency responses of the command to the measured outputs, (measured, W), and to the reference, (W,)."""
-        z = np.exp(1j * np.asarray(w) / self.rate)
+        z = np.exp(1j * as_complex("w", w) / self.rate)
         a, into = self._transition_matrices()
         system = z[:, None, None] * np.eye(len(a)) - a
         right = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))

@@ -16,7 +16,7 @@ from ftlm.analysis.poles import modes
 from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Complex, Floats, error_text, real_number, short_repr, whole_number
+from ftlm.utils.validation import Complex, Floats, as_floats, error_text, real_number, short_repr, whole_number
 
 #: Number of fitted frequencies; the error is also evaluated between them.
 FIT_FREQUENCIES = 120
@@ -71,7 +71,7 @@ class Realisation:
 
     def response(self, w: Floats) -> Complex:
         """Frequency response [rad/s] of the samples to a held input, shape (outputs, W)."""
-        z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
+        z = np.exp(1j * as_floats("w", w) / self.rate)
         system = z[:, None, None] * np.eye(self.states) - self.a
         states = np.linalg.solve(system, np.broadcast_to(self.b, (z.size, *self.b.shape)))[:, :, 0]
         return np.asarray((states @ self.c.T).T)

@@ -469,12 +469,33 @@ class Run:
         Parameters
         ----------
         samples : mapping of str to array
-            New samples by name, shape (N,).
+            New samples by name, shape (N,), in SI units; missing (NaN or masked) ones of outputs alone.
         read : mapping of str to array, optional
             New samples at the original times, for a run with `sample_times`.
+
+        Raises
+        ------
+        DataError
+            If a name is no signal of this run, or its values are not N numbers, finite where it is an input.
         """
-        readings = self.sample_times and self.sample_times.replace_signals(**(read or {}))
-        return self._with(_data={**self._data, **samples}, sample_times=readings)
+        checked = self._checked_samples("samples", samples, self.length)
+        readings = self.sample_times
+        if readings is not None:
+            own = {} if read is None else read
+            readings = readings.replace_signals(**self._checked_samples("read", own, readings.times.size))
+        return self._with(_data={**self._data, **checked}, sample_times=readings)
+
+    def _checked_samples(self, argument: str, given: object, length: int) -> dict[str, Floats]:
+        """Return new samples of some signals by name; raise if they do not fit this run."""
+        checked: dict[str, Floats] = {}
+        for name, values in as_mapping(argument, given).items():
+            if name not in self:
+                raise self._unknown_signal_error(name)
+            what, gaps = f"signal {name!r}", name in self.outputs
+            checked[name] = as_vector(values, what, gaps=gaps)[0]
+            check_lengths({f"run {self.name!r}": length, what: checked[name].size})
+            check_values(checked[name], what, 0, gaps=gaps)
+        return checked
 
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.

@@ -19,7 +19,7 @@ from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Floats, whole_number
+from ftlm.utils.validation import Floats, as_floats, whole_number
 
 #: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
 #: the iteration has converged.
@@ -366,7 +366,7 @@ class Streaming:
         ConvergenceError
             The covariance lost its sign to rounding.
         """
-        self._core.push(np.ascontiguousarray(samples, dtype=np.float64))
+        self._core.push(as_floats("samples", samples))
 
     @property
     def coefficients(self) -> dict[str, float]:

@@ -34,6 +34,7 @@ from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.formatting import symbol
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import as_floats
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
@@ -354,7 +355,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     found = model.model if isinstance(model, Identification) else model
     if not isinstance(found, Model):
         raise ModelError(f"model is {type(found).__name__}; give a model or an identification")
-    omega = response_frequencies(found) if w is None else np.asarray(w, dtype=np.float64)
+    omega = response_frequencies(found) if w is None else as_floats("w", w)
     curves = bode_curves(found, omega)
     figure, axes = axes_for(ax, max(len(curves), 1), 2)
     for i, curve in enumerate(curves):

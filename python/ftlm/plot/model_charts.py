@@ -19,7 +19,7 @@ from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import symbol
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Complex, Floats
+from ftlm.utils.validation import Complex, Floats, as_floats
 
 #: Decibels per unit of the natural logarithm of a gain.
 DECIBELS_PER_NEPER = 20.0 / math.log(10.0)
@@ -47,7 +47,7 @@ def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
     w
         Frequencies [rad/s]; by default around the corner frequencies of the model.
     """
-    omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
+    omega = response_frequencies(model) if w is None else as_floats("w", w)
     return bode_figures(omega, bode_curves(model, omega))
 
 
@@ -202,7 +202,7 @@ class Bode:
 def bode(model: Model, w: ArrayLike | None = None) -> Bode:
     """Return the frequency response of a model with charts; see :meth:`ftlm.Model.bode`."""
     check_model(model)
-    omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
+    omega = response_frequencies(model) if w is None else as_floats("w", w)
     return Bode(omega, tuple(bode_curves(model, omega)))
 
 

@@ -17,9 +17,9 @@ from types import CodeType, FrameType
 from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
-from ftlm.errors import FtlmError, ModelError, RigFault
+from ftlm.errors import DataError, FtlmError, ModelError, RigFault
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, error_text, real_number
+from ftlm.utils.validation import Floats, as_floats, error_text, real_number
 
 #: Termination signals, including those of a closed terminal.
 _TERMINATION_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
@@ -594,10 +594,15 @@ class Rig:
 
         Raises
         ------
+        DataError
+            Commands of another shape, or no numbers.
         RigFault
             A fault has latched; the motors stay at 0 V.
         """
         self._check()
+        commands = as_floats("commands", commands)
+        if commands.ndim != 2 or commands.shape[1] != 2:
+            raise DataError(f"commands has shape {commands.shape}; give two currents [A] a row, shape (n, 2)")
         if self._samples + len(commands) > self.limit * self.rate + 1.5:
             self.fail(f"the time limit of {self.limit:g} s is over; ask for a longer one")
         self._samples += len(commands)

@@ -13,7 +13,7 @@ from ftlm.errors import DataError
 from ftlm.svg.figure import MIN_DIFFERENCE, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
 from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.formatting import number, truncate_text
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_floats
 
 #: Most bars of a histogram, and its height [px].
 MAX_BARS = 41
@@ -41,7 +41,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     DataError
         Fewer than two finite values.
     """
-    every = np.asarray(values, dtype=np.float64).ravel()
+    every = as_floats("values", values, gaps=True).ravel()
     there = every[np.isfinite(every)]
     if there.size < 2:
         raise DataError(f"a histogram needs two finite values at least, not {there.size}; give a longer run")
@@ -158,7 +158,7 @@ def bar_chart(
     DataError
         Nothing to draw, more than five series, or a series without one value per name.
     """
-    tables = [(name, np.asarray(values, dtype=np.float64)) for name, values in groups]
+    tables = [(name, as_floats(name, values, gaps=True)) for name, values in groups]
     if not names or not 0 < len(tables) < len(LINE_STYLES):
         raise DataError(
             f"{len(names)} names and {len(tables)} groups of bars; give names, and 1 to {len(LINE_STYLES) - 1} groups"

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm.errors import DataError
 from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width
 from ftlm.utils.formatting import number, symbol, truncate_text
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_floats
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def correlation_map(names: Sequence[str], values: ArrayLike, *, title: str, capt
     DataError
         A matrix that is not square or does not fit the names, or values beyond 1.
     """
-    matrix = np.asarray(values, dtype=np.float64)
+    matrix = as_floats("values", values, gaps=True)
     if matrix.shape != (len(names), len(names)) or not len(names):
         raise DataError(f"a matrix of shape {matrix.shape} for {len(names)} names; give one row and column a name")
     beyond = np.abs(matrix) > 1 + 1e-6
