@@ -110,7 +110,10 @@ def common_base(powers: Sequence[float]) -> float | None:
 
 
 def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
-    """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power; None where there are none."""
+    """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power.
+
+    None without a common base, or if frequencies or coefficients are out of the range of numbers.
+    """
     lowest, highest = min(polynomial), max(polynomial)
     base = common_base([p - lowest for p in polynomial])
     if base is None or (highest - lowest) / base > MAX_ROOT_DEGREE:
@@ -118,13 +121,19 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     if highest - lowest < POWER_TOLERANCE:
         return base or 1.0, np.empty(0, dtype=np.complex128)
     degree = round((highest - lowest) / base)
+    sizes = {power: math.log(abs(value)) for power, value in polynomial.items() if value}
+    if lowest not in sizes or highest not in sizes:
+        return None
     # In units of the mean frequency all coefficients are of a size.
-    unit = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
+    unit = (sizes[lowest] - sizes[highest]) / (highest - lowest)
+    logs = {power: size - sizes[highest] + unit * (power - highest) for power, size in sizes.items()}
+    if max(abs(unit), *logs.values()) > MAX_LOG_FREQUENCY:
+        return None
     coefficients = np.zeros(degree + 1)
-    for power, value in polynomial.items():
+    for power, size in logs.items():
         at = degree - round((power - lowest) / base)
-        coefficients[at] = value / polynomial[highest] * unit ** (power - highest)
-    return base, np.asarray(np.roots(coefficients) * unit**base, dtype=np.complex128)
+        coefficients[at] = math.copysign(math.exp(size), polynomial[power] / math.copysign(1.0, polynomial[highest]))
+    return base, np.asarray(np.roots(coefficients) * math.exp(unit * base), dtype=np.complex128)
 
 
 def poles(model: Model, *, coupling: str = "simulated") -> Complex:
@@ -153,8 +162,9 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
         roots = roots_in_base(polynomial)
         if roots is None:
             raise ModelError(
-                "the orders have no common base of 0.01 or more (or a degree above 100 in it), so the model has no "
-                "polynomial whose roots could be found; use stability(), or round the orders"
+                "the orders have no common base of 0.01 or more (or a degree above 100 in it), or the poles are out of "
+                "the range of numbers, so the model has no polynomial whose roots could be found; use stability(), or "
+                "round the orders"
             )
         base, values = roots
         angle = np.angle(values)
