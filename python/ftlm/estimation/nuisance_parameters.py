@@ -155,8 +155,8 @@ def offset_test(
             column[start:stop] = row[start:stop]
             columns.append(column)
     before = np.stack(columns, axis=1)
-    sizes = column_norms(before)
-    left = before / np.where(sizes > 0, sizes, 1.0)
+    norms = column_norms(before)
+    left = before / np.where(norms > 0, norms, 1.0)
     basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
     for _ in range(2):
         left = left - basis @ (basis.T @ left)
