@@ -1,4 +1,4 @@
-"""Records of a few rows and of extreme sizes: every method ends in a result or in words, without a warning of NumPy's."""
+"""Records of a few rows and of extreme sizes: a method ends in a result or in words, without NumPy's warnings."""
 
 import contextlib
 
