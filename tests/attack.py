@@ -465,6 +465,21 @@ def loops(table, count):
     table.tried("calls of control and a rig's loop", count)
 
 
+def odd_arguments(table):
+    """Every public function and method with an odd value for each argument."""
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    import odd
+
+    tried = 0
+    for name, parameter, word, wrong in odd.calls():
+        tried += 1
+        if wrong is not None:
+            table.broken("odd arguments of public functions", f"{name}({parameter}={word}): {wrong}")
+    table.tried("odd arguments of public functions", tried)
+
+
 class Table:
     """What was tried and what broke."""
 
@@ -518,6 +533,7 @@ def main():
         if not given.only_calls:
             way_out(table)
             loops(table, given.files)
+            odd_arguments(table)
             outputs(table, folder)
             files(table, folder, given.files)
             presses(table, folder)

@@ -15,6 +15,7 @@ from ftlm.estimation.methods import EstimationMethod
 from ftlm.structure.order import Values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import Floats, as_array
 
 try:
@@ -62,6 +63,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         Inputs.
     """
 
+    @check_arguments
     def __init__(
         self,
         structure: str | Structure = "auto",
@@ -81,6 +83,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         self.continues = continues
         self.threads = threads
 
+    @check_arguments
     def fit(self, X: Any, y: Any) -> FractionalRegressor:
         """Identify the structure from rows ordered in time.
 
@@ -121,6 +124,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         self._fitted, self._flat = X.copy(), np.ndim(y) == 1
         return self
 
+    @check_arguments
     def predict(self, X: Any) -> Floats:
         """Simulate rows of inputs; returns shape (n,) or (n, outputs), as y had."""
         _validation.check_is_fitted(self)

@@ -19,6 +19,7 @@ from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, as_floats, check_choice
 
@@ -123,6 +124,7 @@ def coupled_outputs(model: Model, *, coupled: bool) -> list[tuple[str, ...]]:
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
+@check_arguments
 def transfer_functions(model: Model, *, coupling: str = "simulated") -> TransferFunctions:
     """Transfer functions of a model by Cramer's rule, without the sensor filter.
 
@@ -174,6 +176,7 @@ def is_coupled(coupling: str) -> bool:
     return coupling == "simulated"
 
 
+@check_arguments
 def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
     """Exact frequency response with fractional orders.
 
@@ -260,6 +263,7 @@ def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
     return total
 
 
+@check_arguments
 def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
     """Standard deviations of the frequency response, from the covariance of the model by the delta method.
 
@@ -335,6 +339,7 @@ def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) ->
     return new
 
 
+@check_arguments
 def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
     """Response of every output to a unit step of every input, from rest.
 

@@ -25,6 +25,7 @@ from ftlm.analysis.frequency_response import (
 )
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import with_error
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
@@ -136,6 +137,7 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     return base, np.asarray(np.roots(coefficients) * math.exp(unit * base), dtype=np.complex128)
 
 
+@check_arguments
 def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     """Poles of a commensurate model on the principal sheet.
 
@@ -176,6 +178,7 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
+@check_arguments
 def stability(model: Model, *, coupling: str = "simulated") -> Stability:
     """Whether a model is stable: by its poles where orders are commensurate, else by the argument principle.
 
@@ -347,6 +350,7 @@ class Mode:
         )
 
 
+@check_arguments
 def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     """Return the modes of a model for any orders, slowest first: frequency, damping and time constant of its poles.
 
@@ -557,6 +561,7 @@ class SteadyState:
     order_error: float | None = None
 
 
+@check_arguments
 def steady_states(model: Model) -> tuple[SteadyState, ...]:
     """Return the steady state of every output for every input that affects it, with coupled equations.
 
@@ -615,6 +620,7 @@ def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
     return out
 
 
+@check_arguments
 def dcgain(model: Model) -> Floats:
     """Steady-state gain of every output from every input that is not modelled.
 

@@ -14,6 +14,7 @@ from ftlm.analysis.poles import modes as model_modes
 from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
@@ -57,6 +58,7 @@ class Shaper:
         """Delay of a shaped reference [s]."""
         return self.times[-1]
 
+    @check_arguments
     def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
         """Residual vibration of a mode after a shaped step, relative to an unshaped one.
 
@@ -69,6 +71,7 @@ class Shaper:
         """
         return residual_vibration(np.array(self.times), np.array(self.amplitudes), frequency, damping)
 
+    @check_arguments
     def impulses(self, rate: float) -> Floats:
         """Impulses at the samples of a rate [Hz], shape (N,), with exact zeros at the poles and sum 1.
 
@@ -99,6 +102,7 @@ class Shaper:
                 taps = _convolve(np.append(taps, np.zeros(len(part) - 1)), part)
         return taps
 
+    @check_arguments
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
         """Apply the shaper to a reference or input at a sampling rate [Hz]; the length does not change.
 
@@ -147,6 +151,7 @@ class Shaper:
         return f"{self.kind.upper()} shaper of {shown}: {steps}{within}"
 
 
+@check_arguments
 def input_shaper(
     model: Model | complex,
     kind: Literal["zv", "zvd"] = "zv",
@@ -229,6 +234,8 @@ def input_shaper(
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
     """Amplitude of the vibration after the last impulse, relative to a single impulse of sum 1 at that time."""
     w, z = np.broadcast_arrays(as_floats("frequency", frequency), as_floats("damping", damping))
+    if not (np.all(np.abs(w) < POLE_RANGE_RAD_S[1]) and np.all(np.abs(z) <= 1.0)):
+        raise DataError("frequency or damping is out of range; give rad/s, finite, and damping ratios from -1 to 1")
     pole = w * (-z + 1j * np.sqrt(np.maximum(1.0 - z * z, 0.0)))
     left = np.sum(amplitudes * np.exp(pole[..., None] * (times[-1] - times)), axis=-1)
     return np.asarray(np.abs(left), dtype=np.float64)

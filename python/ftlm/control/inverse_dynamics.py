@@ -14,6 +14,7 @@ from ftlm.control.fractional_pid import least_certain_parameter
 from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats, as_array, real_number, short_repr
 
@@ -95,6 +96,7 @@ class Trajectory:
         )
 
 
+@check_arguments
 def point_to_point(
     distance: float, duration: float, rate: float = 500.0, *, dwell_before: float = 0.3, dwell_after: float = 1.2
 ) -> Floats:
@@ -135,6 +137,7 @@ def point_to_point(
     return np.asarray(reach * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3))
 
 
+@check_arguments
 def inverse_dynamics(
     design: Loop,
     path: ArrayLike,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, real_number
 
@@ -23,6 +24,7 @@ FREQUENCY_UNITS: dict[str, float] = {
 }
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class FrequencyData:
     """Frequency response measured from one input to one output; built by :meth:`from_arrays`.
@@ -85,6 +87,7 @@ class FrequencyData:
             object.__setattr__(self, "deviation", _read_only_copy(deviation))
 
     @classmethod
+    @check_arguments
     def from_arrays(
         cls,
         frequency: ArrayLike,
@@ -134,6 +137,7 @@ class FrequencyData:
         out[order] = np.degrees(np.unwrap(np.angle(self.response[order])))
         return out
 
+    @check_arguments
     def slice(self, low: float | None = None, high: float | None = None) -> FrequencyData:
         """Return the data between two angular frequencies, both included.
 

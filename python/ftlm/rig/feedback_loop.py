@@ -25,6 +25,7 @@ from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.excitation import finite_number
 from ftlm.rig.recording import Experiment, check_times
 from ftlm.rig.rig import MAX_RUN_DURATION_S, Board, Rig
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, as_array, check_seed, error_text
 
@@ -39,6 +40,7 @@ DEFAULT_RATE_HZ = 500.0
 DEFAULT_TRAVEL_RAD = (math.pi / 2, math.pi / 2)
 
 
+@check_arguments
 def control(
     controller: Controller,
     reference: ArrayLike,

@@ -18,6 +18,7 @@ from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
 from ftlm.errors import DataError, FtlmError, ModelError, RigFault
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, as_floats, error_text, real_number
 
@@ -311,6 +312,7 @@ MOTORS_LIVE_MESSAGE = (
 RIG_COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Limits:
     """Safety limits of every command and sample; pairs are for joints 1 and 2.
@@ -353,6 +355,7 @@ class Limits:
     late: float = 0.05
     missed: int = 20
 
+    @check_arguments
     def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
         """Return the guard that enforces the limits at a sampling interval [s]."""
         return _core.Guard(

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ftlm.errors import DataError
 from ftlm.svg.figure import MIN_DIFFERENCE, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
 from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, truncate_text
 from ftlm.utils.validation import Floats, as_floats
 
@@ -24,6 +25,7 @@ BAR_HEIGHT_PX = 16.0
 MAX_NAME_CHARACTERS = 26
 
 
+@check_arguments
 def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "") -> Figure:
     """Return a histogram with the normal density of the same mean and standard deviation.
 
@@ -125,6 +127,7 @@ def _histogram(
     return svg(width, round(HISTOGRAM_HEIGHT_PX), title, described, out, narrow=narrow)
 
 
+@check_arguments
 def bar_chart(
     names: Sequence[str],
     groups: Sequence[tuple[str, ArrayLike]],

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ftlm.errors import DataError
 from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
 from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number
 from ftlm.utils.validation import Complex, as_complex
 
@@ -21,6 +22,7 @@ PLANE_HEIGHT_PX, CROSS_HALF_SIZE_PX = 260.0, 5.0
 PLANE_MARGIN_FACTOR = 1.18
 
 
+@check_arguments
 def plane_chart(
     points: Sequence[complex],
     *,

@@ -29,6 +29,7 @@ from ftlm.svg.figure import (
     text_width,
     ticks,
 )
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, truncate_text
 from ftlm.utils.validation import Floats, as_floats
 
@@ -196,6 +197,7 @@ class _Chart:
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
 
 
+@check_arguments
 def line_chart(
     x: ArrayLike,
     lines: Sequence[tuple[str, ArrayLike]],

@@ -8,7 +8,7 @@ import operator
 import os
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -198,6 +198,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Complex: TypeAlias = NDArray[np.complex128]
 
 
+Scalar = TypeVar("Scalar", bound=np.generic)
 #: Values of a sequence, which NumPy reads one by one, and of an array that is not compared with the memory.
 MAX_SEQUENCE_LENGTH = 50_000_000
 #: Dimensions of nested sequences; NumPy visits every path of one that contains itself.
@@ -249,6 +250,13 @@ def _check_sequence(name: str, values: object) -> None:
         if not length:
             return
         depth, first = depth + 1, first[0]
+
+
+def check_vector(name: str, array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Return a vector of at least one value; raise for arrays of other shapes."""
+    if array.ndim != 1 or not array.size:
+        raise DataError(f"{name} has shape {array.shape}; give a vector of at least one number")
+    return array
 
 
 def as_floats(name: str, values: object, *, gaps: bool = False) -> NDArray[np.float64]:
