@@ -274,7 +274,7 @@ def own_arguments(sound):
         "ftlm.Structure.filter_states": {"initial": {}},
         "ftlm.Layout.of": {"given": {"decimal": "comma"}},
         "ftlm.Layout.under": {"other": ftlm.Layout()},
-        "ftlm.SensorFilter.low_pass": {"signals": ["y"], "cutoff": 5.0},
+        "ftlm.SensorFilter.low_pass": {"signals": ["y"]},
         "ftlm.Model.from_control": {"system": object()},
         "ftlm.GeneticAlgorithm.fit": {"structure": free},
         "control.fractional_pid": hub | {"output": "theta", "input": "I"},

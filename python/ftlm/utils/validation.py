@@ -241,15 +241,17 @@ def _check_sequence(name: str, values: object) -> None:
     depth, first = 0, values
     while isinstance(first, Sequence) and not isinstance(first, (str, bytes, bytearray, memoryview)):
         try:
-            length = len(first)
+            length, item = len(first), first[0] if first else None
         except OverflowError:
-            length = MAX_SEQUENCE_LENGTH + 1
+            length, item = MAX_SEQUENCE_LENGTH + 1, None
+        except Exception as error:
+            raise DataError(f"{name} is no array of numbers ({error_text(error, 200)}); give an array") from error
         if length > MAX_SEQUENCE_LENGTH or depth > MAX_DIMENSIONS:
             found = f"{MAX_SEQUENCE_LENGTH} values" if length > MAX_SEQUENCE_LENGTH else f"{MAX_DIMENSIONS} dimensions"
             raise DataError(f"{name} is no array of numbers, but a sequence of more than {found}; give an array")
         if not length:
             return
-        depth, first = depth + 1, first[0]
+        depth, first = depth + 1, item
 
 
 def check_vector(name: str, array: NDArray[Scalar]) -> NDArray[Scalar]:
