@@ -404,7 +404,7 @@ def outcome(call, given):
         while trace is not None and trace.tb_next is not None:
             trace = trace.tb_next
         # Python's own refusal of a signature has no frame below the call.
-        if isinstance(error, TypeError) and trace and trace.tb_frame.f_code.co_name in {"outcome", "checked"}:
+        if isinstance(error, TypeError) and trace and trace.tb_frame.f_code.co_name in {"outcome", "call_function"}:
             return None
         where = f"{Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}" if trace else ""
         return f"{type(error).__name__}: {str(error)[:100]} ({where})"

@@ -54,7 +54,7 @@ def check_arguments(decorated: Decorated) -> Decorated:
         return decorated
 
     @functools.wraps(decorated)
-    def checked(*given: Any, **named: Any) -> Any:
+    def call_function(*given: Any, **named: Any) -> Any:
         for value in (*given, *named.values()):
             if isinstance(value, range):
                 _check_range(decorated, given, named)
@@ -66,7 +66,7 @@ def check_arguments(decorated: Decorated) -> Decorated:
                 _raise_in_words(decorated, given, named, error)
             raise
 
-    return cast("Decorated", checked)
+    return cast("Decorated", call_function)
 
 
 def _check_range(function: Callable[..., Any], given: Any, named: Any) -> None:
