@@ -25,6 +25,7 @@ from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, check_choice, check_threads, short_repr, whole_number
 
@@ -447,6 +448,7 @@ def differential_evolution_search(
     return GeneticRun(orders, coefficients, each, evaluations, problem.bounds)
 
 
+@check_arguments
 @dataclass(frozen=True, kw_only=True)
 class GeneticAlgorithm:
     """Genetic algorithm on the free run, the paper's baseline; for comparison only.

@@ -23,6 +23,7 @@ from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_li
 from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
 from ftlm.utils.statistics import NORMAL_95
@@ -141,6 +142,7 @@ class DesignTask:
     warnings: tuple[str, ...]
 
 
+@check_arguments
 def design_input(
     model: Identification | Model,
     *,

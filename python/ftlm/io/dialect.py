@@ -19,6 +19,7 @@ from ftlm.io.cell_parsing import (
     split_cells,
     unit_of,
 )
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import Placeholder, layout_fields, layout_parameter, parameter
 from ftlm.utils.validation import join_names, nearest, whole_number
 
@@ -35,6 +36,7 @@ SHEET_OPTIONS, TEXT_OPTIONS = (
 _MAX_SKIPPED_LINES = 1 << 40
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Layout:
     """Layout of a text file or sheet; options that are None are detected and reported as assumptions.
@@ -109,6 +111,7 @@ class Layout:
             raise DataError(f"{layout_fields('sheet')} is a {type(self.sheet).__name__}; give the name of a sheet")
 
     @classmethod
+    @check_arguments
     def of(cls, given: object) -> Layout:
         """Build a layout from an argument: None, a layout, or a mapping of its fields."""
         if given is None:
@@ -128,6 +131,7 @@ class Layout:
                 )
         return cls(**given)
 
+    @check_arguments
     def under(self, other: Layout) -> Layout:
         """Merge two layouts; options of the other one take precedence."""
         return replace(self, **other.to_dict())
@@ -136,6 +140,7 @@ class Layout:
         """Return the options that are set, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
+    @check_arguments
     def check_used(self, path: str, kind: str, used: tuple[str, ...]) -> None:
         """Raise if an option is set that this file format does not use."""
         unused = [option for option in self.to_dict() if option not in used]

@@ -22,6 +22,7 @@ from ftlm.io.delimited_text import read_text
 from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Layout
 from ftlm.io.isolated_reader import binary_format_of, read_isolated
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER, read_toml
 from ftlm.utils.parameters import NAMED_COLUMNS, parameter
 from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, join_names, names_to_columns, nearest
@@ -55,6 +56,7 @@ class ColumnSelection:
     layout: Layout
 
 
+@check_arguments
 def load(
     path: PathLike | Sequence[PathLike],
     *,

@@ -29,6 +29,7 @@ from ftlm.io.load import (
 )
 from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, flag_of, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
@@ -302,6 +303,7 @@ class OpenedFile:
         return words
 
 
+@check_arguments
 def open_file(
     path: PathLike,
     *,

@@ -18,6 +18,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
 from ftlm.simulation.discretization import equation_tuple
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import read_toml
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import join_names, nearest, short_repr
@@ -35,6 +36,7 @@ ROTATING_INERTIA_SHARE = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
 MAX_SUBSTEP_S = 1e-4
 
 
+@check_arguments
 @dataclass(frozen=True)
 class StageParameters:
     """Parameters of one joint of the simulated arm: orders and coefficients of the law, and Coulomb friction.
@@ -59,11 +61,13 @@ class StageParameters:
     mu: float
     coulomb: float = 0.0
 
+    @check_arguments
     def orders(self, stage: int) -> dict[str, float]:
         """Return the five free orders, by their names in the law."""
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
+    @check_arguments
     def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
         """Return the coefficients of both equations, by their names in the law."""
         h, k = 2 * stage - 1, 2 * stage
@@ -74,6 +78,7 @@ class StageParameters:
         return hub | {f"a{k}": -self.a * self.r, f"b{k}": -self.b, f"d{k}": -self.d * self.r, f"g{k}": -self.g}
 
 
+@check_arguments
 @dataclass(frozen=True)
 class ArmParameters:
     """Parameters of the simulated arm and its sensors.
@@ -130,6 +135,7 @@ class ArmParameters:
     name: str = "effective"
 
     @classmethod
+    @check_arguments
     def of(cls, given: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
         """Return a named parameter set, the set of a TOML file, or the argument itself.
 
@@ -209,6 +215,7 @@ class ArmParameters:
             )
         return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
 
+    @check_arguments
     def model(self, *, friction: bool = False) -> Model:
         """Return the model of the arm from currents to angles; with friction it equals the simulation of :meth:`arm`.
 
@@ -244,6 +251,7 @@ class ArmParameters:
         known = {n: v for n, v in orders.items() if n in structure.order_names}
         return Model(structure.with_orders(known).with_coefficients(coefficients), orders=known)
 
+    @check_arguments
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:
         """Return the simulated arm at rest, for runs of at most `horizon` s with samples of `step` s."""
         model = self.model()

@@ -13,6 +13,7 @@ import numpy as np
 from ftlm.errors import DataError, ModelError
 from ftlm.io.load import column_names, load
 from ftlm.rig.rig import CURRENT_LIMIT, MAX_RUN_DURATION_S, check_rate
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number, short_repr
 
@@ -22,6 +23,7 @@ CURRENT_SIGNALS = ("I1", "I2")
 _PAPER_SINE_RAD_S = 6.3
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Excitation:
     """Motor-current signal of an experiment.
@@ -55,6 +57,7 @@ class Excitation:
     seed: int = 0
     file: str | os.PathLike[str] | None = None
 
+    @check_arguments
     def commands(self, rate: float, duration: float) -> Floats:
         """Return the currents [A], shape (round(duration·rate) + 1, 2); the last row is zero.
 

@@ -30,6 +30,7 @@ from ftlm.simulation.simulate import comparison_records, respond
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, symbol_html
 from ftlm.utils.parameters import parameter
@@ -71,6 +72,7 @@ class Metrics:
 UNKNOWN_METRICS = Metrics(math.nan, math.nan, math.nan, math.nan)
 
 
+@check_arguments
 def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     """Return error (45), RMSE (46), NR (47) and fit of a prediction.
 
@@ -241,6 +243,7 @@ MISSING_SAMPLES_REASON = "not every sample of it was read, and the straight line
 HIDDEN_OFFSET_NOTE = "not told apart from what the run did before its start; begin the run at rest to learn it"
 
 
+@check_arguments
 def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
     """Return equation error and output error of a model on measured runs.
 
