@@ -327,7 +327,7 @@ import attack, ftlm
 run = attack.sample_run()
 equation = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
 found = ftlm.search_orders(
-    run, equation, ftlm.order_grid(step={step}), store={store!r}, m=64, pruning=False, threads=2
+    run, equation, ftlm.order_grid(increment={step}), store={store!r}, m=64, pruning=False, threads=2
 )
 print(found)
 """
@@ -376,7 +376,7 @@ call = lambda: ftlm.fractional_derivative(x, 0.5, step=0.1)
     "search of one equation": """
 run = ftlm.Run.from_arrays(inputs={"u": rng.standard_normal(2000)}, outputs={"y": rng.standard_normal(2000)}, step=0.01)
 equation = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
-call = lambda: ftlm.search_orders(run, equation, ftlm.order_grid(step=0.01))
+call = lambda: ftlm.search_orders(run, equation, ftlm.order_grid(increment=0.01))
 """,
     "identification": """
 run = ftlm.Run.from_arrays(inputs={"u": rng.standard_normal(4000)}, outputs={"y": rng.standard_normal(4000)}, step=0.01)
