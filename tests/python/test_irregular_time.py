@@ -88,3 +88,22 @@ def test_jitter_of_thirty_percent_leaves_intervals_that_cover_as_well() -> None:
     covered, errors = coverage(0.3)
     assert min(covered.values()) >= 27, covered
     assert np.abs(np.mean(errors, axis=0)).max() < 0.5
+
+
+@pytest.mark.parametrize("step", [0.01, 0.0125, 0.07])
+def test_regular_rows_on_another_step_are_no_more_data_than_they_are(step: float) -> None:
+    rng = np.random.default_rng(11)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 20), 15)
+    plain = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": np.zeros(u.size)}, step=0.05)
+    y = ftlm.Model(ftlm.equation(PLANT)).simulate(plain)["y"] + 0.02 * rng.standard_normal(u.size)
+    as_is, resampled = (
+        ftlm.identify(
+            ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=0.05, **more),
+            ftlm.equation("D^alpha y = a y + b u", initial="rest"),
+        )
+        for more in ({}, {"resample": step})
+    )
+    for name, error in as_is.standard_errors.items():
+        assert resampled.standard_errors[name] == pytest.approx(error, rel=0.02)
+    assert resampled.orders["alpha"] == pytest.approx(as_is.orders["alpha"], abs=0.1 * as_is.standard_errors["alpha"])
+    assert not [w for w in resampled.warnings if "not white" in w]

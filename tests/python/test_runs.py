@@ -482,8 +482,13 @@ def test_resample_of_a_run():
     np.testing.assert_allclose(finer["v"], np.linspace(-1, 1, 99), atol=1e-15)
     assert (finer.step, finer.length, finer.duration) == (0.005, 99, run.duration)
     assert (
-        "resampled from 0.01 s to 0.005 s (held: u, by means over the new intervals; others linear" in finer.warnings[0]
+        "resampled from 0.01 s to 0.005 s (held: u, by means over the new intervals; outputs keep their own times"
+        in finer.warnings[0]
     )
+    # Values between the rows are no measurements; every second row is.
+    np.testing.assert_array_equal(finer.sample_times.data["y"], run["y"])
+    assert run.resample(0.02).sample_times is None
+    assert run.resample(0.015).sample_times is not None
     back = finer.resample(0.01)
     for name in run.signals:
         np.testing.assert_allclose(back[name], run[name], atol=1e-15)
@@ -653,16 +658,16 @@ def test_csv_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
 
 
 def test_csv_holds_what_the_first_line_says(tmp_path):
-    make(units={"y": "deg"}, name="n").resample(0.005).to_csv(tmp_path / "a.csv")
+    make(units={"y": "deg"}, name="n").resample(0.02).to_csv(tmp_path / "a.csv")
     lines = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()
     assert lines[0].startswith("# ftlm-run 1 {")
     told = json.loads(lines[0].removeprefix("# ftlm-run 1 "))
     assert told["inputs"] == ["u"]
     assert told["units"] == {"u": "", "y": "rad"}
-    assert told["step"] == 0.005
+    assert told["step"] == 0.02
     assert len(told["warnings"]) == 1
     assert lines[1] == "t_s,u,y"
-    assert [line.split(",")[0] for line in lines[2:6]] == ["0.0", "0.005", "0.01", "0.015"]
+    assert [line.split(",")[0] for line in lines[2:6]] == ["0.0", "0.02", "0.04", "0.06"]
 
 
 # --- properties -------------------------------------------------------------------------------------------------------

@@ -28,10 +28,10 @@ from ftlm.data.sampling import (
     fill_input_gaps,
     grid_positions,
     has_too_few_values,
-    is_regular,
     missing_mask,
     regular_step,
     resample_uniform,
+    rows_coincide,
     uniform_times,
     window_rows,
 )
@@ -124,7 +124,7 @@ class RunArguments:
         if new_step is not None:
             step, since = new_step, times - times[0]
             whole = not any(np.isnan(data[s]).any() for s in self.outputs)
-            if whole and is_regular(since):
+            if whole and rows_coincide(since, new_step):
                 data = resample_uniform(since, data, behaviour, new_step)
                 facts += (describe_resampling(since, new_step, first, describe_interpolation(behaviour)),)
             else:

@@ -31,6 +31,7 @@ from ftlm.data.sampling import (
     make_read_only,
     missing_mask,
     resample_uniform,
+    rows_coincide,
     uniform_times,
     window_rows,
 )
@@ -155,9 +156,9 @@ class Run:
             Name of the run in reports.
         resample : float, optional
             Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
-            Recorded in `warnings`. Nonuniform or missing samples are kept in `sample_times`: the output error is
-            simulated with the original inputs and evaluated at the original output times. Equation-error methods use
-            the resampled signals.
+            Recorded in `warnings`. Unless every new row is an old one, the original samples are kept in `sample_times`:
+            the output error is simulated with the original inputs and evaluated at the original output times.
+            Equation-error methods use the resampled signals.
         window : pair of float or None, optional
             Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
@@ -390,6 +391,8 @@ class Run:
 
         Held inputs ("zoh") take their mean over each new interval, the exact integral of the hold. Inputs with "foh"
         and all outputs are interpolated linearly. No anti-alias filter is applied. `warnings` records the resampling.
+        Unless every new row is an old one, output-error fits and comparisons use the outputs as they were sampled, at
+        their own times: interpolated values are no measurements.
 
         Parameters
         ----------
@@ -411,7 +414,7 @@ class Run:
             self.sample_times,
             describe_interpolation(self._intersample),
         )
-        if readings is None and self.missing_samples:
+        if readings is None and (self.missing_samples or not rows_coincide(since, new_step)):
             readings = NonuniformSamples(since, self._data)
         if readings is None:
             data = resample_uniform(since, self._data, self._intersample, new_step)

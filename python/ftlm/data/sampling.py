@@ -346,10 +346,11 @@ def check_rows(since: Floats, step: float) -> int:
     return rows
 
 
-def is_regular(since: Floats) -> bool:
-    """Whether sample times are regular within the jitter tolerance."""
-    step = float(since[-1]) / (since.size - 1)
-    return bool(np.abs(since - uniform_times(since.size, step)).max() <= _MAX_JITTER_SHARE * step)
+def rows_coincide(since: Floats, step: float) -> bool:
+    """Whether sample times are regular and every row of the new step is one of them, so that no value is made up."""
+    own = float(since[-1]) / (since.size - 1)
+    regular = np.abs(since - uniform_times(since.size, own)).max() <= _MAX_JITTER_SHARE * own
+    return bool(regular) and abs(step / own - round(step / own)) * since.size <= _MAX_JITTER_SHARE and step > 0.5 * own
 
 
 def resample_uniform(
