@@ -733,3 +733,38 @@ def test_the_only_column_called_t_is_no_time_where_it_is_a_signal(tmp_path):
     scipy.io.savemat(tmp_path / "heat.mat", {"V": np.column_stack([np.arange(60.0), np.ones(60)])})
     with pytest.raises(DataError, match="no column is called t, time or seconds"):
         load(tmp_path / "heat.mat", inputs={"u": "V.1"}, outputs={"y": "V.2"})
+
+
+def matlab_object(name):
+    """Return the bytes of an object of MATLAB, such as a datetime, as version 5 writes it beside the variables."""
+
+    def element(kind, body):
+        return struct.pack("<II", kind, len(body)) + body + b"\0" * (-len(body) % 8)
+
+    def matrix(body):
+        return struct.pack("<II", 14, len(body)) + body
+
+    content = [
+        element(6, struct.pack("<II", 13, 0)),
+        element(5, struct.pack("<ii", 6, 1)),
+        element(1, b""),
+        element(6, struct.pack("<6I", 0xDD000000, 2, 1, 1, 1, 1)),
+    ]
+    words = [element(1, text) for text in (name.encode(), b"MCOS", b"datetime")]
+    return matrix(b"".join([element(6, struct.pack("<II", 17, 0)), *words, matrix(b"".join(content))]))
+
+
+def test_a_mat_file_is_read_beside_an_object_of_matlab(tmp_path):
+    variables = {"t": np.arange(40)[:, None] * 0.1, "u": np.ones((40, 1)), "y": np.sin(np.arange(40.0))[:, None]}
+    path = tmp_path / "run.mat"
+    scipy.io.savemat(path, variables)
+    plain = load(path, time="t", inputs=["u"], outputs=["y"])
+    path.write_bytes(path.read_bytes() + matlab_object("when"))
+    run = load(path, time="t", inputs=["u"], outputs=["y"])
+    for signal in ("u", "y"):
+        np.testing.assert_array_equal(run[signal], plain[signal])
+    # The object alone is no table.
+    scipy.io.savemat(path, {})
+    path.write_bytes(path.read_bytes() + matlab_object("when"))
+    with pytest.raises(DataError, match="object"):
+        load(path, time="t", inputs=["u"], outputs=["y"])

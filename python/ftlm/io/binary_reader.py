@@ -94,7 +94,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     wanted: dict[str, str] = {}
     size = 0
     seen: set[str] = set()
-    for name, shape, kind in matlab.whosmat(path):
+    for name, shape, kind in list_variables(matlab, path):
         if name in seen:
             raise UnreadableError(f"the variable {name!r} is in it twice")
         seen.add(name)
@@ -128,6 +128,28 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
         header["arrays"].append({"name": name, "rows": values.shape[0], "columns": values.shape[1], "type": kind})
         arrays.append(values)
     return header, arrays
+
+
+def list_variables(matlab: Any, path: str) -> list[tuple[str, tuple[int, ...], str]]:
+    """Return name, shape and class of every variable of a .mat file.
+
+    SciPy cannot list a file that holds an object, such as a datetime or a table, but can load it: it is loaded here
+    under the memory limit of this process, and the object, which has no name for SciPy, is listed as "object".
+    """
+    try:
+        return list(matlab.whosmat(path))
+    except TypeError:
+        loaded = matlab.loadmat(path, mat_dtype=False)
+        kinds = {"float64": "double", "float32": "single"}
+        return [
+            (
+                name,
+                value.shape,
+                kinds.get(value.dtype.name, value.dtype.name) if value.dtype.names is None else "object",
+            )
+            for name, value in loaded.items()
+            if not name.startswith("__")
+        ]
 
 
 def check_size(rows: int, columns: int) -> None:
