@@ -94,7 +94,11 @@ BAD = {
             words="D^alpha y = a D^b y + c D^e y + d D^f y + u", order_grid=ftlm.order_grid(increment=0.001)
         ),
     ),
-    "lattice with a step of 0": (MODEL, "order alpha: increment 0 is not positive", lambda: ftlm.order_grid(increment=0)),
+    "lattice with a step of 0": (
+        MODEL,
+        "order alpha: increment 0 is not positive",
+        lambda: ftlm.order_grid(increment=0),
+    ),
     "lattice of an unknown order": (
         MODEL,
         "order 'betta' of order_grid= is no free order; free are alpha, beta",
