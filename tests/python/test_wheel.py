@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -143,6 +144,30 @@ def test_every_pin_has_its_hashes_and_every_dependency_its_pin():
     # Wheels are made and checked with what made and checked them in the tests.
     assert {name: tested[name] for name in made if name in tested} == {n: v for n, v in made.items() if n in tested}
     assert set(made) - set(tested) == {"ziglang"}
+
+
+def test_a_package_has_one_floor_and_each_is_tried():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    found = WHEEL["floors"](project)
+    names = [re.fullmatch(r"([\w-]+)==[\d.]+", line)[1] for line in found]
+    assert len(set(names)) == len(names)
+    assert {"numpy", "typer", "rich", "scipy", "pygad", "uvicorn"} <= set(names)
+    assert "ruff" not in names
+    recipe = re.search(r"^wheel-test:.*?\n\n", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    assert "wheel.py --floors" in recipe[0]
+    assert "wheel.py --commands" in recipe[0]
+
+
+@pytest.mark.skipif(shutil.which("cargo") is None, reason="needs cargo")
+def test_rust_is_as_new_as_the_newest_crate_needs():
+    words = ["cargo", "metadata", "--offline", "--locked", "--all-features", "--format-version", "1"]
+    ended = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    if ended.returncode:
+        pytest.skip(f"cargo has not all crates: {ended.stderr[-200:]}")
+    needed = {p["name"]: p["rust_version"] or "0" for p in json.loads(ended.stdout)["packages"]}
+    own = needed.pop("ftlm")
+    newest = max(needed.values(), key=lambda version: [*map(int, version.split("."))])
+    assert [*map(int, own.split("."))] == [*map(int, newest.split("."))][:2], needed
 
 
 def test_hosted_machines_are_told_what_there_is():
