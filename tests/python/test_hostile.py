@@ -93,6 +93,23 @@ def test_a_file_that_is_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch,
     assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
 
 
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("force", [True, False])
+def test_a_save_that_is_refused_leaves_nothing(tmp_path, monkeypatch, links, force):
+    def refuse(*_, **__):
+        raise PermissionError(13, "not here")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    if links and not force:
+        assert write_atomically(tmp_path / "a", b"ours", force=force).read_bytes() == b"ours"
+        return
+    with pytest.raises(ftlm.DataError, match="cannot be written"):
+        write_atomically(tmp_path / "a", b"ours", force=force)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_without_links_takes_files_too(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "link", lambda *_, **__: (_ for _ in ()).throw(PermissionError("no links here")))
     assert write_atomically(tmp_path / "a", b"ours", force=False).read_bytes() == b"ours"

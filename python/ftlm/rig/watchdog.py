@@ -124,9 +124,16 @@ def start(page: RegisterPage, *, keep: bool, patience: float = 10.0) -> subproce
         The process could not be started.
     """
     command = [sys.executable, "-I", "-S", __file__, str(page.path), "keep" if keep else "remove"]
-    # A separate session, so that Ctrl-C does not reach the watchdog.
+    # A separate session, and on Windows a console, so that Ctrl-C and Ctrl-Break do not reach the watchdog.
     nothing = subprocess.DEVNULL
-    process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
+    process = subprocess.Popen(
+        command,
+        stdin=nothing,
+        stdout=nothing,
+        stderr=nothing,
+        start_new_session=True,
+        creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+    )
     until = time.monotonic() + patience
     try:
         while not page.get("ready"):
