@@ -294,20 +294,25 @@ def test_numpys_interface_is_there_before_a_ctrl_c_can_arrive():
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted in /proc")
-def test_ctrl_c_does_not_wait_for_a_transform():
-    x = np.random.default_rng(0).standard_normal(1 << 22)
+@pytest.mark.parametrize(
+    "transform",
+    [lambda x: ftlm.fractional_integral(x, 0.5, step=0.1), ftlm.haar_transform, ftlm.haar_inverse],
+    ids=["integral", "haar", "inverse"],
+)
+def test_ctrl_c_does_not_wait_for_a_transform(transform):
+    x = np.random.default_rng(0).standard_normal(1 << 23)
     kept = signal.signal(signal.SIGINT, signal.default_int_handler)
     before = len(os.listdir("/proc/self/task"))
     timer = threading.Timer(0.1, signal.raise_signal, [signal.SIGINT])
     timer.start()
 
-    def integrals():
+    def transforms():
         for _ in range(100):
-            ftlm.fractional_integral(x, 0.5, step=0.1)
+            transform(x)
 
     try:
         with pytest.raises(KeyboardInterrupt):
-            integrals()
+            transforms()
     finally:
         signal.signal(signal.SIGINT, kept)
     # What it was computing is still being computed, and nobody waits for it.
