@@ -24,7 +24,9 @@ POSIX_ONLY = re.compile(
     r"from test_(cli|store|rig_safety) "
 )
 if os.name == "nt":
-    collect_ignore = [p.name for p in Path(__file__).parent.glob("test_*.py") if POSIX_ONLY.search(p.read_text("utf-8"))]
+    collect_ignore = [
+        p.name for p in Path(__file__).parent.glob("test_*.py") if POSIX_ONLY.search(p.read_text("utf-8"))
+    ]
 
 # The same examples in every run, and no clock.
 settings.register_profile("ftlm", derandomize=True, deadline=None)

@@ -153,7 +153,9 @@ def test_a_package_has_one_floor_and_each_is_tried():
     assert len(set(names)) == len(names)
     assert {"numpy", "typer", "rich", "scipy", "pygad", "uvicorn"} <= set(names)
     assert "ruff" not in names
-    recipe = re.search(r"^wheel-test:.*?\n\n", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    recipe = re.search(
+        r"^wheel-test:.*?\n\n", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
     assert "wheel.py --floors" in recipe[0]
     assert "wheel.py --commands" in recipe[0]
 

@@ -411,8 +411,8 @@ def simulated_panel(
 ) -> Panel:
     """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
 
-    Without an order grid there are neither; with ``has_contests=False`` there are no contests. Before each step `begin` is
-    called with what it is, a key of `ftlm.reproduction.stage_models.STEPS`.
+    Without an order grid there are neither; with ``has_contests=False`` there are no contests. Before each step `begin`
+    is called with what it is, a key of `ftlm.reproduction.stage_models.STEPS`.
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
