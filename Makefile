@@ -105,19 +105,25 @@ wheels-twice: $(ZIG)/.tools
 		$(MAKE) -C $$folder/$$copy wheels ZIG=$(abspath $(ZIG)) WHEELS="$(WHEELS)" || exit 1; done && \
 	for made in $$folder/one/wheels/*; do cmp $$made $$folder/two/deeper/wheels/$${made##*/} || exit 1; done
 
-# The wheel alone, in environments that have nothing else: what a user gets from pip. PYTHONS names several.
+# The wheel alone, in environments that have nothing else: what a user gets from pip. PYTHONS names several. At last with
+# the lowest versions that pyproject.toml allows.
 PYTHONS ?= $(PYTHON)
 wheel-test: wheel
 	for python in $(PYTHONS); do rm -rf $(VENV)-wheel && $$python -m venv $(VENV)-wheel && \
 		$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl && \
 		(cd wheels && ../$(VENV)-wheel/bin/ftlm doctor && ../$(VENV)-wheel/bin/ftlm demo --increment 0.1 -o demo --force) || \
 		exit 1; done
+	rm -rf $(VENV)-floors && $(PYTHON) -m venv $(VENV)-floors
+	$(BIN)/python tests/wheel.py --floors > wheels/floors.txt
+	$(VENV)-floors/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: -r wheels/floors.txt wheels/*.whl
+	cd wheels && ../$(VENV)-floors/bin/python ../tests/wheel.py --commands
 	$(BIN)/python -m abi3audit --strict wheels/*.whl
 ifeq ($(shell uname -s),Linux)
 	$(BIN)/auditwheel show --json wheels/*.whl | $(BIN)/python tests/wheel.py
 	$(BIN)/python tests/wheel.py --holds wheels/*.whl
 endif
-	rm -rf $(VENV)-wheel wheels/demo
+	rm -rf $(VENV)-wheel $(VENV)-floors
+	find wheels -mindepth 1 ! -name '*.whl' -delete
 
 # The source distribution alone builds and works, in an environment that has only pip; Rust is needed.
 sdist-test: $(VENV)/.tools
@@ -129,4 +135,4 @@ sdist-test: $(VENV)/.tools
 	rm -rf $(VENV)-sdist sdist
 
 clean:
-	rm -rf $(VENV) $(VENV)-wheel $(VENV)-sdist $(ZIG) wheels sdist demo target docs/_build docs/_pictures
+	rm -rf $(VENV) $(VENV)-wheel $(VENV)-floors $(VENV)-sdist $(ZIG) wheels sdist demo target docs/_build docs/_pictures

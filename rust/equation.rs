@@ -296,6 +296,9 @@ impl Structure {
     }
 
     /// Integration order α − ν of term k. Negative values differentiate.
+    ///
+    /// # Panics
+    /// If there is no term k.
     #[must_use]
     pub fn integration(&self, k: usize) -> f64 {
         tidy(self.order - self.terms[k].order)
@@ -350,7 +353,7 @@ pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
     }
 }
 
-fn missing_signal_error(signal: usize, signals: usize) -> Error {
+pub(crate) fn missing_signal_error(signal: usize, signals: usize) -> Error {
     Error::Structure {
         what: format!("the equation names signal {signal}, but the record holds {signals}"),
         remedy: "give the record all signals of the equation".into(),
@@ -363,20 +366,35 @@ fn whole_below(order: f64) -> impl Iterator<Item = f64> {
 }
 
 /// Order rounded to the resolution, so that equal orders have equal bits.
+///
+/// Numbers beyond 9·10⁶, which are farther apart than the resolution, and NaN are returned as they are.
+///
+/// ```
+/// assert_eq!(ftlm::equation::tidy(0.1 + 0.2), 0.3);
+/// assert_eq!(ftlm::equation::tidy(1e12), 1e12);
+/// ```
 #[must_use]
 pub fn tidy(order: f64) -> f64 {
-    let units = grains(order);
-    #[allow(clippy::cast_precision_loss)]
-    let tidied = units as f64 / 1e9;
-    tidied
+    const EXACT: f64 = 9_007_199_254_740_992.0; // 2⁵³
+    let units = (order * 1e9).round();
+    if units.abs() < EXACT {
+        // Of −0 as well, so that equal orders have equal bits.
+        units / 1e9 + 0.0
+    } else {
+        order
+    }
 }
 
-/// Order as an integer multiple of the resolution: the key of its regressor.
+/// Order as an integer multiple of the resolution: the key of its regressor. Saturates beyond 9·10⁹; 0 for NaN.
 #[must_use]
 #[allow(clippy::cast_possible_truncation)]
 pub fn grains(order: f64) -> i64 {
     (order * 1e9).round() as i64
 }
+
+/// Largest size of an order law within the bounds of its free orders. The sum of several may exceed an order's own range,
+/// which is checked at every point; tables by whole order need memory in proportion to it.
+pub const MAX_REACHED_ORDER: f64 = 100.0;
 
 /// An affine order law: constant + Σ weight·free order.
 #[derive(Debug, Clone, PartialEq)]
@@ -388,6 +406,26 @@ pub struct AffineOrder {
 }
 
 impl AffineOrder {
+    /// Check that there is a weight for each free order, and that no order within their bounds is extreme.
+    ///
+    /// # Errors
+    /// [`Error::Length`] for other weights than free orders; [`Error::OutOfRange`] for an order that may exceed
+    /// [`MAX_REACHED_ORDER`] in size.
+    pub fn check(&self, bounds: &[(f64, f64)]) -> Result<()> {
+        check_length("weights of an order", bounds.len(), self.weights.len())?;
+        let free = self.weights.iter().zip(bounds).map(|(w, (low, high))| w.abs() * low.abs().max(high.abs()));
+        let size = self.constant.abs() + free.sum::<f64>();
+        if size <= MAX_REACHED_ORDER {
+            return Ok(());
+        }
+        Err(Error::OutOfRange {
+            name: "size of an order within its bounds".into(),
+            value: size,
+            range: format!("[0, {MAX_REACHED_ORDER}]"),
+            remedy: format!("bound free orders by {MIN_INPUT_ORDER} and {MAX_ORDER}"),
+        })
+    }
+
     /// Value at these free orders.
     #[must_use]
     pub fn at(&self, free: &[f64]) -> f64 {

@@ -29,7 +29,7 @@ pub enum Error {
         found: usize,
     },
     /// A value is out of range.
-    #[error("{name} = {value} is outside {range}; {remedy}")]
+    #[error("{name} = {} is outside {range}; {remedy}", format_number(*value))]
     OutOfRange {
         /// Name of the argument.
         name: String,
@@ -91,7 +91,7 @@ pub enum Error {
         limit: u128,
     },
     /// Working memory of a search over its limit.
-    #[error("{what} need {bytes} bytes, more than the {limit} that a search may take; take a smaller m, a larger step, narrower intervals or fewer runs at once, or allow more by FTLM_MEMORY")]
+    #[error("{what} need {bytes} bytes, more than the {limit} that a search may take; take a smaller m, a larger step, narrower intervals or fewer runs at once, or allow more")]
     Memory {
         /// Data that need the memory.
         what: String,
@@ -208,6 +208,32 @@ pub fn check_length(name: &str, expected: usize, found: usize) -> Result<()> {
         Ok(())
     } else {
         Err(Error::Length { name: name.to_owned(), expected, found })
+    }
+}
+
+/// Return an error for a result of operations in the step that overflows.
+///
+/// # Errors
+/// [`Error::OutOfRange`].
+pub(crate) fn check_overflow(result: &[f64], step: f64) -> Result<()> {
+    if result.iter().all(|v| v.is_finite()) {
+        return Ok(());
+    }
+    Err(Error::OutOfRange {
+        name: "step".into(),
+        value: step,
+        range: "the steps for which the result is finite".into(),
+        remedy: "measure time, or the signal, in another unit".into(),
+    })
+}
+
+/// Number as text; an extreme one has an exponent in place of hundreds of zeros.
+fn format_number(value: f64) -> String {
+    let plain = value == 0.0 || !value.is_finite() || (1e-9..1e16).contains(&value.abs());
+    if plain {
+        format!("{value}")
+    } else {
+        format!("{value:e}")
     }
 }
 

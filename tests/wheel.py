@@ -6,11 +6,16 @@ With --holds, that it brings license and notices; with --nameless also that it n
 was made, as wheels for others must not.
 
 python tests/wheel.py --holds wheels/*.whl
+
+With --floors it prints the lowest versions that ftlm promises to work with, as requirements; with --commands it runs
+commands of the ftlm of its Python in the working folder, every reader and plot among them.
 """
 
 import json
 import os
+import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -87,7 +92,59 @@ def lacks(path, folders):
     return told
 
 
+#: Extras of those who change ftlm; what they install is pinned.
+TOOLS = {"docs", "test"}
+
+
+def floors(project):
+    """Requirements of the lowest versions in a [project] table."""
+    extras = project["optional-dependencies"]
+    asked = {*project["dependencies"], *(each for name in extras.keys() - TOOLS for each in extras[name])}
+    return sorted(each.replace(">=", "==") for each in asked)
+
+
+#: Writes a run of a small model in every format whose library has a floor.
+RUNS = """
+import distributed, h5py, numpy as np, scipy.io, uvicorn, ftlm, ftlm.sklearn
+u = np.where(np.arange(401) % 160 < 90, 1.0, -0.6)
+model = ftlm.Model(ftlm.equation("D^1.6 y = -3 D^0.6 y - 8 y + 5 u"))
+run = model.simulate(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u}))
+table = {"t": run.time, "u": run["u"], "y": run["y"]}
+run.to_csv("run.csv"), run.to_parquet("run.parquet"), scipy.io.savemat("run.mat", table)
+with h5py.File("run.h5", "w") as file:
+    for name, values in table.items():
+        file[name] = values
+"""
+EQUATION = "D^alpha y = a1 D^nu y + a0 y + b0 u"
+COMMANDS = [
+    ["--help"],
+    ["identify", "--help-all"],
+    ["doctor"],
+    *(["inspect", f"run.{ending}", "-u", "u", "-y", "y"] for ending in ("csv", "parquet", "mat", "h5")),
+    ["identify", "run.csv", "--structure", EQUATION, "-o", "model.json", "--report", "report.html", "--force"],
+    ["identify", "run.csv", "--structure", EQUATION, "--method", "genetic", "--evaluations", "400"],
+    ["compare", "model.json", "run.csv"],
+    ["plot", "model.json", "--kind", "bode", "-o", "bode.png", "--force"],
+    ["export", "model.json", "--to", "control", "--band", "0.1:100", "-o", "model.py", "--force"],
+    ["demo", "--increment", "0.25", "-o", "demo", "--force"],
+]
+
+
+def run_commands():
+    """Fails with the words of the first command that fails."""
+    for words in (["-c", RUNS], *(["-m", "ftlm", *words] for words in COMMANDS)):
+        ended = subprocess.run([sys.executable, "-W", "ignore", *words], capture_output=True, text=True, check=False)
+        if ended.returncode:
+            sys.exit(f"{' '.join(words)}: exit {ended.returncode}\n{ended.stdout}{ended.stderr}")
+
+
 if __name__ == "__main__":
+    if sys.argv[1:] == ["--floors"]:
+        print("\n".join(floors(tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))["project"])))
+        sys.exit()
+    if sys.argv[1:] == ["--commands"]:
+        run_commands()
+        sys.exit()
     if sys.argv[1:2] in (["--holds"], ["--nameless"]):
         named = folders() if sys.argv[1] == "--nameless" else []
         sys.exit("\n".join(f"{path}: {words}" for path in sys.argv[2:] for words in lacks(path, named)) or None)

@@ -86,18 +86,25 @@ impl Regression {
     }
 
     /// Convert a solution (free coefficients, then initial terms by record) to an [`Estimate`].
-    #[must_use]
-    pub fn estimate(&self, solution: &[f64], dropped: &[usize]) -> Estimate {
+    ///
+    /// # Errors
+    /// [`Error::Length`] for a solution of another length; [`Error::Structure`] for a dropped column that is no initial
+    /// term.
+    pub fn estimate(&self, solution: &[f64], dropped: &[usize]) -> Result<Estimate> {
+        let first = self.free_count();
+        let count = first + (self.starts.len() - 1) * self.exponents.len();
+        check_length("solution", count, solution.len())?;
+        if let Some(index) = dropped.iter().find(|index| !(first..count).contains(index)) {
+            let what = format!("column {index} is no initial term of {first} to {count}");
+            return Err(Error::Structure { what, remedy: "drop initial terms only".into() });
+        }
         let mut free = solution.iter();
         let coefficients = self.fixed.iter().map(|f| f.or_else(|| free.next().copied()).unwrap_or(0.0)).collect();
         let width = self.exponents.len();
         let rest: Vec<f64> = free.copied().collect();
         let initial = (0..self.starts.len() - 1).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
-        let dropped = dropped
-            .iter()
-            .map(|&d| (d - self.free_count()) / width.max(1))
-            .zip(dropped.iter().map(|&d| (d - self.free_count()) % width.max(1)));
-        Estimate { coefficients, initial, exponents: self.exponents.clone(), dropped: dropped.collect() }
+        let dropped = dropped.iter().map(|&index| ((index - first) / width, (index - first) % width)).collect();
+        Ok(Estimate { coefficients, initial, exponents: self.exponents.clone(), dropped })
     }
 }
 
@@ -127,7 +134,7 @@ impl Regression {
 pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Estimate> {
     let regression = Regression::new(records, structure, fixed, initial)?;
     let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free_count())?;
-    Ok(regression.estimate(&solution, &dropped))
+    regression.estimate(&solution, &dropped)
 }
 
 /// Solve argmin ‖target − Σ x_k column_k‖ by QR.

@@ -119,7 +119,7 @@ pub fn closed_form(
     if let Some(&index) = dropped.iter().find(|&&d| d < regression.free_count()) {
         return Err(Error::Singular { index, count: k });
     }
-    Ok(regression.estimate(&solution, &dropped))
+    regression.estimate(&solution, &dropped)
 }
 
 /// Run the recursion (44) from X₀ = 0; return the last estimate and the coefficients after every step.
@@ -148,10 +148,10 @@ pub fn recursion(
             state
                 .step(innovations)
                 .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;
-            trace.push(regression.estimate(state.coefficients(), &[]).coefficients);
+            trace.push(regression.estimate(state.coefficients(), &[])?.coefficients);
         }
     }
-    Ok((regression.estimate(state.coefficients(), &[]), trace))
+    Ok((regression.estimate(state.coefficients(), &[])?, trace))
 }
 
 fn regression_in_basis(

@@ -6,7 +6,7 @@
 //! replace them and match its first four moments. Rates do not depend on q, so all orders of one signal share its
 //! states.
 
-use crate::error::{check_finite, Error, Result};
+use crate::error::{check_finite, check_overflow, Error, Result};
 
 /// Lowest rate of the rule times the longest lag. Below it four moments suffice (1e−3⁴/4! < 1e−13).
 const LOWEST_RATE_TIMES_LAG: f64 = 1e-3;
@@ -164,5 +164,6 @@ pub fn integral_by_memory(x: &[f64], order: f64, step: f64, tolerance: f64) -> R
         }
         out[n] = value;
     }
+    check_overflow(&out, step)?;
     Ok((out, past.len()))
 }

@@ -1,6 +1,6 @@
 //! Fractional integrals and derivatives of uniformly sampled signals.
 
-use crate::error::{check_finite, check_step, Error, Result};
+use crate::error::{check_finite, check_overflow, check_step, Error, Result};
 use crate::fractional::kernels::{block_pulse_kernel, check_order, grunwald_letnikov_weights, SecondDifferences};
 use crate::series;
 
@@ -33,7 +33,7 @@ pub enum Derivative {
 /// I^η of uniformly sampled `x`, lower limit at the first sample.
 ///
 /// # Errors
-/// An order outside [0, 10], a step that is not positive, or a value that is not finite.
+/// An order outside [0, 10], a step that is not positive, a value that is not finite, or an integral that overflows.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -52,13 +52,13 @@ pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -
     if eta == 0.0 || m == 0 {
         return Ok(x.to_vec());
     }
-    match rule {
-        IntegralRule::BlockPulse => Ok(series::multiply(&block_pulse_kernel(eta, m, step), x, m)),
+    let integral = match rule {
+        IntegralRule::BlockPulse => series::multiply(&block_pulse_kernel(eta, m, step), x, m),
         IntegralRule::GrunwaldLetnikov => {
             let scale = libm::pow(step, eta);
             let mut out = series::multiply(&grunwald_letnikov_weights(-eta, m), x, m);
             out.iter_mut().for_each(|v| *v *= scale);
-            Ok(out)
+            out
         }
         IntegralRule::Trapezoidal => {
             let differences = SecondDifferences::new(eta);
@@ -71,9 +71,11 @@ pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -
             if let Some(first) = out.first_mut() {
                 *first = 0.0;
             }
-            Ok(out)
+            out
         }
-    }
+    };
+    check_overflow(&integral, step)?;
+    Ok(integral)
 }
 
 /// Trapezoidal weight of the first sample at point n: `(n−1)^{η+1} − (n−1−η) n^η`.
@@ -96,8 +98,8 @@ fn first_sample_weight(eta: f64, n: usize) -> f64 {
 /// differences of the samples.
 ///
 /// # Errors
-/// An order outside [0, 3], a step that is not positive, a value that is not finite, or fewer samples than the
-/// differences need (⌈α⌉ + 2).
+/// An order outside [0, 3], a step that is not positive, a value that is not finite, a derivative that overflows, or
+/// fewer samples than the differences need (⌈α⌉ + 2).
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -134,6 +136,7 @@ pub fn fractional_derivative(
         let scale = libm::pow(step, -alpha);
         let mut out = series::multiply(&grunwald_letnikov_weights(alpha, m), x, m);
         out.iter_mut().for_each(|v| *v *= scale);
+        check_overflow(&out, step)?;
         return Ok(out);
     }
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]

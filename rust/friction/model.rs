@@ -115,7 +115,7 @@ impl FrictionModel {
     /// Return an error for an inconsistent model, or for experiments that do not fit it.
     ///
     /// # Errors
-    /// [`Error::Structure`], [`Error::Length`].
+    /// [`Error::Structure`], [`Error::Length`]; as [`AffineOrder::check`](crate::equation::AffineOrder::check).
     pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
         let refuse = |what: &str, remedy: &str| Err(Error::Structure { what: what.into(), remedy: remedy.into() });
         let Some(signals) = experiments.iter().map(|e| e.record.len()).min() else {
@@ -150,7 +150,7 @@ impl FrictionModel {
         }
         for equation in &self.equations {
             for order in equation.terms.iter().map(|t| &t.1).chain([&equation.order]) {
-                check_length("weights of an order", self.order_bounds.len(), order.weights.len())?;
+                order.check(&self.order_bounds)?;
             }
         }
         for experiment in experiments {

@@ -17,7 +17,12 @@ impl From<Error> for PyErr {
             Kind::Internal => "InternalError",
             Kind::Interrupted => return PyKeyboardInterrupt::new_err(()),
         };
-        raise(class, error.to_string())
+        let message = match error {
+            // The limit of a search is an argument in Rust, and an environment variable here.
+            Error::Memory { .. } => format!("{error} by FTLM_MEMORY"),
+            _ => error.to_string(),
+        };
+        raise(class, message)
     }
 }
 

@@ -25,7 +25,7 @@ fn choice(name: &str, given: &str, known: &str) -> Error {
 #[pyfunction]
 #[pyo3(signature = (order, m, step, *, derivative = false))]
 pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, derivative: bool) -> PyResult<Array<'_>> {
-    let kernel = run_detached(py, || {
+    let kernel = run_interruptible(py, m, None, move |_| {
         check_points("m", m)?;
         kernels::check_order("order", order)?;
         check_step(step)?;
@@ -40,7 +40,7 @@ pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, deriv
 
 #[pyfunction]
 pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResult<Array<'_>> {
-    let weights = run_detached(py, || {
+    let weights = run_interruptible(py, m, None, move |_| {
         check_points("m", m)?;
         Ok(kernels::grunwald_letnikov_weights(order, m))
     })?;
@@ -63,14 +63,16 @@ fn map_rows<'py>(
     work: fn(&mut [f64]) -> crate::error::Result<()>,
 ) -> PyResult<Matrix<'py>> {
     let mut all = rows(x)?;
-    let all = run_detached(py, || {
+    let points = all.iter().map(Vec::len).sum();
+    let all = run_interruptible(py, points, None, move |stop| {
         for row in &mut all {
+            stop.check()?;
             check_finite("x", row)?;
             work(row)?;
         }
         Ok(all)
     })?;
-    stack_rows(py, &all)
+    join_rows(py, all, columns(x))
 }
 
 #[pyfunction]

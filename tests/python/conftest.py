@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 # Workers of the suite share the processor's cores: threads of each would wait for one another. Read when NumPy loads.
@@ -16,6 +17,16 @@ import ftlm
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "reference"
+
+#: What Windows lacks, and the files of tests that need it.
+POSIX_ONLY = re.compile(
+    r"fcntl|import (pty|resource)|os\.fork|os\.kill|SIG(KILL|INT|TERM|HUP)|mkfifo|preexec_fn|/(proc|dev)/|"
+    r"from test_(cli|store|rig_safety) "
+)
+if os.name == "nt":
+    collect_ignore = [
+        p.name for p in Path(__file__).parent.glob("test_*.py") if POSIX_ONLY.search(p.read_text("utf-8"))
+    ]
 
 # The same examples in every run, and no clock.
 settings.register_profile("ftlm", derandomize=True, deadline=None)

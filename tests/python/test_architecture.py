@@ -231,6 +231,8 @@ def careless_processes(source):
         if isinstance(n, (ast.Import, ast.ImportFrom))
         and {name.split(".")[0] for name in (*(a.name for a in n.names), getattr(n, "module", None) or "")}
         & {"multiprocessing", "pty"}
+        # It starts nothing.
+        and [a.name for a in n.names] != ["parent_process"]
     ]
 
 
@@ -259,12 +261,40 @@ def test_every_process_is_started_in_one_way():
         ("from subprocess import run", 1),
         ("import multiprocessing.pool", 1),
         ("from multiprocessing import Process", 1),
+        ("from multiprocessing import parent_process", 0),
         ("from concurrent.futures import ProcessPoolExecutor as P\nProcessPoolExecutor(2)", 1),
         ("rig.run(commands)", 0),
     ],
 )
 def test_the_check_for_processes_finds_them(source, count):
     assert len(careless_processes(source)) == count
+
+
+def private_names(source):
+    """Private names of other packages that a module uses, as dotted names."""
+    tree, found, modules = ast.parse(source), [], {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            modules |= {a.asname or a.name.partition(".")[0]: a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level and node.module != "__future__":
+            modules |= {a.asname or a.name: f"{node.module}.{a.name}" for a in node.names}
+    found += modules.values()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            names = ast.unparse(node).split(".")
+            found += [".".join([modules[names[0]], *names[1:]])] if names[0] in modules else []
+    private = re.compile(r"(?!ftlm\.)[\w.]*\._(?!_)[\w.]*")
+    return sorted({name for name in found if private.fullmatch(name)})
+
+
+def test_no_private_name_of_a_library_is_used():
+    assert private_names("import typer.core as c\nc.TyperOption._parse\nfrom a import _b") == [
+        "a._b",
+        "typer.core.TyperOption._parse",
+    ]
+    used = {name for path in PYTHON for name in private_names(path.read_text(encoding="utf-8"))}
+    # Documented, despite its name.
+    assert used <= {"os._exit"}
 
 
 def test_importing_the_package_imports_little():

@@ -11,12 +11,14 @@ import sys
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 import ftlm
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.order_search import batches
+from ftlm.order_search.checkpoint import SEARCH_FILE, FrameFile
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 
@@ -340,3 +342,59 @@ def test_an_executor_that_fails_is_the_error_of_each_run(small_run):
 def test_what_is_no_run_is_refused(runs):
     with pytest.raises(ModelError, match="run"):
         ftlm.identify_many(runs, ftlm.equation("D^1.6 y = a y + b u"))
+
+
+#: A search with a store on workers of a method; the first report writes their process numbers.
+SEARCH_ON_WORKERS = """
+import multiprocessing, os, sys
+from concurrent.futures import ProcessPoolExecutor
+import numpy as np
+import ftlm
+
+def report(done, total):
+    if done > 0 and not os.path.exists("pids"):
+        open("new", "w").write(" ".join(str(p.pid) for p in multiprocessing.active_children()))
+        os.rename("new", "pids")
+
+if __name__ == "__main__":
+    t = np.arange(2049) * 0.02
+    u = np.sign(np.sin(1.3 * t))
+    run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": ftlm.fractional_integral(u, 1.4, step=0.02)}, step=0.02)
+    equation = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(sys.argv[1])) as pool:
+        ftlm.search_orders(
+            run, equation, ftlm.order_grid(increment=0.02), m=1024, executor=pool, store="a.ftlm", progress=report)
+"""
+
+
+def is_running(process):
+    try:
+        return (Path("/proc") / str(process) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_killed_search_leaves_neither_a_lock_nor_workers(tmp_path, method):
+    (tmp_path / "search.py").write_text(SEARCH_ON_WORKERS)
+    words = [sys.executable, "-W", "ignore", "search.py", method]
+    with subprocess.Popen(words, cwd=tmp_path, stderr=subprocess.DEVNULL) as process:
+        until = time.monotonic() + 120
+        while not (tmp_path / "pids").exists():
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        process.kill()
+    # In the moment of the kill, while the workers may live.
+    FrameFile(tmp_path / "a.ftlm", SEARCH_FILE, create=False).close()
+    workers = [int(word) for word in (tmp_path / "pids").read_text().split()]
+    assert workers
+    try:
+        until = time.monotonic() + 20
+        while any(map(is_running, workers)):
+            assert time.monotonic() < until, "workers outlive their search"
+            time.sleep(0.05)
+    finally:
+        for worker in filter(is_running, workers):
+            os.kill(worker, signal.SIGKILL)

@@ -94,6 +94,23 @@ def test_a_file_that_is_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch,
     assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
 
 
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("force", [True, False])
+def test_a_save_that_is_refused_leaves_nothing(tmp_path, monkeypatch, links, force):
+    def refuse(*_, **__):
+        raise PermissionError(13, "not here")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    if links and not force:
+        assert write_atomically(tmp_path / "a", b"ours", force=force).read_bytes() == b"ours"
+        return
+    with pytest.raises(ftlm.DataError, match="cannot be written"):
+        write_atomically(tmp_path / "a", b"ours", force=force)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_without_links_takes_files_too(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "link", lambda *_, **__: (_ for _ in ()).throw(PermissionError("no links here")))
     assert write_atomically(tmp_path / "a", b"ours", force=False).read_bytes() == b"ours"
@@ -348,20 +365,25 @@ def test_numpys_interface_is_there_before_a_ctrl_c_can_arrive():
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted in /proc")
-def test_ctrl_c_does_not_wait_for_a_transform():
-    x = np.random.default_rng(0).standard_normal(1 << 22)
+@pytest.mark.parametrize(
+    "transform",
+    [lambda x: ftlm.fractional_integral(x, 0.5, step=0.1), ftlm.haar_transform, ftlm.haar_inverse],
+    ids=["integral", "haar", "inverse"],
+)
+def test_ctrl_c_does_not_wait_for_a_transform(transform):
+    x = np.random.default_rng(0).standard_normal(1 << 23)
     kept = signal.signal(signal.SIGINT, signal.default_int_handler)
     before = len(os.listdir("/proc/self/task"))
     timer = threading.Timer(0.1, signal.raise_signal, [signal.SIGINT])
     timer.start()
 
-    def integrals():
+    def transforms():
         for _ in range(100):
-            ftlm.fractional_integral(x, 0.5, step=0.1)
+            transform(x)
 
     try:
         with pytest.raises(KeyboardInterrupt):
-            integrals()
+            transforms()
     finally:
         signal.signal(signal.SIGINT, kept)
     # What it was computing is still being computed, and nobody waits for it.

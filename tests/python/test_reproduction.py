@@ -3,6 +3,7 @@
 import json
 import math
 import signal
+import sys
 import threading
 from dataclasses import replace
 
@@ -526,6 +527,30 @@ def test_what_cannot_be_done_is_said_before_any_work(tmp_path, words, code, mess
     assert ran.stdout == ""
     assert (tmp_path / "there.html").read_text() == "mine"
     assert not (tmp_path / "paper.html").exists()
+
+
+@pytest.mark.parametrize("absent", ["pygad", "scipy.optimize"])
+def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reproduction, tmp_path, monkeypatch, absent):
+    def stage_without_searches(work, genetic):
+        return replace(reproduction.stages[work.number], rivals=work.rivals(genetic))
+
+    monkeypatch.setattr("ftlm.reproduction.stage_models.StageWork.compute_stage", stage_without_searches)
+    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
+    monkeypatch.setitem(sys.modules, absent, None)
+    lines = []
+    found = ftlm.reproduce(increment=0.25, arms=["whole orders"], records=1, log=lines.append)
+    assert lines[0].startswith("Tables 6 and 7 and Figure 11 are left out: ")
+    assert "pip install 'ftlm[genetic]'" in lines[0]
+    assert found.notes.count(lines[0]) == 1
+    assert found.rivals == {}
+    assert found.panel.contests == ()
+    # The joint fits of the other arm do not need the optimizers.
+    assert {c.arm for c in found.panel.order_comparisons} == {"fractional", "whole orders"}
+    page = found.page(tmp_path / "paper.html").read_text()
+    assert "Tables 6 and 7 and Figure 11 are left out: " in page
+    assert "Table 5." in page
+    assert "Table 6." not in page
+    assert "Table 7." not in page
 
 
 def test_stages_are_found_by_their_signals(reproduction):

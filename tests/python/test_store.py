@@ -916,3 +916,50 @@ def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
         again = list(pool.map(lambda _: ready.rounds(0, 1, [], None, 1, None, None), range(4)))
     assert all(a == part for a in again)
     assert np.isfinite(part[0][0][1])
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The lock
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (errno.EWOULDBLOCK, "is in use by another search; wait for it"),
+        (errno.ENOSYS, "cannot be locked (ENOSYS: Function not implemented); choose a file on another file system"),
+        (errno.ENOLCK, "cannot be locked (ENOLCK: "),
+        (errno.EIO, "cannot be locked (EIO: "),
+    ],
+)
+def test_a_lock_that_fails_is_reported_by_its_own_error(tmp_path, monkeypatch, number, message):
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with pytest.raises(ftlm.DataError) as refused:
+        frames.FrameFile(tmp_path / "a.ftlm", frames.SEARCH_FILE, create=True)
+    assert message in str(refused.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_child_does_not_keep_the_lock(tmp_path):
+    path = tmp_path / "a.ftlm"
+    file = frames.FrameFile(path, frames.SEARCH_FILE, create=True)
+    ready, started = os.pipe()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        os.write(started, b".")
+        signal.pause()
+    try:
+        os.read(ready, 1)
+        # The child takes nothing away either.
+        with pytest.raises(ftlm.DataError, match="in use by another search"):
+            frames.FrameFile(path, frames.SEARCH_FILE, create=True)
+        file.close()
+        frames.FrameFile(path, frames.SEARCH_FILE, create=True).close()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(ready)
+        os.close(started)

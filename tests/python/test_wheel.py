@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -145,6 +146,32 @@ def test_every_pin_has_its_hashes_and_every_dependency_its_pin():
     assert set(made) - set(tested) == {"ziglang"}
 
 
+def test_a_package_has_one_floor_and_each_is_tried():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    found = WHEEL["floors"](project)
+    names = [re.fullmatch(r"([\w-]+)==[\d.]+", line)[1] for line in found]
+    assert len(set(names)) == len(names)
+    assert {"numpy", "typer", "rich", "scipy", "pygad", "uvicorn"} <= set(names)
+    assert "ruff" not in names
+    recipe = re.search(
+        r"^wheel-test:.*?\n\n", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    assert "wheel.py --floors" in recipe[0]
+    assert "wheel.py --commands" in recipe[0]
+
+
+@pytest.mark.skipif(shutil.which("cargo") is None, reason="needs cargo")
+def test_rust_is_as_new_as_the_newest_crate_needs():
+    words = ["cargo", "metadata", "--offline", "--locked", "--all-features", "--format-version", "1"]
+    ended = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    if ended.returncode:
+        pytest.skip(f"cargo has not all crates: {ended.stderr[-200:]}")
+    needed = {p["name"]: p["rust_version"] or "0" for p in json.loads(ended.stdout)["packages"]}
+    own = needed.pop("ftlm")
+    newest = max(needed.values(), key=lambda version: [*map(int, version.split("."))])
+    assert [*map(int, own.split("."))] == [*map(int, newest.split("."))][:2], needed
+
+
 def test_hosted_machines_are_told_what_there_is():
     text = (ROOT / ".github" / "workflows" / "release.yml").read_text(encoding="utf-8")
     jobs = yaml.safe_load(text)["jobs"]
@@ -152,13 +179,24 @@ def test_hosted_machines_are_told_what_there_is():
         os for job in jobs.values() for os in job.get("strategy", {}).get("matrix", {}).get("os", [])
     }
     assert {system.split("-")[0] for system in systems if "$" not in system} == {"ubuntu", "macos", "windows"}
+    # Images that were taken away, or will be within the year, end a release before it begins.
+    assert systems - {system for system in systems if "$" in system} <= {
+        "ubuntu-latest",
+        "ubuntu-24.04-arm",
+        "macos-15-intel",
+        "macos-latest",
+        "windows-latest",
+    }
+    suite = jobs["suite"]
+    assert suite["strategy"]["matrix"]["os"] == ["macos-latest", "windows-latest"]
+    assert any("pytest" in step.get("run", "") for step in suite["steps"])
     assert jobs["tried"]["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13", "3.14"]
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = set(re.findall(r"^([\w-]+):(?!=)", makefile, re.MULTILINE))
     phony = set(re.search(r"^\.PHONY:((?:[^\n\\]|\\\n)*)$", makefile, re.MULTILINE)[1].replace("\\", "").split())
     assert phony == targets
     called = {word for run in re.findall(r"run: make (.*)", text) for word in run.split()}
-    assert {"wheels", "wheels-twice", "sdist-test"} <= called <= phony
+    assert {"wheels", "wheels-twice", "sdist-test", "wheel-test"} <= called <= phony
     for file in re.findall(r"-r (\S+\.txt)", text):
         assert (ROOT / file).is_file()
 

@@ -1,13 +1,16 @@
 //! What would panic, hang or exhaust memory later is refused at the door, in words.
 
-use ftlm::equation::{Equation, Filter, Initial, Structure, Term};
+use ftlm::equation::{tidy, AffineOrder, Equation, Filter, Initial, Structure, Term};
 use ftlm::error::{check_dense, check_points, Error, MOST_POINTS};
 use ftlm::estimation::instrumental_variables;
+use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
+use ftlm::estimation::joint_fit::{structure as joint, Problem};
 use ftlm::estimation::least_squares::{self, Regression};
-use ftlm::estimation::output_error::Experiment;
+use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeModel, Monomial};
 use ftlm::estimation::streaming::Streaming;
 use ftlm::fft;
 use ftlm::fractional::exponential_sum::{integral_by_memory, Rates};
+use ftlm::fractional::integral::{fractional_derivative, fractional_integral, Derivative, IntegralRule};
 use ftlm::fractional::kernels::digamma;
 use ftlm::fractional::operational_matrices;
 use ftlm::linalg::small::{self, Recursion};
@@ -110,6 +113,92 @@ fn regressions_that_cannot_be_made() {
         &Initial::Rest,
         instrumental_variables::Settings::default(),
     ));
+}
+
+#[test]
+fn a_solution_of_another_regression() {
+    let run = [record(0.1, vec![(0..20).map(f64::from).collect(), vec![1.0; 20]])];
+    let initial = Initial::Powers(vec![0.0]);
+    let regression = Regression::new(&run, &structure(0, 1.0, &[(1, 0.0)]), &[None], &initial).unwrap();
+    refused(regression.estimate(&[1.0], &[]));
+    refused(regression.estimate(&[1.0; 3], &[]));
+    refused(regression.estimate(&[1.0; 2], &[0]));
+    refused(regression.estimate(&[1.0; 2], &[2]));
+    assert_eq!(regression.estimate(&[1.0; 2], &[1]).unwrap().dropped, [(0, 0)]);
+}
+
+/// D^order y = c D^own y, with one free order.
+fn free_model(order: AffineOrder, own: AffineOrder, bounds: (f64, f64)) -> FreeModel {
+    let coefficient = Monomial { factor: 1.0, powers: vec![(0, 1)] };
+    FreeModel {
+        equations: vec![FreeEquation { output: 0, order, terms: vec![(0, own, coefficient)] }],
+        order_bounds: vec![bounds],
+        coordinates: vec![Coordinate::Plain],
+        inputs: Vec::new(),
+        coupled: false,
+        initial: Initial::Caputo,
+    }
+}
+
+#[test]
+fn free_orders_out_of_all_bounds() {
+    let law = |constant, weights: &[f64]| AffineOrder { constant, weights: weights.to_vec() };
+    let run = record(0.1, vec![vec![0.5; 20], vec![1.0; 20]]);
+    let experiments = [Experiment::new(run, 1, vec![vec![0.0; 21]], vec![1.0]).unwrap()];
+    let check = |model: &FreeModel| {
+        let made = Problem::new(vec!["y".into()], model.clone(), Vec::new());
+        assert_eq!(made.is_ok(), model.check(&experiments).is_ok());
+        model.check(&experiments)
+    };
+    check(&free_model(law(0.0, &[1.0]), law(0.0, &[0.0]), (0.1, 2.0))).unwrap();
+    // Weights of a highest order, like those of a term.
+    for weights in [&[][..], &[1.0, 1.0]] {
+        refused(check(&free_model(law(0.0, weights), law(0.0, &[0.0]), (0.1, 2.0))));
+        refused(check(&free_model(law(1.0, &[0.0]), law(0.0, weights), (0.1, 2.0))));
+    }
+    // A table by whole order would need gigabytes.
+    for bounds in [(0.1, 1e9), (1e9, 1e9), (-1e9, 1.0), (0.0, f64::INFINITY)] {
+        refused(check(&free_model(law(0.0, &[1.0]), law(0.0, &[0.0]), bounds)));
+    }
+    for far in [law(1e9, &[0.0]), law(0.0, &[1e9]), law(f64::NAN, &[1.0])] {
+        refused(check(&free_model(far, law(0.0, &[0.0]), (0.1, 2.0))));
+    }
+    assert_eq!(tidy(1e12).to_bits(), 1e12_f64.to_bits());
+    assert_eq!(tidy(-1e300).to_bits(), (-1e300_f64).to_bits());
+    assert!(tidy(f64::NAN).is_nan());
+    assert_eq!(tidy(-1e-12).to_bits(), 0.0_f64.to_bits());
+}
+
+#[test]
+fn a_joint_structure_of_signals_that_are_not_there() {
+    let made = |output, signal| {
+        let order = joint::Order::number(0.0);
+        let term = joint::Term { signal, order, coefficient: joint::Coefficient::Free("a".into()), factor: 1.0 };
+        let order = joint::Order::free("alpha");
+        let equation = joint::Equation { output, order, terms: vec![term], friction: None };
+        let signals = vec!["y".into(), "u".into()];
+        ParameterSet::from_structure(joint::Structure::new(signals, vec![equation], Initial::Rest))
+    };
+    made(0, 1).unwrap();
+    refused(made(2, 1));
+    refused(made(0, 2));
+    let mut bounded = made(0, 1).unwrap().structure;
+    bounded.bounds.insert("alpha".into(), (1.0, 1e9));
+    refused(ParameterSet::from_structure(bounded));
+}
+
+#[test]
+fn integrals_beyond_the_range_of_numbers() {
+    let x = [1.0, -2.0, 3.0, 0.0, 1.0];
+    for rule in [IntegralRule::BlockPulse, IntegralRule::Trapezoidal, IntegralRule::GrunwaldLetnikov] {
+        for order in [1.5, 10.0] {
+            refused(fractional_integral(&x, order, 1e300, rule));
+        }
+        fractional_integral(&x, 1.5, 1e100, rule).unwrap();
+    }
+    refused(fractional_derivative(&x, 2.5, 1e-300, Derivative::GrunwaldLetnikov, &[]));
+    let error = fractional_integral(&x, 1.5, 1e300, IntegralRule::BlockPulse).unwrap_err().to_string();
+    assert!(error.starts_with("step = 1e300 is outside "), "{error}");
 }
 
 #[test]

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -107,15 +107,7 @@ MIN_TABLE_GAPS, _GAP_PATTERN, _ENTRY_PATTERN = (
     re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )"),
 )
 #: Type names in help texts.
-TYPE_LABELS = {
-    "<str>": "TEXT",
-    "<list[str]>": "TEXT",
-    "<float>": "NUMBER",
-    "<int>": "N",
-    "<int range>": "N",
-    "<list[int]>": "N",
-    "<list[int range]>": "N",
-}
+TYPE_LABELS = {str: "TEXT", float: "NUMBER", int: "N"}
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 
 
@@ -128,15 +120,6 @@ OTHER_PANEL = "Options"
 
 class Command(TyperCommand):
     """Command with help in panels, which suggests the right option for a common alias."""
-
-    def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **named)
-        for parameter in self.params:
-            # An argument is named by what it is of, and what no option names is a text or a number to a person.
-            told: Any = parameter
-            told.display_type_rich = functools.partial(
-                _type_label, told.display_type_rich, argument=told.param_type_name == "argument"
-            )
 
     @property
     def methods_by_field(self) -> dict[str, tuple[str, ...]]:
@@ -182,7 +165,8 @@ class Command(TyperCommand):
             if methods is not None and method is not None and method not in methods:
                 hidden = True
             elif record is not None and told.param_type_name == "argument":
-                panels["Arguments"].append(record)
+                # Versions of typer write different types behind the name.
+                panels["Arguments"].append((told.metavar, record[1]))
             elif record is not None:
                 panels[getattr(told, "rich_help_panel", None) or OTHER_PANEL].append(record)
         if self.methods_by_field:
@@ -191,11 +175,6 @@ class Command(TyperCommand):
             if records:
                 with formatter.section(f"{name} of {method}" if name == "Method" and hidden else name):
                     formatter.write_dl(records)
-
-
-def _type_label(kind: Callable[..., str], *, ctx: Any, argument: bool) -> str:
-    """Type of an option's value in plain words."""
-    return "" if argument else TYPE_LABELS.get(kind(ctx=ctx), kind(ctx=ctx))
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
@@ -216,7 +195,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             if hasattr(kind, "methods"):
                 methods_by_field |= dict.fromkeys((f.name for f in fields(kind)), kind.methods)
         else:
-            options.append(parameter)
+            options.append(parameter.replace(annotation=_with_help(kind)))
 
     @functools.wraps(work)
     def run(**given: Any) -> None:
@@ -263,18 +242,28 @@ def _options_of(record: type[Any]) -> list[inspect.Parameter]:
     panel = getattr(record, "panel", None)
     return [
         inspect.Parameter(
-            f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=_in_panel(hints[f.name], panel)
+            f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=_with_help(hints[f.name], panel)
         )
         for f in fields(record)
     ]
 
 
-def _in_panel(hint: Any, panel: str | None) -> Any:
-    """Return an annotated type whose option stands in a panel of the help; an option may state its own."""
+def _with_help(hint: Any, panel: str | None = None) -> Any:
+    """Return an annotated type whose option has a type in plain words, and the panel of its dataclass in the help."""
     kind, option = get_args(hint)
-    placed = copy.copy(option)
-    placed.rich_help_panel = panel
-    return Annotated[kind, placed]
+    described = copy.copy(option)
+    described.metavar = option.metavar or _type_label(kind)
+    described.rich_help_panel = panel or option.rich_help_panel
+    return Annotated[kind, described]
+
+
+def _type_label(kind: Any) -> str | None:
+    """Return the type of an option's value in plain words; None for a switch."""
+    if get_origin(kind) is Literal:
+        return f"<{'|'.join(get_args(kind))}>"
+    # Of an optional value or a list, the type of the value.
+    parts = get_args(kind)
+    return _type_label(parts[0]) if parts else TYPE_LABELS.get(kind)
 
 
 def exit_code(error: FtlmError) -> int:

@@ -212,6 +212,24 @@ def default_bounds(
     return -limit, limit
 
 
+def load_pygad() -> Any:
+    """Return the module of the genetic algorithm; raise ModelError if PyGAD is not installed."""
+    try:
+        import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
+    except ImportError:
+        raise ModelError("the genetic baseline needs PyGAD; pip install 'ftlm[genetic]'") from None
+    return pygad
+
+
+def load_differential_evolution() -> Any:
+    """Return SciPy's differential evolution; raise ModelError if SciPy is not installed."""
+    try:
+        from scipy.optimize import differential_evolution  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this rival needs it
+    except ImportError:
+        raise ModelError("differential evolution needs SciPy; pip install 'ftlm[genetic]'") from None
+    return differential_evolution
+
+
 def genetic_search(
     records: list[Record],
     structure: Structure,
@@ -231,10 +249,7 @@ def genetic_search(
         PyGAD is not installed, a record does not start at rest, a bound names no free parameter, or the order grid is
         so large that `evaluations` must be given.
     """
-    try:
-        import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
-    except ImportError:
-        raise ModelError("the genetic baseline needs PyGAD; pip install 'ftlm[genetic]'") from None
+    pygad = load_pygad()
     if records[0].offset != "none":
         raise ModelError(
             f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
@@ -402,10 +417,7 @@ def differential_evolution_search(
     ModelError
         SciPy is not installed, a record does not start at rest, or no candidate has a finite error.
     """
-    try:
-        from scipy.optimize import differential_evolution  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this rival needs it
-    except ImportError:
-        raise ModelError("differential evolution needs SciPy; pip install 'ftlm[genetic]'") from None
+    differential_evolution = load_differential_evolution()
     if records[0].start != (False, []) or records[0].offset != "none":
         raise ModelError("differential evolution knows no initial terms and no offset; slice the runs to start at rest")
     problem = GeneticProblem(records, structure, settings, check_threads(threads))

@@ -40,6 +40,7 @@ from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
+from ftlm.utils.resources import run_in_worker
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
@@ -412,7 +413,7 @@ def identify_many(
     try:
         for item in items:
             try:
-                pending.append(executor.submit(identify_one, item, structure, options))
+                pending.append(executor.submit(run_in_worker, identify_one, item, structure, options))
             except (BrokenExecutor, RuntimeError) as error:
                 lost: Future[Any] = Future()
                 lost.set_exception(error)

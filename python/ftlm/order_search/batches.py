@@ -35,6 +35,7 @@ from ftlm.order_search.checkpoint import (
 from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.discretization import InitialTuple
 from ftlm.utils.parameters import parameter
+from ftlm.utils.resources import run_in_worker
 from ftlm.utils.validation import Floats
 
 #: Maximum number of search evaluators that a worker caches.
@@ -269,7 +270,7 @@ def run_on_executor(
                     waiting.append(CandidateBlock(stretch.first + size, stretch.last))
                     stretch = CandidateBlock(stretch.first, stretch.first + size)
                 try:
-                    pending[executor.submit(*send(stretch))] = stretch
+                    pending[executor.submit(run_in_worker, *send(stretch))] = stretch
                 except (BrokenExecutor, RuntimeError) as error:
                     raise _executor_error(error) from error
             done, _ = wait(pending, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)

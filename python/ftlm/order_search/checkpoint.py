@@ -21,12 +21,14 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import errno
 import hashlib
 import math
 import os
 import stat
 import struct
 import time
+import weakref
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -298,6 +300,10 @@ def check_file(path: str | os.PathLike[str], handle: int, kind: FileKind) -> Non
     os.lseek(handle, 0, os.SEEK_SET)
 
 
+#: Errors of a lock that another process has: of POSIX, and of Windows.
+_IN_USE_ERRORS = {errno.EWOULDBLOCK, errno.EAGAIN} | ({errno.EACCES, errno.EDEADLK} if os.name == "nt" else set())
+
+
 class FrameFile:
     """Checkpoint file, locked until closed; without `create` it must exist.
 
@@ -312,6 +318,7 @@ class FrameFile:
         flags = os.O_RDWR | getattr(os, "O_NONBLOCK", 0) | (os.O_CREAT if create else 0) | getattr(os, "O_BINARY", 0)
         try:
             self.handle = os.open(self.path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
+            _OPEN_FILES.add(self)
         except (OSError, ValueError) as error:
             why = error.strerror if isinstance(error, OSError) else None
             raise DataError(f"store {self.path} cannot be opened: {why or error}; choose another file") from error
@@ -335,6 +342,12 @@ class FrameFile:
 
                 fcntl.flock(self.handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
+            if error.errno not in _IN_USE_ERRORS:
+                name = errno.errorcode.get(error.errno or 0, "unknown error")
+                raise DataError(
+                    f"store {self.path} cannot be locked ({name}: {error.strerror}); choose a file on another file "
+                    "system, such as a local disk"
+                ) from error
             raise DataError(
                 f"store {self.path} is in use by another {self.kind.name}; wait for it, stop it, or choose another file"
             ) from error
@@ -409,7 +422,23 @@ class FrameFile:
 
     def close(self) -> None:
         """Close the file and release the lock."""
-        os.close(self.handle)
+        _OPEN_FILES.discard(self)
+        if self.handle >= 0:
+            os.close(self.handle)
+            self.handle = -1
+
+
+_OPEN_FILES: weakref.WeakSet[FrameFile] = weakref.WeakSet()
+
+
+def _close_in_child() -> None:
+    """Close the files of the parent, whose locks a forked child would hold beyond the parent's end."""
+    for file in list(_OPEN_FILES):
+        file.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_in_child)
 
 
 @dataclass

@@ -405,12 +405,14 @@ def simulated_panel(
     *,
     genetic: GeneticAlgorithm | None = None,
     order_grid: OrderGrid | None = None,
+    has_contests: bool = True,
     begin: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Panel:
     """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
 
-    Before each step `begin` is called with what it is, a key of `ftlm.reproduction.stage_models.STEPS`.
+    Without an order grid there are neither; with ``has_contests=False`` there are no contests. Before each step `begin`
+    is called with what it is, a key of `ftlm.reproduction.stage_models.STEPS`.
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
@@ -423,7 +425,7 @@ def simulated_panel(
             continue
         structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
         own = run.select(list(structure.signals))
-        for output in structure.outputs:
+        for output in structure.outputs if has_contests else ():
             begin("rivals")
             made = compare_optimizers(
                 own, structure.equation(output), order_grid, genetic, threads=threads, progress=progress

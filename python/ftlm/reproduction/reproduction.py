@@ -14,7 +14,7 @@ from typing import Any
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation.genetic import GeneticAlgorithm
+from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolution, load_pygad
 from ftlm.model.model import Model
 from ftlm.progress import format_time_left
 from ftlm.reproduction.claims import Claim, ReproductionData, claims
@@ -23,7 +23,15 @@ from ftlm.reproduction.published_models import PrintedModelRun, run_printed_mode
 from ftlm.reproduction.published_values import AsPrinted, as_printed
 from ftlm.reproduction.report import reproduction_page
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run
-from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
+from ftlm.reproduction.stage_models import (
+    RIVALS_OMITTED,
+    Preset,
+    StageWork,
+    TotalProgress,
+    WorkerProgress,
+    seconds_of,
+    seconds_of_all,
+)
 from ftlm.reproduction.stage_result import TRACE_EVERY, Stage
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
@@ -210,19 +218,27 @@ def reproduce(
     others, lattice = _other_arms(arms, records), OrderGrid(increment=increment)
     for each in (increment, real_number("rivals_increment", rivals_increment)):
         OrderGrid(increment=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
+    if square is None and sine is not None:
+        raise ModelError("a sine run is given without a square run; give both, or neither")
+    omitted = []
+    try:
+        load_pygad()
+        load_differential_evolution()
+    except ModelError as error:
+        omitted.append(RIVALS_OMITTED.format(error))
+        log(omitted[0])
+    compared_increment = None if omitted else rivals_increment
     if square is None:
-        if sine is not None:
-            raise ModelError("a sine run is given without a square run; give both, or neither")
         log("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
     more = (len(others), records) if simulated else ()
-    seconds = seconds_of_all(increment, len(numbers), *more, rivals_increment=rivals_increment)
+    seconds = seconds_of_all(increment, len(numbers), *more, rivals_increment=compared_increment)
     about = format_time_left(estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))).removesuffix(
         " left"
     )
     log(f"this takes {about}")
-    preset = Preset(lattice, TOP_CANDIDATES, TRACE_EVERY, common_pulses=True, rivals_increment=rivals_increment)
+    preset = Preset(lattice, TOP_CANDIDATES, TRACE_EVERY, common_pulses=True, rivals_increment=compared_increment)
     own = MAIN_ARM if simulated else MEASURED_LABEL
     seeds = [seed + k for k in range(records)]
     run, other = square, sine
@@ -245,7 +261,7 @@ def reproduce(
             of_more = seeds[1:] if arm == MAIN_ARM else seeds
 
             def begin(name: str) -> None:
-                steps.begin(seconds_of(name, increment, rivals_increment))
+                steps.begin(seconds_of(name, increment, compared_increment))
 
             return simulated_panel(
                 number,
@@ -257,6 +273,7 @@ def reproduce(
                 begin=begin,
                 progress=steps,
                 order_grid=None if arm == MAIN_ARM else rivals_order_grid(increment, rivals_increment),
+                has_contests=not omitted,
             )
 
         return job
@@ -274,7 +291,7 @@ def reproduce(
         simulated,
         {m.stage.number: m.stage for m in made},
         lattice,
-        tuple(dict.fromkeys(note for m in made for note in m.notes)),
+        tuple(dict.fromkeys([*omitted, *(note for m in made for note in m.notes)])),
         panel,
         tuple(row for m in made for row in m.rows),
         {output: part for m in made for output, part in m.printed.items()},

@@ -84,9 +84,11 @@ STEPS_PER_STAGE = {
 STEPS_PER_ARM = {"trials": 0, "rivals": 2, "freed": 1}
 
 
-def seconds_of(increment: str, lattice_step: float, rivals_increment: float = CONTEST_STEP) -> float:
+def seconds_of(increment: str, lattice_step: float, rivals_increment: float | None = CONTEST_STEP) -> float:
     """Processor time of a step [s]; searches grow with the inverse fourth power of the increment."""
     if increment == "rivals":
+        if rivals_increment is None:
+            return 0.0
         candidates = round(CONTEST_CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_increment)) ** 4)
         evaluations = candidates * len(seeds_for(candidates))
         return STEP_DURATIONS_S[increment] * evaluations / (CONTEST_CANDIDATES * len(seeds_for(CONTEST_CANDIDATES)))
@@ -94,7 +96,7 @@ def seconds_of(increment: str, lattice_step: float, rivals_increment: float = CO
 
 
 def seconds_of_all(
-    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_increment: float = CONTEST_STEP
+    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_increment: float | None = CONTEST_STEP
 ) -> float:
     """Processor time of the whole reproduction [s]."""
     counts = dict(STEPS_PER_STAGE)
@@ -193,7 +195,12 @@ class Preset:
     # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
     # the currents alone as well, or each as its method worked.
     common_pulses: bool
-    rivals_increment: float = CONTEST_STEP  # of the lattice that the rivals are held against
+    # Of the order grid of the optimizer comparison; None without PyGAD or SciPy.
+    rivals_increment: float | None = CONTEST_STEP
+
+
+#: Note on a reproduction without the optimizer comparison, with a placeholder for the reason.
+RIVALS_OMITTED = "Tables 6 and 7 and Figure 11 are left out: {}"
 
 
 @dataclass
@@ -488,7 +495,9 @@ class StageWork:
         )
 
     def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
-        """Compare the optimizers on each equation at equal budgets."""
+        """Compare the optimizers on each equation at equal budgets; empty if they are not installed."""
+        if self.preset.rivals_increment is None:
+            return {}
         lattice = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
         found = {}
         for output in self.measured.outputs:
@@ -499,7 +508,7 @@ class StageWork:
                     self.on, single, lattice, genetic, threads=self.threads, progress=self.progress
                 )
             except ModelError as error:
-                self.notes.append(f"Tables 6 and 7 and Figure 11 are left out: {error}")
+                self.notes.append(RIVALS_OMITTED.format(error))
                 return {}
 
             def model(

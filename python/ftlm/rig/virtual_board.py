@@ -263,13 +263,14 @@ def start_watchdog(page: watchdog.RegisterPage, *, keep: bool, patience: float =
     OSError
         The process could not be started.
     """
-    # A separate session, so that Ctrl-C does not reach the watchdog.
+    # A separate session, and on Windows a console, so that Ctrl-C and Ctrl-Break do not reach the watchdog.
     process = subprocess.Popen(
         **python_child(Path(watchdog.__file__), str(page.path.resolve()), "keep" if keep else "remove", site=False),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
+        creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )
     until = time.monotonic() + patience
     try:

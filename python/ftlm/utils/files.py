@@ -147,8 +147,10 @@ def write_atomically(
                 if there is not None and hasattr(os, "fchmod"):
                     os.fchmod(stream.fileno(), stat.S_IMODE(there.st_mode) & 0o777)
                 os.fsync(stream.fileno())
-            if force or not _move_exclusively(beside, file):
+            if force:
                 os.replace(beside, file)
+            else:
+                _move_exclusively(beside, file)
         except FileExistsError:
             with contextlib.suppress(OSError):
                 beside.unlink()
@@ -173,20 +175,25 @@ def write_atomically(
     return file
 
 
-def _move_exclusively(beside: Path, file: Path) -> bool:
-    """Rename a file to a name that must not exist; raise if it was created meanwhile.
-
-    On file systems without hard links return False and leave an empty file of that name as a placeholder.
-    """
+def _move_exclusively(beside: Path, file: Path) -> None:
+    """Rename a file to a name that must not exist; raise if it was created meanwhile, and leave nothing there."""
     try:
         os.link(beside, file, follow_symlinks=False)
     except FileExistsError:
         raise
     except (OSError, NotImplementedError):
+        # Without hard links an empty file reserves the name.
         os.close(os.open(file, _NEW_FILE_FLAGS, 0o666))
-        return False
-    beside.unlink()
-    return True
+        try:
+            os.replace(beside, file)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                file.unlink()
+            raise
+    else:
+        # The file is complete, whatever becomes of its other name.
+        with contextlib.suppress(OSError):
+            beside.unlink()
 
 
 #: Longest name in a message, and size limit of models, controllers and settings, which take some kilobytes.

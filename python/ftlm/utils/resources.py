@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import re
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -194,3 +196,26 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
     command = [sys.executable, "-I", *([] if site else ["-S"]), "-c", program, *arguments]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     return {"args": command, "env": environment, "cwd": sys.prefix}
+
+
+def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result of a task of an executor; a worker process ends when the process that started it is killed."""
+    # Tasks of thread pools run in other threads than the main one.
+    if threading.current_thread() is threading.main_thread():
+        _end_with_parent(os.getpid())
+    return work(*arguments)
+
+
+@cache
+def _end_with_parent(_process: int) -> None:
+    """End this process with its parent: a worker of a killed pool would wait for tasks for good."""
+    from multiprocessing import parent_process  # noqa: PLC0415 — pools alone import it
+
+    parent = parent_process()
+    if parent is not None:
+
+        def wait() -> None:
+            parent.join()
+            os._exit(1)
+
+        threading.Thread(target=wait, name="ftlm parent", daemon=True).start()

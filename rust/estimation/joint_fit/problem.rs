@@ -25,17 +25,17 @@ impl Problem {
     /// Problem in the coordinates of the model; Stribeck velocities are positive and use logarithms.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::Structure`] for an unknown coefficient or equation, or crossed bounds.
+    /// [`Error::Length`], [`Error::Structure`] for an unknown coefficient or equation, or crossed bounds; as
+    /// [`AffineOrder::check`].
     pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeFrictionLaw)>) -> Result<Self> {
         check_length("outputs", model.equations.len(), outputs.len())?;
-        let (orders, coefficients) = (model.order_bounds.len(), model.coordinates.len());
+        let coefficients = model.coordinates.len();
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
-        let weighs = |order: &AffineOrder| check_length("weights of an order", orders, order.weights.len());
         let missing = |number: &Monomial| number.powers.iter().any(|&(i, _)| i >= coefficients);
         for equation in &model.equations {
-            weighs(&equation.order)?;
+            equation.order.check(&model.order_bounds)?;
             for (_, order, coefficient) in &equation.terms {
-                weighs(order)?;
+                order.check(&model.order_bounds)?;
                 if missing(coefficient) {
                     return refuse("an equation names a coefficient that is not there".into(), "number them from 0");
                 }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::equation::{alpha_fits, tidy, AffineOrder, Initial};
+use crate::equation::{alpha_fits, missing_signal_error, tidy, AffineOrder, Initial};
 use crate::error::{Error, Result};
 use crate::estimation::output_error::FreeInput;
 use crate::fractional::kernels::{MAX_EXCESS, MIN_INPUT_ORDER};
@@ -244,13 +244,19 @@ impl Structure {
         self.equations.iter().any(|equation| equation.friction.is_some())
     }
 
-    /// Check that the orders form valid equations.
+    /// Check that signals have names and orders form valid equations.
     ///
     /// # Errors
-    /// [`Error::Structure`] for an equation without terms, or an order out of range.
+    /// [`Error::Structure`] for an equation without terms, or a signal that is not there; an order out of range.
     pub fn check(&self) -> Result<()> {
         if self.equations.is_empty() {
             return Err(Error::Structure { what: "a model without an equation".into(), remedy: "add one".into() });
+        }
+        let of_equation = |e: &Equation| e.terms.iter().map(|t| t.signal).chain([e.output]).max();
+        let inputs = self.inputs.iter().map(|input| input.free.signal);
+        let highest = self.equations.iter().filter_map(of_equation).chain(inputs).max();
+        if let Some(signal) = highest.filter(|&signal| signal >= self.signals.len()) {
+            return Err(missing_signal_error(signal, self.signals.len()));
         }
         self.equations.iter().try_for_each(Equation::check)
     }

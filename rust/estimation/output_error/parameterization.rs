@@ -144,13 +144,13 @@ impl FreeModel {
     ///
     /// # Errors
     /// [`Error::Structure`] for an unknown signal or coefficient, a nonlinearity of a signal that is no input, or
-    /// crossed bounds; [`Error::Length`] for experiments or weights of wrong lengths.
+    /// crossed bounds; [`Error::Length`] for experiments or weights of wrong lengths; as [`AffineOrder::check`].
     pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
         let Some(signals) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
         };
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
-        let (orders, coefficients) = (self.order_bounds.len(), self.coordinates.len());
+        let coefficients = self.coordinates.len();
         for equation in &self.equations {
             let missing = |(signal, _, c): &(usize, AffineOrder, Monomial)| {
                 *signal >= signals || c.powers.iter().any(|&(i, _)| i >= coefficients)
@@ -159,8 +159,8 @@ impl FreeModel {
                 let what = "an equation names a signal or a coefficient that is not there".to_owned();
                 return refuse(what, "number them from 0");
             }
-            for (_, order, _) in &equation.terms {
-                check_length("weights of an order", orders, order.weights.len())?;
+            for order in equation.terms.iter().map(|term| &term.1).chain([&equation.order]) {
+                order.check(&self.order_bounds)?;
             }
         }
         for (k, &FreeInput { signal, bounds: (low, high), .. }) in self.inputs.iter().enumerate() {
