@@ -134,8 +134,9 @@ class Counting(Executor):
 
     def submit(self, function, /, *args, **options):
         future = Future()
-        self.tasks.append(args)
-        self.carried += args[1] is not None
+        _, *task = args  # after the function that the worker calls
+        self.tasks.append(task)
+        self.carried += task[1] is not None
         if len(self.tasks) in self.fail:
             future.set_exception(OSError("the network is down"))
         else:
