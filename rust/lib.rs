@@ -11,7 +11,7 @@
 //!    variables; orders and coefficients together by joint output error; [`friction`]: simulation and output error
 //!    with dry friction;
 //! 6. [`order_search`]: orders by exhaustive search over an order grid;
-//! 7. [`simulate`], [`signal::metrics`]: simulation, output and equation error, figures of merit;
+//! 7. [`simulate`], [`state_space`], [`signal::metrics`]: simulation, output and equation error, figures of merit;
 //!    [`signal::statistics`]: residual analysis.
 //!
 //! ```
@@ -62,6 +62,7 @@ pub mod equation;
 pub mod regressors;
 mod series_system;
 pub mod simulate;
+pub mod state_space;
 
 pub mod estimation;
 pub mod friction;

@@ -75,6 +75,7 @@ __all__ = [
     "series_divide",
     "series_multiply",
     "singular_values",
+    "state_space_respond",
     "trace_errors",
     "triangular_factor",
     "whitening_filter",
@@ -502,6 +503,14 @@ def respond_with_initial(
     terms: _Initial,
     filter: tuple[_Floats, Sequence[bool]] | None,
 ) -> tuple[_Matrix, list[list[float]], list[list[float]]]: ...
+def state_space_respond(
+    model: Sequence[_Equation],
+    inputs: Sequence[bool],
+    driving: Sequence[tuple[int, _Floats, bool, float, float]],
+    terms: Sequence[Sequence[tuple[float, float]]],
+    step: float,
+    rows: int,
+) -> _Matrix | None: ...
 def equation_error(run: _Record, equation: _Equation, inputs: Sequence[bool], terms: _Initial) -> _Vector: ...
 def explicit_euler(signals: _Floats, step: float, model: Sequence[_Equation], inputs: Sequence[bool]) -> _Matrix: ...
 def trace_errors(run: _Record, equation: _Structure, inputs: Sequence[bool], trace: _Floats) -> _Vector: ...

@@ -48,7 +48,7 @@ mod _core {
     #[pymodule_export]
     use crate::python::simulation::{
         correlation, equation_error, explicit_euler, interpolate_samples, kink_correction, metrics, nyquist_margin,
-        respond, respond_and_units, respond_with_initial, trace_errors,
+        respond, respond_and_units, respond_with_initial, state_space_respond, trace_errors,
     };
 
     #[pymodule_export]

@@ -4,14 +4,15 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use super::convert::{
-    copy_vector, equations, initial, record, rows, stack_rows, structure, to_vectors, vector, EquationArg, InitialArg,
-    List, RecordArg, StructureArg,
+    copy_vector, equations, initial, matrix, record, rows, stack_rows, structure, to_vectors, vector, EquationArg,
+    InitialArg, List, RecordArg, StructureArg,
 };
 use super::errors::run_detached;
 use super::estimation::jumps_near;
 use crate::python::order_search::watch::run_interruptible;
-use crate::signal::block_pulse::SampleInterpolation;
+use crate::signal::block_pulse::{Intersample, SampleInterpolation};
 use crate::simulate::{self, OutputFilter};
+use crate::state_space::{self, Input};
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
@@ -65,6 +66,35 @@ pub fn respond_with_initial<'py>(
         simulate::respond_with_initial(&equations, &record, &initial, filter)
     })?;
     Ok((stack_rows(py, &response.outputs)?, response.exponents, response.initial))
+}
+
+/// (signal, samples, whether held, delay in steps, value before the record).
+type InputArg<'py> = (usize, PyReadonlyArray1<'py, f64>, bool, f64, f64);
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn state_space_respond<'py>(
+    py: Python<'py>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
+    driving: List<InputArg<'py>>,
+    terms: List<List<(f64, f64)>>,
+    step: f64,
+    rows: usize,
+) -> PyResult<Option<Bound<'py, PyArray2<f64>>>> {
+    let equations = equations(model, inputs.len(), &inputs)?;
+    let driving = (driving.iter())
+        .map(|(signal, samples, held, delay, before)| {
+            let between = if *held { Intersample::Hold } else { Intersample::Linear };
+            let samples = vector("input", samples)?;
+            Ok(Input { signal: *signal, samples, between, delay: *delay, before: *before })
+        })
+        .collect::<PyResult<Vec<_>>>()?;
+    let count = equations.len();
+    let found = run_interruptible(py, rows, None, move |stop| {
+        state_space::respond(&equations, &driving, &to_vectors(terms), step, rows, stop)
+    })?;
+    found.map(|samples| matrix(py, samples, count)).transpose()
 }
 
 #[pyfunction]

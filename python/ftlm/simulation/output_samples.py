@@ -174,7 +174,7 @@ class OutputSamples:
     initial
         Coefficients of the initial terms, by output and exponent.
     refinement
-        Pulses per sampling interval on the finest grid.
+        Pulses per sampling interval on the finest grid; 1 for an exact simulation.
     change
         Change on halving the step, relative to the largest value of each output; infinite before there are three grids.
     """

@@ -80,10 +80,13 @@ def simulate(
 ) -> Run:
     """Simulate the outputs of a model on the inputs of a run, at its sample times.
 
-    The step of the record is refined under the intersample behavior of the inputs (a zero-order hold stays exact), with
-    Richardson extrapolation (powers 2, 3 and 4), until halving the step changes no output by more than ``tolerance`` of
-    its largest value. A sample is the value just after the input of its row has changed. A term of the equation's own
-    order (direct feedthrough) acts without delay; everything else is continuous there.
+    Integer orders are simulated exactly, by the matrix exponential of one sampling interval, if the samples are uniform
+    and the model has neither a sensor filter nor friction. For all other models the step of the record is refined under
+    the intersample behavior of the inputs (a zero-order hold stays exact), with Richardson extrapolation (powers 2, 3
+    and 4), until halving the step changes no output by more than ``tolerance`` of its largest value.
+
+    A sample is the value just after the input of its row has changed. A term of the equation's own order (direct
+    feedthrough) acts without delay; everything else is continuous there.
 
     Parameters
     ----------

@@ -32,6 +32,7 @@ from ftlm.simulation.output_samples import (
     unit_samples,
     with_initial_conditions,
 )
+from ftlm.simulation.state_space import simulate_state_space
 from ftlm.utils.validation import Floats
 
 #: Powers of the step in the error of a sample: 2 from the block-pulse scheme, 3 from extrapolation to a sample time,
@@ -442,7 +443,8 @@ def simulate_refined(
 ) -> OutputSamples:
     """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
 
-    A long record is refined only as far as that moves it (:func:`ftlm.simulation.step_refinement.long_run`).
+    Integer orders on uniform samples need no grid (:func:`ftlm.simulation.state_space.simulate_state_space`). A long
+    record is refined only as far as that moves it (:func:`simulate_long`).
 
     Parameters
     ----------
@@ -454,6 +456,9 @@ def simulate_refined(
     on_grid
         Whether to use the uniform grid of a run with nonuniform samples.
     """
+    exact = simulate_state_space(model, run, initial)
+    if exact is not None:
+        return exact
     own = run.length - 1
     every = FIRST_REFINEMENT
     if initial is None and model.structure.has_friction:

@@ -1,0 +1,496 @@
+//! Equations of integer orders in state space, and their exact discretization for inputs that are held or linear
+//! between samples.
+//!
+//! An equation y = Σ c_k I^{η_k} s_k + Σ a_e t^e with integers η = α − ν and e is a chain of integrators. State j is
+//! the integrand of the j-th integral: w_j′ = w_{j+1} + Σ c_k s_k over the terms with η_k = j. A term with η = 0 acts
+//! on the output directly, and a power of t is the initial state w_{e+1} = a_e e!. With the outputs substituted this is
+//! w′ = A w + B u, y = C w + D u. One sampling interval is
+//!
+//! w(h) = w + (e^{hA} − I) w + φ₁(hA) hB u(0) + φ₂(hA) hB (u(h) − u(0)),
+//! φ₁(z) = (e^z − 1)/z, φ₂(z) = (e^z − 1 − z)/z²,
+//!
+//! where the second input term exists for a linear input only. The recursion advances w by e^{hA} − I, and squaring
+//! computes this difference rather than e^{hA}. Slow modes keep their digits beside fast ones, and at short steps
+//! (Higham, *Functions of Matrices*, 2008, sections 10.3 and 10.7).
+
+use std::borrow::Cow;
+
+use crate::equation::{check_regular, Equation, ORDER_GRAIN};
+use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
+use crate::linalg::{dense, small};
+use crate::parallel::Stop;
+use crate::signal::block_pulse::{delay_samples, Intersample};
+
+/// Input of the equations.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Input {
+    /// Index of the signal in the equations.
+    pub signal: usize,
+    /// Samples, one a row of the record.
+    pub samples: Vec<f64>,
+    /// Inter-sample behavior. A linear signal is delayed at its samples and then linear between them.
+    pub between: Intersample,
+    /// Delay in sampling intervals, whole and fractional.
+    pub delay: f64,
+    /// Value before the record, for a delayed input.
+    pub before: f64,
+}
+
+/// Largest number of states. A step costs its square.
+const MAX_STATES: usize = 128;
+/// Largest condition of the direct terms. Beyond it a cancellation decides the orders of the equations.
+const MAX_CONDITION: f64 = 1e10;
+/// Delays this close to a whole number of sampling intervals, relative to the larger of 1 and their number, are whole.
+const DELAY_TOLERANCE: f64 = 1e-9;
+/// Rows between two checks for a stop, with their input terms computed together.
+const BLOCK_ROWS: usize = 1 << 10;
+/// States below this are 0 from the next block on, because arithmetic below 1e−308 is slow.
+const SMALLEST_STATE: f64 = 1e-290;
+/// Terms of the Taylor series of φ₂ for a norm of at most 1/2.
+const TAYLOR_TERMS: i32 = 15;
+
+/// Samples of the outputs of equations with integer orders, a row of `rows` samples for each equation, joined.
+///
+/// The outputs are simulated together, and a signal that is neither output nor input is zero. A sample is the value
+/// just after the inputs of its row have changed. `initial` has (exponent, coefficient) pairs per equation, empty for
+/// zero initial conditions. An unstable model may overflow, so that values are not finite. None if the direct terms are singular or nearly so, if there are more than 128
+/// states, or if the transition over one interval overflows. O(n²) a row with n states.
+///
+/// # Errors
+/// Invalid equations, orders or exponents that are not integers or are below 0, samples that are not finite or not as
+/// many as rows, too many rows, [`Error::Interrupted`] after a stop.
+///
+/// ```
+/// use ftlm::equation::{Equation, Structure, Term};
+/// use ftlm::signal::block_pulse::Intersample;
+/// use ftlm::state_space::{respond, Input};
+/// # fn main() -> ftlm::error::Result<()> {
+/// // y′ = −y + u.
+/// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+/// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
+/// let step = Input { signal: 1, samples: vec![1.0; 3], between: Intersample::Hold, delay: 0.0, before: 0.0 };
+/// let y = respond(&[model], &[step], &[], 0.5, 3, &ftlm::parallel::Stop::default())?.unwrap_or_default();
+/// assert!((y[2] - (1.0 - (-1.0_f64).exp())).abs() < 1e-15);
+/// # Ok(())
+/// # }
+/// ```
+pub fn respond(
+    equations: &[Equation],
+    inputs: &[Input],
+    initial: &[Vec<(f64, f64)>],
+    step: f64,
+    rows: usize,
+    stop: &Stop,
+) -> Result<Option<Vec<f64>>> {
+    check_step(step)?;
+    check_points("samples of all outputs", rows.saturating_mul(equations.len()))?;
+    for equation in equations {
+        equation.check(usize::MAX)?;
+    }
+    if !initial.is_empty() {
+        check_length("initial terms", equations.len(), initial.len())?;
+    }
+    for input in inputs {
+        check_length("input", rows, input.samples.len())?;
+        check_finite("input", &input.samples)?;
+        check_finite("input before the record", &[input.before])?;
+        if !(input.delay >= 0.0 && input.delay.is_finite()) {
+            return Err(Error::OutOfRange {
+                name: "delay".into(),
+                value: input.delay,
+                range: "[0, ∞) steps".into(),
+                remedy: "an input acts after it is given".into(),
+            });
+        }
+    }
+    let Some(model) = Realization::new(equations, inputs, initial, step)? else { return Ok(None) };
+    let Some(recursion) = model.discretize(inputs)? else { return Ok(None) };
+    recursion.run(model.start, rows, stop).map(Some)
+}
+
+/// Integer from an order or an exponent.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn integer(order: f64) -> Result<usize> {
+    let nearest = order.round();
+    if nearest >= 0.0 && (order - nearest).abs() <= ORDER_GRAIN {
+        return Ok(nearest as usize);
+    }
+    Err(Error::Structure {
+        what: format!("an order or exponent {order} that no chain of integrators has"),
+        remedy: "use whole numbers from 0, or the series simulation".into(),
+    })
+}
+
+/// Continuous state-space model in time units of one sampling interval. Matrices are row-major.
+struct Realization {
+    states: usize,
+    outputs: usize,
+    /// h A.
+    system: Vec<f64>,
+    /// h B and D of each input.
+    drives: Vec<(Vec<f64>, Vec<f64>)>,
+    /// C, a row for each output.
+    read: Vec<f64>,
+    start: Vec<f64>,
+}
+
+impl Realization {
+    /// Model of equations, balanced. None if the direct terms are singular, or for too many states.
+    fn new(equations: &[Equation], inputs: &[Input], initial: &[Vec<(f64, f64)>], step: f64) -> Result<Option<Self>> {
+        let count = equations.len();
+        let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
+        let mut lengths = vec![0; count];
+        // (equation, integrations, index of the output or count + index of the input, coefficient).
+        let mut terms = Vec::new();
+        for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
+            for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
+                let of_input = || inputs.iter().position(|u| u.signal == term.signal).map(|q| count + q);
+                let eta = integer(structure.integration(k))?;
+                // A signal without samples is zero.
+                let Some(source) = outputs.iter().position(|&o| o == term.signal).or_else(of_input) else { continue };
+                if c != 0.0 {
+                    terms.push((i, eta, source, c));
+                    lengths[i] = eta.max(lengths[i]);
+                }
+            }
+            for &(exponent, _) in initial.get(i).into_iter().flatten() {
+                lengths[i] = (integer(exponent)? + 1).max(lengths[i]);
+            }
+        }
+        let n: usize = lengths.iter().sum();
+        if n > MAX_STATES || check_regular(equations).is_err() {
+            return Ok(None);
+        }
+        let first: Vec<usize> = (0..count).map(|i| lengths[..i].iter().sum()).collect();
+        // Direct terms: (I − E) y = w₁ + F u, F as columns.
+        let mut tied = vec![0.0; count * count];
+        let mut direct = vec![vec![0.0; count]; inputs.len()];
+        (0..count).for_each(|i| tied[i * count + i] = 1.0);
+        for &(i, _, source, c) in terms.iter().filter(|t| t.1 == 0) {
+            match source.checked_sub(count) {
+                None => tied[i * count + source] -= c,
+                Some(q) => direct[q][i] += c,
+            }
+        }
+        let norm = |m: &[f64]| m.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
+        let Ok(through) = small::inverse(&tied, count) else { return Ok(None) };
+        let condition = norm(&tied) * norm(&through);
+        if condition.is_nan() || condition > MAX_CONDITION {
+            return Ok(None);
+        }
+        let mut read = vec![0.0; count * n];
+        for (i, row) in (0..count).flat_map(|i| (0..count).map(move |row| (i, row))).filter(|&(i, _)| lengths[i] > 0) {
+            read[row * n + first[i]] = through[row * count + i];
+        }
+        let mut drives: Vec<(Vec<f64>, Vec<f64>)> =
+            direct.iter().map(|f| (vec![0.0; n], dense::multiply(&through, f, count, count, 1))).collect();
+        let mut system = vec![0.0; n * n];
+        let mut start = vec![0.0; n];
+        for i in 0..count {
+            (first[i]..(first[i] + lengths[i]).saturating_sub(1)).for_each(|row| system[row * n + row + 1] = step);
+            for &(exponent, value) in initial.get(i).into_iter().flatten() {
+                let power = integer(exponent)?;
+                #[allow(clippy::cast_precision_loss)]
+                let factorial: f64 = (1..=power).map(|k| k as f64).product();
+                start[first[i] + power] += value * factorial;
+            }
+        }
+        for &(i, eta, source, c) in terms.iter().filter(|t| t.1 > 0) {
+            let (row, gain) = (first[i] + eta - 1, step * c);
+            match source.checked_sub(count) {
+                None => {
+                    (0..n).for_each(|j| system[row * n + j] += gain * read[source * n + j]);
+                    drives.iter_mut().for_each(|(b, d)| b[row] += gain * d[source]);
+                }
+                Some(q) => drives[q].0[row] += gain,
+            }
+        }
+        let mut model = Self { states: n, outputs: count, system, drives, read, start };
+        model.balance();
+        Ok(Some(model))
+    }
+
+    /// Scale the states by powers of two until off-diagonal rows and columns of hA are of equal size (Parlett and
+    /// Reinsch, 1969).
+    fn balance(&mut self) {
+        let n = self.states;
+        let mut moved = true;
+        // Each sweep reduces the norm, and a reducible matrix stops when its coupling is negligible.
+        for _ in 0..MAX_STATES {
+            if !std::mem::take(&mut moved) {
+                break;
+            }
+            for i in 0..n {
+                let sum = |of: &dyn Fn(usize) -> usize| {
+                    (0..n).filter(|&j| j != i).map(|j| self.system[of(j)].abs()).sum::<f64>()
+                };
+                let (column, row) = (sum(&|j| j * n + i), sum(&|j| i * n + j));
+                let ratio = (row / column).log2() * 0.5;
+                if !ratio.is_finite() || ratio.abs() < 1.0 {
+                    continue;
+                }
+                // State i becomes `factor` times as small.
+                let factor = ratio.round().exp2();
+                (0..n).filter(|&j| j != i).for_each(|j| {
+                    self.system[j * n + i] *= factor;
+                    self.system[i * n + j] /= factor;
+                });
+                self.read.iter_mut().skip(i).step_by(n).for_each(|v| *v *= factor);
+                self.drives.iter_mut().for_each(|(b, _)| b[i] /= factor);
+                self.start[i] /= factor;
+                moved = true;
+            }
+        }
+    }
+
+    /// Recursion over one sampling interval; None if it overflows.
+    fn discretize<'a>(&self, inputs: &'a [Input]) -> Result<Option<Recursion<'a>>> {
+        let n = self.states;
+        let Some(interval) = Transition::new(&self.system, n, 1.0) else { return Ok(None) };
+        let mut channels = Vec::with_capacity(inputs.len());
+        for (input, (drive, direct)) in inputs.iter().zip(&self.drives) {
+            let nearest = input.delay.round();
+            let is_whole = (input.delay - nearest).abs() <= DELAY_TOLERANCE * nearest.max(1.0);
+            let delay = if is_whole { nearest } else { input.delay };
+            let fraction = delay - delay.floor();
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let whole = delay.floor().min(1e18) as usize;
+            let all = dense::multiply(&interval.first, drive, n, n, 1);
+            let channel = match input.between {
+                Intersample::Linear => {
+                    let later = dense::multiply(&interval.second, drive, n, n, 1);
+                    let now = all.iter().zip(&later).map(|(a, b)| a - b).collect();
+                    let samples = match delay {
+                        0.0 => Cow::Borrowed(input.samples.as_slice()),
+                        _ => Cow::Owned(delay_samples(&input.samples, delay, input.before)?),
+                    };
+                    Channel { samples, lag: 0, before: input.before, now, later, direct: direct.clone() }
+                }
+                Intersample::Hold if fraction == 0.0 => Channel {
+                    samples: Cow::Borrowed(&input.samples),
+                    lag: whole,
+                    before: input.before,
+                    now: all,
+                    later: vec![0.0; n],
+                    direct: direct.clone(),
+                },
+                Intersample::Hold => {
+                    // The next value arrives within the interval and acts over the rest of it.
+                    let rest = 1.0 - fraction;
+                    let Some(part) = Transition::new(&self.system, n, rest) else { return Ok(None) };
+                    let later: Vec<f64> =
+                        dense::multiply(&part.first, drive, n, n, 1).into_iter().map(|v| v * rest).collect();
+                    let now = all.iter().zip(&later).map(|(a, b)| a - b).collect();
+                    let (samples, direct) = (Cow::Borrowed(input.samples.as_slice()), direct.clone());
+                    Channel { samples, lag: whole.saturating_add(1), before: input.before, now, later, direct }
+                }
+            };
+            channels.push(channel);
+        }
+        let finite = channels.iter().flat_map(|c| c.now.iter().chain(&c.later).chain(&c.direct));
+        if !finite.chain(&self.start).chain(&self.read).all(|v| v.is_finite()) {
+            return Ok(None);
+        }
+        // Columns are contiguous, so that the states of a step are independent sums.
+        let growth = (0..n * n).map(|k| interval.growth[k % n * n + k / n]).collect();
+        Ok(Some(Recursion { states: n, outputs: self.outputs, growth, read: self.read.clone(), channels }))
+    }
+}
+
+/// e^M − I, φ₁(M) and φ₂(M) of a row-major n × n matrix.
+struct Transition {
+    growth: Vec<f64>,
+    first: Vec<f64>,
+    second: Vec<f64>,
+}
+
+impl Transition {
+    /// Functions of `share` times the matrix, by scaling and squaring; None if they overflow.
+    #[allow(clippy::cast_possible_truncation)]
+    fn new(matrix: &[f64], n: usize, share: f64) -> Option<Self> {
+        let norm = (0..n).map(|i| (0..n).map(|j| matrix[i * n + j].abs()).sum::<f64>()).fold(0.0_f64, f64::max) * share;
+        if !norm.is_finite() {
+            return None;
+        }
+        let halvings = if norm > 0.5 { norm.log2().ceil() as i32 + 1 } else { 0 };
+        let scaled: Vec<f64> = matrix.iter().map(|v| v * share * 0.5_f64.powi(halvings)).collect();
+        let with_diagonal = |mut matrix: Vec<f64>, value: f64| {
+            (0..n).for_each(|i| matrix[i * n + i] += value);
+            matrix
+        };
+        let product = |a: &[f64], b: &[f64]| dense::multiply(a, b, n, n, n);
+        // Σ M^k/(k + 2)! by Horner's rule.
+        let mut second = vec![0.0; n * n];
+        let mut coefficient: f64 = (1..TAYLOR_TERMS + 2).map(f64::from).product::<f64>().recip();
+        for k in (0..TAYLOR_TERMS).rev() {
+            second = with_diagonal(product(&scaled, &second), coefficient);
+            coefficient *= f64::from(k + 2);
+        }
+        let mut first = with_diagonal(product(&scaled, &second), 1.0);
+        let mut growth = product(&scaled, &first);
+        for _ in 0..halvings {
+            let squared = product(&first, &first);
+            second.iter_mut().zip(&squared).for_each(|(v, s)| *v = 0.25 * (s + 2.0 * *v));
+            let risen = product(&growth, &first);
+            first.iter_mut().zip(&risen).for_each(|(v, r)| *v += 0.5 * r);
+            let squared = product(&growth, &growth);
+            growth.iter_mut().zip(&squared).for_each(|(v, s)| *v = 2.0 * *v + s);
+        }
+        let finite = growth.iter().chain(&first).chain(&second).all(|v| v.is_finite());
+        finite.then_some(Self { growth, first, second })
+    }
+}
+
+/// Input of a recursion.
+struct Channel<'a> {
+    samples: Cow<'a, [f64]>,
+    /// Rows by which the samples are late, and the value before them.
+    lag: usize,
+    before: f64,
+    /// Gains of a row's own value and of the next row's value on the next state.
+    now: Vec<f64>,
+    later: Vec<f64>,
+    /// Direct gain on each output.
+    direct: Vec<f64>,
+}
+
+/// Linear recursion of the states from row to row.
+struct Recursion<'a> {
+    states: usize,
+    outputs: usize,
+    /// e^{hA} − I, column-major.
+    growth: Vec<f64>,
+    read: Vec<f64>,
+    channels: Vec<Channel<'a>>,
+}
+
+impl Recursion<'_> {
+    /// Samples of the outputs from an initial state.
+    fn run(&self, mut state: Vec<f64>, rows: usize, stop: &Stop) -> Result<Vec<f64>> {
+        let n = self.states;
+        let mut out = vec![0.0; self.outputs * rows];
+        if rows == 0 {
+            return Ok(out);
+        }
+        let mut forcing = vec![0.0; BLOCK_ROWS * n];
+        let mut history = vec![0.0; BLOCK_ROWS * n];
+        let mut values = vec![0.0; BLOCK_ROWS + 1];
+        for begin in (0..rows).step_by(BLOCK_ROWS) {
+            stop.check()?;
+            let count = BLOCK_ROWS.min(rows - begin);
+            forcing.fill(0.0);
+            for channel in &self.channels {
+                for (row, value) in values.iter_mut().enumerate() {
+                    *value = match (begin + row).checked_sub(channel.lag) {
+                        Some(k) => channel.samples.get(k).copied().unwrap_or(0.0),
+                        None => channel.before,
+                    };
+                }
+                for (gains, shift) in [(&channel.now, 0), (&channel.later, 1)] {
+                    if gains.iter().any(|&gain| gain != 0.0) {
+                        for (sums, &value) in forcing.chunks_exact_mut(n).zip(&values[shift..]) {
+                            sums.iter_mut().zip(gains).for_each(|(sum, gain)| *sum += gain * value);
+                        }
+                    }
+                }
+                for (samples, &gain) in out.chunks_exact_mut(rows).zip(&channel.direct).filter(|&(_, &g)| g != 0.0) {
+                    let samples = &mut samples[begin..begin + count];
+                    samples.iter_mut().zip(&values).for_each(|(y, value)| *y += gain * value);
+                }
+            }
+            // Common sizes get loops of constant length.
+            match n {
+                0 => {}
+                1 => advance(1, &self.growth, &mut state, &forcing, &mut history),
+                2 => advance(2, &self.growth, &mut state, &forcing, &mut history),
+                3 => advance(3, &self.growth, &mut state, &forcing, &mut history),
+                4 => advance(4, &self.growth, &mut state, &forcing, &mut history),
+                _ => advance(n, &self.growth, &mut state, &forcing, &mut history),
+            }
+            for (i, samples) in out.chunks_exact_mut(rows).enumerate() {
+                for (j, &gain) in self.read[i * n..][..n].iter().enumerate().filter(|&(_, &gain)| gain != 0.0) {
+                    let samples = &mut samples[begin..begin + count];
+                    let column = history.iter().skip(j).step_by(n);
+                    samples.iter_mut().zip(column).for_each(|(y, x)| *y += gain * x);
+                }
+            }
+            state.iter_mut().filter(|x| x.abs() < SMALLEST_STATE).for_each(|x| *x = 0.0);
+        }
+        Ok(out)
+    }
+}
+
+/// Advance the state by one block of rows; `history` are the states before each row's step.
+#[inline(always)]
+fn advance(n: usize, growth: &[f64], state: &mut [f64], forcing: &[f64], history: &mut [f64]) {
+    let (growth, state) = (&growth[..n * n], &mut state[..n]);
+    for (force, past) in forcing.chunks_exact(n).zip(history.chunks_exact_mut(n)) {
+        past.copy_from_slice(state);
+        for i in 0..n {
+            state[i] += force[i];
+        }
+        for j in 0..n {
+            for i in 0..n {
+                state[i] += growth[j * n + i] * past[j];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{respond, Input, Transition};
+    use crate::equation::{Equation, Structure, Term};
+    use crate::error::Error;
+    use crate::parallel::Stop;
+    use crate::signal::block_pulse::Intersample;
+
+    /// e^{−λh} − I, φ₁ and φ₂ of the chain of two poles, from its partial fractions.
+    fn two_poles(fast: f64, slow: f64) -> [f64; 3] {
+        // Element (1, 1) of a function of [[−(f + s), f], [−s, 0]] with the eigenvalues −f and −s.
+        let of = |z: fn(f64) -> f64| (-slow * z(-fast) + fast * z(-slow)) / (fast - slow);
+        [of(|z| z.exp_m1()), of(|z| z.exp_m1() / z), of(|z| (z.exp_m1() / z - 1.0) / z)]
+    }
+
+    #[test]
+    fn slow_poles_keep_their_digits_beside_fast_ones() {
+        for fast in [1e1, 1e4, 1e8, 1e12] {
+            for slow in [1.0, 1e-3, 1e-6] {
+                let root = f64::sqrt(fast * slow);
+                let matrix = [-(fast + slow), root, -root, 0.0];
+                let found = Transition::new(&matrix, 2, 1.0).map(|t| [t.growth[3], t.first[3], t.second[3]]);
+                let apart = found.map(|f| f.iter().zip(two_poles(fast, slow)).map(|(a, b)| (a / b - 1.0).abs()));
+                let worst = apart.map_or(f64::NAN, |a| a.fold(0.0, f64::max));
+                // The second function loses six digits of the reference by cancellation at 1e-6.
+                assert!(worst < 1e-9, "{fast:e}, {slow:e}: {worst:e}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_nilpotent_chain_is_exact() {
+        let mut chain = vec![0.0; 16];
+        (0..3).for_each(|i| chain[5 * i + 1] = 1.0);
+        let found = Transition::new(&chain, 4, 0.5).map(|t| (t.growth[3], t.first[3], t.second[3]));
+        assert_eq!(found, Some((0.5_f64.powi(3) / 6.0, 0.5_f64.powi(3) / 24.0, 0.5_f64.powi(3) / 120.0)));
+    }
+
+    #[test]
+    fn growth_beyond_the_range_of_numbers_has_no_transition() {
+        assert!(Transition::new(&[1e3], 1, 1.0).is_none());
+        assert!(Transition::new(&[-1e300], 1, 1.0).is_some());
+        assert!(Transition::new(&[f64::INFINITY], 1, 1.0).is_none());
+    }
+    #[test]
+    fn a_stop_ends_the_recursion() {
+        let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 1, order: 0.0 }] };
+        let samples = vec![1.0; 5];
+        let ramp = [Input { signal: 1, samples, between: Intersample::Hold, delay: 0.0, before: 0.0 }];
+        let equations = [Equation { structure, coefficients: vec![1.0] }];
+        let stop = Stop::default();
+        let of = || respond(&equations, &ramp, &[], 1.0, 5, &stop);
+        assert_eq!(of(), Ok(Some(vec![0.0, 1.0, 2.0, 3.0, 4.0])));
+        stop.set();
+        assert_eq!(of(), Err(Error::Interrupted));
+    }
+}
