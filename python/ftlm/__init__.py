@@ -47,6 +47,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.estimation.verdict import Verdict as Verdict
     from ftlm.experiment_design.design_input import design_input as design_input
     from ftlm.experiment_design.result import DesignedInput as DesignedInput
+    from ftlm.findings import Finding as Finding
     from ftlm.fractional_calculus import block_pulse_matrix as block_pulse_matrix
     from ftlm.fractional_calculus import fractional_derivative as fractional_derivative
     from ftlm.fractional_calculus import fractional_integral as fractional_integral
@@ -124,6 +125,7 @@ _MODULE_BY_NAME = {
         "estimation.verdict": "Validation Verdict",
         "experiment_design.design_input": "design_input",
         "experiment_design.result": "DesignedInput",
+        "findings": "Finding",
         "fractional_calculus": "block_pulse_matrix fractional_derivative fractional_integral haar_inverse haar_matrix "
         "haar_transform operational_matrix",
         "io.dialect": "Assumption Layout",

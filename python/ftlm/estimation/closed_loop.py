@@ -11,6 +11,7 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.fit import Fit
+from ftlm.findings import Finding, finding
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import minimum_norm_solution
 from ftlm.utils.parameters import parameter
@@ -26,8 +27,8 @@ MIN_ROWS_PER_LAG = 15
 MIN_FIRST_STAGE_F = 10.0
 
 
-def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[str]]:
-    """Return runs whose inputs are replaced by their part explained by a reference, and warnings.
+def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[Finding]]:
+    """Return runs whose inputs are replaced by their part explained by a reference, and findings.
 
     Controller and loop form one linear filter from reference to input. Least squares over all runs fits it, as in the
     first step of the two-stage method (Van den Hof and Schrama, An indirect method for transfer function estimation
@@ -74,7 +75,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
         if dense == DENSE_LAG_COUNTS[0] or dense * MIN_ROWS_PER_LAG < shortest
     ]
     answers: dict[str, list[Floats]] = {}
-    warnings = []
+    findings = []
     for name in inputs:
         measured = np.concatenate([run[name] for run in runs])
         # Every coefficient too many takes a share of the noise with it: the least Bayesian criterion.
@@ -84,13 +85,9 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
         answers[name] = np.split(fits[best], ends)
         found = first_stage_f(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
         if found < MIN_FIRST_STAGE_F:
-            warnings.append(
-                f"{reference} says little of {name} beside the noise in it (F = {found:.2g}, {MIN_FIRST_STAGE_F:g} "
-                "are needed): a "
-                "weak instrument, with which estimates are biased and their intervals too narrow; move the reference "
-                "more, or longer"
-            )
-    return [_run_with_inputs(run, k, answers) for k, run in enumerate(runs)], warnings
+            numbers = {"f": found, "needed": MIN_FIRST_STAGE_F}
+            findings.append(finding("reference_weak", input=name, reference=reference, **numbers))
+    return [_run_with_inputs(run, k, answers) for k, run in enumerate(runs)], findings
 
 
 def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
@@ -126,8 +123,8 @@ def _run_with_inputs(run: Run, number: int, answers: dict[str, list[Floats]]) ->
     )
 
 
-def mark_reference_fit(fit: Fit, reference: str, warnings: Sequence[str]) -> Fit:
-    """Return a fit with the reference recorded in its settings and warnings."""
+def mark_reference_fit(fit: Fit, reference: str, findings: Sequence[Finding]) -> Fit:
+    """Return a fit with the reference recorded in its settings and findings."""
     # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
-    own = [w for w in fit.warnings if "are not white" not in w]
-    return replace(fit, warnings=[*own, *warnings], settings={**fit.settings, "reference": reference})
+    own = [f for f in fit.findings if f.code != "residuals_not_white"]
+    return replace(fit, findings=[*own, *findings], settings={**fit.settings, "reference": reference})

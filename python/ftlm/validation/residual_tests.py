@@ -16,13 +16,14 @@ from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import DataError, ModelError
+from ftlm.findings import Finding, finding, texts
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import Cell, symbol_html
 from ftlm.utils.linalg import blockwise_triangular_factor, dot, orthonormal, projections, triangular_factor
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
     NORMAL_99,
     SIGNIFICANCE_LEVEL,
@@ -435,7 +436,7 @@ class Residuals:
                 f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
                 f"   {test.verdict}"
             )
-        lines += describe_failed_tests(self)
+        lines += texts(failed_tests(self))
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -604,52 +605,41 @@ def _independence(
     return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
 
 
-def describe_failed_tests(tests: Residuals) -> list[str]:
-    """Describe every failed test, and detected feedback."""
-    words = []
+def failed_tests(tests: Residuals) -> list[Finding]:
+    """Return every failed test, and detected feedback, as findings."""
+    found = []
     for name, output in tests.outputs.items():
         if not math.isfinite(output.rms):
-            words.append(f"{name}: the free run leaves the range of numbers, so its residuals cannot be tested")
+            found.append(finding("out_of_range", output=name))
             continue
         white = output.whiteness
         if not white.passed:
-            words.append(
-                f"{name}: residuals are not white (Ljung-Box {white.statistic:.3g} over {white.lags[-1]} lags, 99 % "
-                f"limit {white.limit:.3g}): the model leaves something out"
-            )
+            numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
+            found.append(finding("output_not_white", output=name, **numbers))
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
-                why = f"its limit is {test.limit:.3g}: too few samples for residuals of this colour; give a longer run"
-                if math.isnan(test.limit):
-                    why = f"{signal} does not move; give a run in which it does"
-                words.append(f"{name}: whether residuals follow {signal} is undecided: {why}")
+                code = "follow_undecided_still" if math.isnan(test.limit) else "follow_undecided"
+                found.append(finding(code, output=name, input=signal, limit=test.limit))
             elif not test.passed:
-                words.append(
-                    f"{name}: residuals still follow {signal} (correlation {value:.2g} at lag {lag}, 99 % limit "
-                    f"{test.limit:.2g}): not all of what {signal} does is in the model"
-                )
-        words += [describe_feedback(name, signal, output) for signal in output.feedback]
-    return words
+                numbers = {"value": value, "lag": lag, "limit": test.limit}
+                found.append(finding("residuals_follow_input", output=name, input=signal, **numbers))
+        found += [feedback_finding(name, signal, output) for signal in output.feedback]
+    return found
 
 
-def describe_feedback(name: str, signal: str, output: OutputResiduals) -> str:
-    """Describe feedback found in residuals and its consequence for the estimates."""
+def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding:
+    """Return feedback found in residuals, with its consequence for the estimates."""
     test = output.feedback_tests[signal]
     how = f"{signal} answers what {name} did before" if not test.instant else f"{signal} answers {name} within a sample"
     or_else = "" if not test.instant else f" (or {signal} feeds through to {name} directly: then add that term)"
-    found = f"{name}: {how} (statistic {test.statistic:.3g}, 99 % limit {test.limit:.3g}): a closed loop{or_else}"
-    if output.whiteness.passed:
-        return f"{found}; with white residuals output error has no bias from it, equation-error methods have"
-    return (
-        f"{found}, and residuals are not white: the noise that comes back with {signal} biases estimates, which their "
-        f"intervals do not know; record what drives the loop and name it with {parameter('reference')}, or open the "
-        "loop"
-    )
+    code = "loop_harmless" if output.whiteness.passed else "loop_found"
+    numbers = {"how": how, "statistic": test.statistic, "limit": test.limit, "or_else": or_else}
+    return finding(code, output=name, input=signal, **numbers)
 
 
-def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RATIO) -> list[str]:
-    """Describe failed residual tests, except for outputs with a normalized residual of at most ``floor``.
+def residual_findings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RATIO) -> list[Finding]:
+    """Return failed residual tests, except for outputs with a normalized residual of at most ``floor``.
 
     Feedback is reported only if residuals are not white: only then does it bias the output-error estimate.
     """
@@ -657,7 +647,7 @@ def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RA
     harmless = {
         n: replace(output, feedback_tests={}) if output.whiteness.passed else output for n, output in kept.items()
     }
-    return describe_failed_tests(replace(tests, outputs=harmless))
+    return failed_tests(replace(tests, outputs=harmless))
 
 
 def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
