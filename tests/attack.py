@@ -327,7 +327,7 @@ import attack, ftlm
 run = attack.sample_run()
 equation = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
 found = ftlm.search_orders(
-    run, equation, ftlm.lattice(step={step}), store={store!r}, m=64, pruning=False, threads=2
+    run, equation, ftlm.order_grid(increment={step}), store={store!r}, m=64, pruning=False, threads=2
 )
 print(found)
 """
@@ -376,7 +376,7 @@ call = lambda: ftlm.fractional_derivative(x, 0.5, step=0.1)
     "search of one equation": """
 run = ftlm.Run.from_arrays(inputs={"u": rng.standard_normal(2000)}, outputs={"y": rng.standard_normal(2000)}, step=0.01)
 equation = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
-call = lambda: ftlm.search_orders(run, equation, ftlm.lattice(step=0.01))
+call = lambda: ftlm.search_orders(run, equation, ftlm.order_grid(increment=0.01))
 """,
     "identification": """
 run = ftlm.Run.from_arrays(inputs={"u": rng.standard_normal(4000)}, outputs={"y": rng.standard_normal(4000)}, step=0.01)
@@ -465,6 +465,21 @@ def loops(table, count):
     table.tried("calls of control and a rig's loop", count)
 
 
+def odd_arguments(table):
+    """Every public function and method with an odd value for each argument."""
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    import odd
+
+    tried = 0
+    for name, parameter, word, wrong in odd.calls():
+        tried += 1
+        if wrong is not None:
+            table.broken("odd arguments of public functions", f"{name}({parameter}={word}): {wrong}")
+    table.tried("odd arguments of public functions", tried)
+
+
 class Table:
     """What was tried and what broke."""
 
@@ -518,6 +533,7 @@ def main():
         if not given.only_calls:
             way_out(table)
             loops(table, given.files)
+            odd_arguments(table)
             outputs(table, folder)
             files(table, folder, given.files)
             presses(table, folder)

@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm import _core
 from ftlm.errors import ModelError
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import apply_along_axis, as_floats, check_pulses, real_number
 
 
+@check_arguments
 def fractional_integral(
     x: ArrayLike,
     order: float,
@@ -59,6 +61,7 @@ def fractional_integral(
     return apply_along_axis("x", x, axis, lambda rows: _core.fractional_integral(rows, eta, width, rule))
 
 
+@check_arguments
 def fractional_derivative(
     x: ArrayLike,
     order: float,
@@ -119,6 +122,7 @@ def fractional_derivative(
     return apply_along_axis("x", x, axis, work)
 
 
+@check_arguments
 def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     """Haar coefficients, coarse to fine, of pulse means: the orthogonal matrix of paper (29) applied in O(m).
 
@@ -142,6 +146,7 @@ def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     return apply_along_axis("x", x, axis, _core.haar_transform)
 
 
+@check_arguments
 def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     """Pulse means from Haar coefficients: the transpose of :func:`haar_transform`.
 
@@ -174,6 +179,7 @@ def _step(m: int, duration: float) -> float:
     return length / m
 
 
+@check_arguments
 def haar_matrix(m: int) -> NDArray[np.float64]:
     """Orthogonal Haar matrix (paper (27), (29)).
 
@@ -195,6 +201,7 @@ def haar_matrix(m: int) -> NDArray[np.float64]:
     return _core.haar_matrix(check_pulses(m))
 
 
+@check_arguments
 def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.float64]:
     """Fractional integration matrix of block pulses (paper (32)), upper triangular.
 
@@ -223,6 +230,7 @@ def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
     return _core.block_pulse_matrix(real_number("order", order), m, _step(m, duration))
 
 
+@check_arguments
 def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.float64]:
     """Fractional integration matrix of Haar wavelets (paper (37)), by the two-sided fast Haar transform, O(m^2).
 

@@ -13,6 +13,8 @@ from typing import Any
 from rich.progress import Progress as RichProgress
 from rich.progress import TaskID
 
+from ftlm.utils.formatting import EscapedStream, escape_controls, escape_standard_streams
+
 #: Work that ends sooner shows no bar.
 BAR_DELAY_S = 1.0
 #: Work that takes longer [s] is announced with its estimated duration.
@@ -108,16 +110,21 @@ class _Bars:
 
         with self._lock:
             if self._shown is None:
+                stream: Any = sys.stderr
+                escaped = isinstance(stream, EscapedStream)
                 self._shown = Progress(
                     TextColumn("{task.description}"),
                     BarColumn(),
                     TextColumn("{task.fields[counted]}"),
                     TextColumn("{task.fields[pruned]}"),
                     TextColumn("{task.fields[left]}"),
-                    console=Console(stderr=True),
+                    console=Console(file=stream.stream) if escaped else Console(stderr=True),
                     transient=True,
                 )
                 self._shown.start()
+                if escaped:
+                    # The display has put streams of its own in place, which print above the bars.
+                    escape_standard_streams()
             return self._shown.add_task("", total=total, counted="", pruned="", left="")
 
     def update(self, task: TaskID, **state: Any) -> None:
@@ -128,7 +135,7 @@ class _Bars:
                 room = max(
                     self._shown.console.width - sum(len(f) + 1 for f in figures) - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS
                 )
-                label = str(state["description"])
+                label = escape_controls(str(state["description"]))
                 label = label if len(label) <= room else f"{label[: room - 1].rstrip(' ,')}…"
                 self._shown.update(task, **state | {"description": label})
 

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from ftlm.data.run import Run
-from ftlm.errors import ModelError
+from ftlm.errors import DataError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.methods import EstimationMethod
 from ftlm.structure.order import Values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
-from ftlm.utils.validation import Floats
+from ftlm.utils.arguments import check_arguments
+from ftlm.utils.validation import Floats, as_array
 
 try:
     _base, _validation = (importlib.import_module(f"sklearn.{part}") for part in ("base", "utils.validation"))
 except ImportError:
     raise ModelError("scikit-learn is not installed; pip install 'ftlm[sklearn]'") from None
+
+
+#: Largest deviation of a step of a data frame's index from the median step, relative to it.
+MAX_INDEX_JITTER_SHARE = 0.02
 
 
 class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.BaseEstimator):  # type: ignore[misc, name-defined]
@@ -30,7 +35,8 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
     ----------
     structure
         An equation in words, a structure, or ``"auto"``: D^alpha y0 = a0 y0 + b0_0 u0 + b0_1 u1 …, one alpha for all
-        outputs. Inputs are the columns of X in the order in which they appear in it, outputs those of y.
+        outputs. Columns of several inputs or outputs are taken by name from a data frame, otherwise in the order in
+        which the signals appear in the structure. ``"auto"`` takes columns in their order.
     step
         Time between rows [s].
     orders
@@ -40,9 +46,10 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
     offset
         As of :func:`ftlm.identify`; it belongs to the fitted rows and is no part of a prediction.
     continues
-        Rows that are predicted follow the fitted ones without a gap, as those of ``TimeSeriesSplit`` do: the free run
-        goes through the fitted inputs first. Rows that are the fitted ones themselves are predicted from their start.
-        If not, every prediction starts from rest.
+        Rows that are predicted follow the fitted ones without a gap, as those of ``TimeSeriesSplit`` do without
+        ``gap``: the simulation goes through the fitted inputs first. Rows that are the fitted ones themselves are
+        predicted from their start. If not, every prediction starts from rest. The index of a data frame shows a gap,
+        which is refused. An array shows none, so that ``gap`` must be 0 with arrays.
     threads
         Threads of a fit; one, for scikit-learn runs several fits at once.
 
@@ -56,6 +63,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         Inputs.
     """
 
+    @check_arguments
     def __init__(
         self,
         structure: str | Structure = "auto",
@@ -75,52 +83,66 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         self.continues = continues
         self.threads = threads
 
+    @check_arguments
     def fit(self, X: Any, y: Any) -> FractionalRegressor:
         """Identify the structure from rows ordered in time.
 
         Parameters
         ----------
         X
-            Inputs, shape (n, inputs), a row an instant.
+            Inputs, shape (n, inputs), a row an instant; a data frame's index of numbers or dates increases by one step.
         y
             Outputs, shape (n,) or (n, outputs).
 
         Raises
         ------
         ValueError
-            What scikit-learn refuses of arrays; numbers of columns that are not those of the structure.
+            What scikit-learn refuses of arrays; numbers of columns that are not those of the structure, or names of
+            several.
         DataError, ModelError, ConvergenceError
             See :func:`ftlm.identify`.
         """
+        for name, values in (("X", X), ("y", y)):
+            as_array(name, values)
+        index, columns = _index(X), _columns(y)
         X, y = _validation.validate_data(
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=8
         )
         table = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
         wanted = self._structure(X.shape[1], table.shape[1])
-        self._inputs = tuple(s for s in wanted.signals if s not in wanted.outputs)
-        for what, names, count in (("X", self._inputs, X.shape[1]), ("y", wanted.outputs, table.shape[1])):
+        inputs = tuple(s for s in wanted.signals if s not in wanted.outputs)
+        for what, names, count in (("X", inputs, X.shape[1]), ("y", wanted.outputs, table.shape[1])):
             if len(names) != count:
                 raise ValueError(f"{what} has {count} columns, and the structure has {len(names)}: {', '.join(names)}")
-        run = self._run(X, table, wanted.outputs, "fit")
+        by_name = not isinstance(self.structure, str) or self.structure != "auto"
+        self._inputs = _in_order("X", inputs, getattr(self, "feature_names_in_", None) if by_name else None)
+        self._outputs = _in_order("y", wanted.outputs, columns if by_name else None)
+        self._index = _check_index(index)
+        run = self._run(X, table, "fit")
         self.identification_ = identify(run, wanted, method=self.method, threads=self.threads, offset=self.offset)
         self.model_ = self.identification_.model
         self._fitted, self._flat = X.copy(), np.ndim(y) == 1
         return self
 
+    @check_arguments
     def predict(self, X: Any) -> Floats:
         """Simulate rows of inputs; returns shape (n,) or (n, outputs), as y had."""
         _validation.check_is_fitted(self)
+        as_array("X", X)
+        index = _check_index(_index(X))
         X = _validation.validate_data(self, X, reset=False, dtype=np.float64)
         before = 0
         if self.continues and not np.array_equal(X, self._fitted):
+            if index is not None and self._index is not None:
+                _check_index(np.concatenate([self._index, index]), len(self._fitted))
             before = len(self._fitted)
             X = np.concatenate([self._fitted, X])
-        rows, outputs = len(X), self.model_.outputs
+        rows = len(X)
         # A free run needs a few instants; what is held beyond the last row changes nothing before it.
         X = np.concatenate([X, np.repeat(X[-1:], max(3 - rows, 0), axis=0)])
-        run = self._run(X, np.zeros((len(X), len(outputs))), outputs, "predict")
-        free = self.model_.simulate(run, initial={o: {} for o in outputs})
-        out: Floats = np.stack([free[o] for o in outputs], axis=1)[before:rows]
+        run = self._run(X, np.zeros((len(X), len(self._outputs))), "predict")
+        free = self.model_.simulate(run, initial={o: {} for o in self._outputs})
+        out: Floats = np.stack([free[o] for o in self._outputs], axis=1)[before:rows]
         return out[:, 0] if self._flat else out
 
     def _structure(self, inputs: int, outputs: int) -> Structure:
@@ -139,6 +161,48 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
             )
         return equation(words, orders=self.orders)
 
-    def _run(self, X: Floats, y: Floats, outputs: tuple[str, ...], name: str) -> Run:
-        columns = dict(zip(self._inputs, X.T, strict=True))
-        return Run.from_arrays(step=self.step, inputs=columns, outputs=dict(zip(outputs, y.T, strict=True)), name=name)
+    def _run(self, X: Floats, y: Floats, name: str) -> Run:
+        inputs, outputs = (dict(zip(n, v.T, strict=True)) for n, v in ((self._inputs, X), (self._outputs, y)))
+        return Run.from_arrays(step=self.step, inputs=inputs, outputs=outputs, name=name)
+
+
+def _columns(table: Any) -> list[str] | None:
+    """Return the names of a data frame's columns; None for anything else."""
+    names = list(getattr(table, "columns", ()))
+    return names if names and all(isinstance(name, str) for name in names) else None
+
+
+def _in_order(what: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the signal of each column: by name if there are several named ones, otherwise by position."""
+    if columns is None or len(signals) < 2:
+        return signals
+    names = tuple(map(str, columns))
+    if sorted(names) != sorted(signals):
+        raise ValueError(
+            f"{what} has the columns {', '.join(names)}, and the structure has {', '.join(signals)}; rename the "
+            f"columns, or pass {what}.to_numpy() in the order of the structure"
+        )
+    return names
+
+
+def _index(table: Any) -> Floats | None:
+    """Return the index of a data frame as numbers; None if it has none of numbers or dates."""
+    index = getattr(table, "index", None)
+    kind = getattr(getattr(index, "dtype", None), "kind", "")
+    if kind == "M":
+        index = np.asarray(index, dtype="datetime64[ns]").astype(np.int64)
+    return np.asarray(index, dtype=np.float64) if kind and kind in "iufM" else None
+
+
+def _check_index(index: Floats | None, fitted: int = 0) -> Floats | None:
+    """Return the index of rows; raise if it does not increase by one step."""
+    steps = np.diff(index) if index is not None else np.zeros(0)
+    usual = float(np.median(steps)) if steps.size else 1.0
+    bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_SHARE * usual)))
+    if not bad.size:
+        return index
+    where = "between the fitted rows and those of X" if fitted == bad[0] + 1 else f"after row {bad[0]} of X"
+    raise DataError(
+        f"X: its index does not go on by one step {where}, {bad.size} such places in all, and rows are instants of "
+        "one record; leave out no row in between (gap=0, no shuffling), or reset the index if none is missing"
+    )

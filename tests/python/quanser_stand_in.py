@@ -13,7 +13,7 @@ import types
 import numpy as np
 
 from ftlm import rig
-from ftlm.rig import watchdog
+from ftlm.rig import virtual_board, watchdog
 
 STEP_LIMIT = 0x7FFFFFFF
 
@@ -355,7 +355,7 @@ class HIL:
             board.note(f"watchdog_start({seconds!r})")
         board.timeout, board.last_reload = seconds, board.time
         if board.page is not None:
-            board.process = watchdog.start(board.page, keep=True)
+            board.process = virtual_board.start_watchdog(board.page, keep=True)
             board.page.set("timeout", seconds)
 
     def watchdog_reload(self):

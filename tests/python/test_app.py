@@ -2,6 +2,7 @@
 
 import ast
 import asyncio
+import http.client
 import json
 import os
 import re
@@ -27,6 +28,7 @@ from ftlm.app.session import Session, safe_name
 from ftlm.app.subprocess_task import Task, TaskError
 from ftlm.cli.main import app
 from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.utils.resources import python_child
 
 TOKEN, HOST = "0123456789abcdef", "127.0.0.1:8347"
 HOSTILE = "<script>hacked=1</script><img src=x onerror=hacked=1>\"' & {{70707*7}}"
@@ -324,13 +326,14 @@ def test_all_files_together_have_a_limit(page, monkeypatch):
     )
     assert status == 413
     assert "remove one" in told(text)
-    assert [p.name for p in page.desk.folder.iterdir()] == ["a.csv"]
+    assert [p.name for p in page.desk.folder.iterdir()] == ["key-a.csv"]
 
 
 async def put_beside(desk, name, size):
     """A file that is there without having been read, which costs a process."""
-    (desk.folder / name).write_bytes(b"x" * size)
-    desk.files[name] = desks.File(name, name, size)
+    file = desks.File(f"key-{name.partition('.')[0]}", name, size)
+    desk.files[file.key] = file
+    (desk.folder / file.stored_name).write_bytes(b"x" * size)
 
 
 def test_more_files_than_there_may_be_are_refused(page):
@@ -343,16 +346,16 @@ def test_more_files_than_there_may_be_are_refused(page):
 
 def test_a_file_that_is_being_read_is_not_yet_fitted_and_says_so(page):
     page.loop(put_beside(page.desk, "large.csv", 1))
-    wanted = {"estimation": "large.csv", "structure": "D y = a y + b u"}
+    wanted = {"estimation": "key-large", "structure": "D y = a y + b u"}
     for path in ("models", "check"):
         text = page.own("POST", path, wanted)[2]
         assert "'large.csv' is still being read; wait until its columns are shown" in told(text)
     # What was read before is no longer meant once it is read anew.
-    page.desk.files["large.csv"].preview = {"problem": "", "options": {}}
-    page.desk.files["large.csv"].task = Task({}, page.desk.folder, lambda _: None)
+    page.desk.files["key-large"].preview = {"problem": "", "options": {}}
+    page.desk.files["key-large"].task = Task({}, lambda _: None)
     assert "still being read" in told(page.own("POST", "models", wanted)[2])
-    page.desk.files["large.csv"].task = None
-    page.desk.files["large.csv"].preview["problem"] = "no output is named"
+    page.desk.files["key-large"].task = None
+    page.desk.files["key-large"].preview["problem"] = "no output is named"
     assert "is no run yet: no output is named" in told(page.own("POST", "models", wanted)[2])
     assert page.desk.models == {}
 
@@ -765,7 +768,7 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
         await asyncio.sleep(0.03)
         assert [m.state for m in models] == ["running", *["waiting"] * 7]
         with pytest.raises(DataError, match="in use"):
-            desk.remove_file("a.csv")
+            desk.remove_file("key-a")
         desk.stop(models[1].key)
         desk.stop(models[0].key)
         await asyncio.sleep(0.05)
@@ -776,7 +779,7 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
         for model in models[3:]:
             desk.stop(model.key)
         await settled(desk)
-        desk.remove_file("a.csv")
+        desk.remove_file("key-a")
         monkeypatch.setattr(desks, "MAX_MODELS", len(desk.models))
         with pytest.raises(DataError, match="are kept"):
             desk.start(LONG)
@@ -847,9 +850,9 @@ def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_the
             assert desk.resume(one.key).version == before + 2
             desk.stop(one.key)
             await asyncio.sleep(0.03)
-        assert asked == [f"{model.key}.ftlm", None, f"{model.key}.ftlm", None]
+        assert asked == [str(desk.folder / f"{model.key}.ftlm"), None] * 2
         # Another file of that name is another file.
-        desk.remove_file("a.csv")
+        desk.remove_file("key-a")
         desk.files["other"] = desks.File("other", "a.csv", 1)
         with pytest.raises(DataError, match="no longer on the page"):
             desk.resume(model.key)
@@ -1100,6 +1103,57 @@ def test_who_does_not_read_an_answer_loses_it(wired):
 
 def run_command(*words):
     return CliRunner().invoke(app, ["app", *map(str, words)])
+
+
+def test_no_child_imports_an_uploaded_file(tmp_path, content):
+    """Modules of the names that a child imports first, and an empty entry of the path, which is the working folder."""
+    pytest.importorskip("uvicorn")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "ftlm", "app", "--port", "0", "--no-browser"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": f":{tmp_path / 'nothing'}", "TMPDIR": str(temporary)},
+    )
+    try:
+        address = re.search(r"http://(127\.0\.0\.1:\d+)(/\S+/)", process.stdout.readline())
+        mark = tmp_path / "ran"
+        module = f"open({str(mark)!r}, 'a').write(__file__)\n".encode()
+        names = ("sitecustomize", "usercustomize", "jinja2", "numpy", "scipy", "json", "runpy")
+        for name, body in [*((f"{name}.py", module) for name in names), ("lag.csv", content)]:
+            client = http.client.HTTPConnection(address[1], timeout=60)
+            headers = {"Origin": f"http://{address[1]}", "Content-Type": RAW}
+            client.request("POST", f"{address[2]}files?name={name}", body, headers)
+            assert client.getresponse().status == 200
+            client.close()
+        stored = [path.name for path in temporary.rglob("*.*")]
+        assert len(stored) == len(names) + 1
+        assert all(re.fullmatch(r"[0-9a-f]{16}\.(py|csv)", name) for name in stored)
+    finally:
+        process.terminate()
+        process.wait(30)
+        process.stdout.close()
+    assert not mark.exists()
+
+
+def test_children_search_neither_the_working_folder_nor_relative_entries(tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text("raise SystemExit('imported')")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import json, os, sys, ftlm; print(json.dumps([os.getcwd(), sys.path, os.environ.get('PYTHONPATH')]))"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", f":.:{tmp_path}")
+    monkeypatch.setattr(sys, "path", ["", ".", str(tmp_path), "relative", *sys.path])
+    for site in (True, False):
+        ran = subprocess.run(**python_child(script, site=site), capture_output=True, text=True, check=True)
+        folder, searched, variable = json.loads(ran.stdout)
+        assert (Path(folder), variable) == (Path(sys.prefix), None)
+        assert all(map(os.path.isabs, searched))
+        assert str(tmp_path) not in searched
 
 
 def test_what_is_missing_is_named(monkeypatch):

@@ -190,6 +190,83 @@ def test_no_code_is_run_or_unpickled_from_data():
         assert "shell" not in keywords, path
 
 
+#: Functions that start processes, by module; "" for those that are recognised by their name alone.
+STARTERS = {
+    "subprocess": {"run", "Popen", "call", "check_call", "check_output", "getoutput", "getstatusoutput"},
+    "os": {"system", "popen", "startfile"},
+    "": {"create_subprocess_exec", "create_subprocess_shell", "ProcessPoolExecutor", "subprocess_exec"},
+}
+STARTER_PATTERN = re.compile(r"(exec|spawn|posix_spawn)[lvpe]*|fork(pty)?")
+
+
+def starts_process(call):
+    """Whether a call starts a process."""
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    owner = ast.unparse(call.func.value) if isinstance(call.func, ast.Attribute) else ""
+    return (
+        name in STARTERS[""]
+        or name in STARTERS.get(owner, ())
+        or (owner == "os" and STARTER_PATTERN.fullmatch(name) is not None)
+    )
+
+
+def careless_processes(source):
+    """Calls that start a process in another way than `python_child` says, and imports that may."""
+    tree = ast.parse(source)
+    functions = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    careful = {
+        call
+        for function in functions
+        if "python_child(" in ast.unparse(function)
+        for call in ast.walk(function)
+        if isinstance(call, ast.Call) and any(k.arg is None for k in call.keywords)
+    }
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and starts_process(n)]
+    taken = [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module in ("subprocess", "os")]
+    found = [ast.unparse(call) for call in calls if call not in careful]
+    found += [ast.unparse(n) for n in taken]
+    return found + [
+        ast.unparse(n)
+        for n in ast.walk(tree)
+        if isinstance(n, (ast.Import, ast.ImportFrom))
+        and {name.split(".")[0] for name in (*(a.name for a in n.names), getattr(n, "module", None) or "")}
+        & {"multiprocessing", "pty"}
+    ]
+
+
+def test_every_process_is_started_in_one_way():
+    found = {name_of(path): careless_processes(path.read_text(encoding="utf-8")) for path in PYTHON}
+    assert {name: calls for name, calls in found.items() if calls} == {}
+    users = [name_of(p) for p in PYTHON if "python_child(" in p.read_text(encoding="utf-8")]
+    assert sorted(users) == [
+        "python/ftlm/app/subprocess_task.py",
+        "python/ftlm/io/isolated_reader.py",
+        "python/ftlm/rig/virtual_board.py",
+        "python/ftlm/utils/resources.py",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("def f():\n    subprocess.run(**python_child(p), stdin=0)", 0),
+        ("def f():\n    subprocess.run([sys.executable, p])", 1),
+        ("def f():\n    python_child(p)\n    subprocess.Popen([p])", 1),
+        ("subprocess.run(**options)", 1),
+        ("async def f():\n    await asyncio.create_subprocess_exec(p)", 1),
+        ("os.execv(p, [])", 1),
+        ("os.fork()", 1),
+        ("from subprocess import run", 1),
+        ("import multiprocessing.pool", 1),
+        ("from multiprocessing import Process", 1),
+        ("from concurrent.futures import ProcessPoolExecutor as P\nProcessPoolExecutor(2)", 1),
+        ("rig.run(commands)", 0),
+    ],
+)
+def test_the_check_for_processes_finds_them(source, count):
+    assert len(careless_processes(source)) == count
+
+
 def test_importing_the_package_imports_little():
     script = (
         "import sys; before = set(sys.modules); import ftlm; "

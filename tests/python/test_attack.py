@@ -19,6 +19,7 @@ TESTS = Path(__file__).resolve().parents[1]
 ATTACK = runpy.run_path(str(TESTS / "attack.py"))
 HOSTILE = runpy.run_path(str(TESTS / "hostile.py"))
 sys.path.insert(0, str(TESTS))
+import odd  # noqa: E402
 import strange  # noqa: E402
 
 
@@ -67,6 +68,24 @@ def test_a_fit_is_not_asked_for_more_time_than_an_attack_waits():
 def test_calls_of_controllers_and_loops_end_in_an_answer_or_in_words():
     assert [told for _, told in strange.calls(random.Random(7), 60) if told is not None] == []
     assert all(strange.outcome(function, given) is None for function, given in strange.recipes().values())
+
+
+def test_odd_arguments_of_public_functions_end_in_an_answer_or_in_words():
+    tried = [(name, word, parameter, wrong) for name, parameter, word, wrong in odd.calls(("ftlm.", "analysis."))]
+    assert [call for call in tried if call[-1] is not None] == []
+    assert len(tried) > 10_000
+
+
+def test_the_examples_of_odd_arguments_are_refused_by_name():
+    model = ftlm.Model(ftlm.equation("D y = -3 y + 5 u"))
+    for call, words in (
+        (lambda: ftlm.equation("D y = a y + b u", delay="u"), "delay = 'u' is a str; give a mapping of names"),
+        (lambda: ftlm.energies(3), "run = 3 is a int; give Run"),
+        (lambda: model.step(10**400), "time"),
+        (lambda: ftlm.equation("D y = a y + b u", initial=range(10**12)), "initial"),
+    ):
+        with pytest.raises(ftlm.FtlmError, match=words):
+            call()
 
 
 def test_what_is_no_answer_of_a_controller_is_seen():

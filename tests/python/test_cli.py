@@ -8,6 +8,7 @@ import os
 import pty
 import re
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -18,8 +19,10 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
+from ftlm import progress
 from ftlm.cli.framework import broken_line, print_text
 from ftlm.cli.main import app
+from ftlm.utils.formatting import EscapedStream, escape_standard_streams
 from measured import DATA, needs_data
 
 
@@ -221,7 +224,7 @@ BAD = [
     (("identify", "square.csv", *SEARCH, "--delay", "u=-1"), 2, "delay"),
     (("identify", "square.csv", *SEARCH, "--initial", "sleepy"), 2, "sleepy"),
     (("identify", "square.csv", *SEARCH, "--order-grid", "beta=0:1:0.1"), 2, "beta"),
-    (("identify", "square.csv", *SEARCH[:4], "--increment", "1e-7"), 2, "step"),
+    (("identify", "square.csv", *SEARCH[:4], "--increment", "1e-7"), 2, "raise the increment"),
     (("identify", "square.csv", *SEARCH, "--validation", "none.csv"), 3, "none.csv"),
     (("identify", "square.csv", *SEARCH, "-o", "nowhere/model.json"), 3, "nowhere"),
     (("identify", "square-foreign.csv", *SEARCH, "-u", "u=amps", "-y", "y=mm"), 3, "amps"),
@@ -470,3 +473,131 @@ def test_the_list_of_commands_is_whole_sentences_and_no_help_names_a_type_of_pyt
     assert (
         "Sampling interval [s] of files" in CliRunner().invoke(app, ["identify", "-h"], env={"COLUMNS": "120"}).output
     )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Names that a terminal would obey
+
+#: A title, colours, an erased line and a turned text, as names of files, columns, units and models may hold them.
+ACTS = "\x1b]0;PWN\x07\x1b[31m\x9b2K\r\u202egpj\u2066\x7f"
+CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+EVERY_COMMAND = """
+import json, sys
+from ftlm.cli.main import app, main
+commands = json.loads(sys.argv[1])
+known = {c.name for c in app.registered_commands}
+assert known == {words[0] for words in commands}, known ^ {words[0] for words in commands}
+for words in commands:
+    sys.argv = ["ftlm", *words]
+    sys.stderr.write(f"== {words[0]}\\n")
+    try:
+        main()
+    except SystemExit as ended:
+        sys.stderr.write(f"exit {ended.code}\\n")
+"""
+
+
+def test_no_command_prints_what_a_terminal_obeys(tmp_path):
+    t = np.arange(200) * 0.05
+    rows = "\n".join(f"{a},{np.sign(np.sin(a))},{np.sin(a)}" for a in t)
+    text, mat, model, store, absent = (f"{ACTS}.{ending}" for ending in ("csv", "mat", "json", "ftlm", "none"))
+    (tmp_path / text).write_text(f"t,u{ACTS} [{ACTS}],y{ACTS}\n{rows}\n", encoding="utf-8")
+    (tmp_path / "plain.csv").write_text(f"t,u,y\n{rows}\n", encoding="utf-8")
+    # A damaged matrix whose name the library passes on in its message.
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+    label = ACTS.encode()
+    body = struct.pack("<IIIIIIII", 6, 8, 6, 0, 5, 8, 9, 9) + struct.pack("<II", 1, len(label)) + label
+    (tmp_path / mat).write_bytes(head + struct.pack("<II", 14, len(body)) + body)
+    saved = ftlm.Model(ftlm.equation("D y = -0.5 y + 0.5 u"))
+    saved.save(tmp_path / "plain.json")
+    document = json.loads((tmp_path / "plain.json").read_text(encoding="utf-8"))
+    (tmp_path / model).write_text(json.dumps({**document, "name": ACTS, "about": {ACTS: ACTS}}), encoding="utf-8")
+    (tmp_path / store).write_bytes(b"no store")
+    (tmp_path / f"{ACTS}.toml").write_text(f'"{ACTS.encode("unicode_escape").decode()}" = 3\n'.replace("\\x", "\\u00"))
+    equation, signals = f"D y = a y + b {ACTS}", ["-u", f"u=u{ACTS}", "-y", f"y=y{ACTS}", "--time", "t"]
+    fit = ["--structure", "D y = a y + b u", "--method", "least-squares"]
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c", EVERY_COMMAND),
+            json.dumps(
+                [
+                    *([name, ACTS, absent] for name in ("app", "open", "inspect", "status", "resume")),
+                    *([name, f] for name in ("open", "inspect", "status", "resume") for f in (absent, text, mat)),
+                    *([name, store] for name in ("status", "resume")),
+                    ["open", text, "--json"],
+                    ["inspect", text, *signals],
+                    ["inspect", text, "--columns", f"{ACTS}.toml"],
+                    ["inspect", text, *signals, "--units", f"y={ACTS}"],
+                    *(
+                        [n, text, *signals, "--structure", equation]
+                        for n in ("identify", "search", "certify", "select")
+                    ),
+                    ["consistency", text, *signals, "--structure", equation],
+                    ["identify", text, *signals, *fit, "--orders", f"{ACTS}=1"],
+                    ["identify", text, *signals, *fit, "-o", f"{ACTS}-made.json", "--report", f"{ACTS}.html"],
+                    ["identify", text, *signals, *fit, "-o", f"{ACTS}-made.json"],
+                    ["identify-frequency", text, "--structure", "D y = a y + b u"],
+                    ["orders", absent],
+                    *([name, file, "plain.csv"] for name in ("compare", "resid") for file in (model, absent, store)),
+                    *([name, model, text, *signals] for name in ("compare", "resid")),
+                    ["simulate", model, "plain.csv", "-o", f"{ACTS}-simulated.csv"],
+                    ["simulate", model, absent, "-o", f"{ACTS}-simulated.csv"],
+                    ["report", model, "-o", f"{ACTS}-report.html"],
+                    ["report", model, "-o", f"{ACTS}-report.html"],
+                    *(
+                        [name, file]
+                        for name in ("export", "plot", "control", "input-shaper")
+                        for file in (model, absent)
+                    ),
+                    ["export", model, "--to", "json", "-o", f"{ACTS}-export.txt"],
+                    ["control", model, "--crossover", "1", "-o", f"{ACTS}-pid.json"],
+                    ["design-input", model, "--reference-run", absent],
+                    ["design-input", absent],
+                    ["record", "--duration", "0.1", "-o", f"{ACTS}-run.csv"],
+                    ["record", "--duration", "0.1", "-o", f"{ACTS}-run.csv"],
+                    ["record", "--parameters", f"{ACTS}.toml", "-o", "x.csv"],
+                    ["demo", "-o", f"{ACTS}/nowhere/{ACTS}"],
+                    ["reproduce", "-o", f"{ACTS}/nowhere", "--arms", ACTS],
+                    ["doctor", ACTS],
+                    ["doctor"],
+                ]
+            ),
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        check=False,
+        timeout=120,
+    )
+    printed = (done.stdout + done.stderr).decode()
+    assert done.returncode == 0, printed
+    assert "Traceback" not in printed
+    assert sorted(set(CONTROLS.findall(printed))) == []
+    # They are shown, not dropped.
+    assert "\\u001b]0;PWN\\u0007" in printed
+    assert "\\u202egpj" in printed
+
+
+def test_a_bar_is_drawn_and_its_label_escaped(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    escape_standard_streams()
+    progress.BAR_DELAY_S, before = 0.0, progress.BAR_DELAY_S
+    try:
+        with progress.Progress(ACTS) as bar:
+            bar(1, 10)
+            print(f"above {ACTS}", file=sys.stderr)
+            bar(10, 10)
+    finally:
+        progress.BAR_DELAY_S = before
+    drawn = terminal.getvalue()
+    assert "\x1b[" in drawn
+    assert "PWN\x07" not in drawn
+    assert "\x9b" not in drawn
+    assert "\u202e" not in drawn
+    assert isinstance(sys.stderr, EscapedStream)

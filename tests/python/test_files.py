@@ -23,6 +23,7 @@ from ftlm.errors import DataError
 from ftlm.io import isolated_reader as apart
 from ftlm.io.dialect import Layout
 from ftlm.io.load import LoadOptions, load, run_from_tables, select_columns
+from ftlm.io.preview import open_file
 from ftlm.io.table import FileTable
 from measured import DATA, needs_data
 
@@ -286,7 +287,7 @@ BAD_CALLS = {
     "columns step": ({"columns": {"step": "fast", "outputs": ["y"]}}, ["step='fast'"]),
     "columns table": ({"columns": {"inputs": 3, "outputs": ["y"]}}, ["inputs=", "int"]),
     "columns units": ({"columns": {"units": "deg", "outputs": ["y"]}}, ["units=", "str"]),
-    "columns missing": ({"columns": "no_such.toml"}, ["no_such.toml", "does not exist"]),
+    "columns missing": ({"columns": "no_such.toml"}, ["no_such.toml", "No such file"]),
     "window": ({**HEADED, "window": (0, 99)}, ["window", "99"]),
     "name": ({**HEADED, "name": "@x"}, ["name='@x'"]),
 }
@@ -706,3 +707,29 @@ def test_measured_records_without_header():
     )
     assert (heating.length, heating.step, heating.units) == (801, 2.0, {"u": "V", "y": "degC"})
     assert heating["y"][0] == 129.32
+
+
+@pytest.mark.parametrize("header", ["Time,Q,T", "t,Q,T", "T,Q,Time"])
+def test_a_column_that_is_named_as_a_signal_is_not_taken_for_the_time(tmp_path, header):
+    clock = "t" if "t," in header[:2] else "Time"
+    columns = {clock: np.arange(60) * 0.5, "Q": np.ones(60), "T": np.linspace(20.0, 30.0, 60)}
+    path = tmp_path / "heat.csv"
+    table = np.column_stack([columns[n] for n in header.split(",")])
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    run = load(path, inputs=["Q"], outputs=["T"])
+    assert run.step == 0.5
+    assert run["T"] == pytest.approx(columns["T"])
+    opened = open_file(path, inputs=["Q"], outputs=["T"])
+    assert (opened.problem, opened.step) == ("", 0.5)
+
+
+def test_the_only_column_called_t_is_no_time_where_it_is_a_signal(tmp_path):
+    path = tmp_path / "heat.csv"
+    np.savetxt(path, np.column_stack([np.ones(60), np.arange(60.0)]), delimiter=",", header="Q,T", comments="")
+    with pytest.raises(DataError, match="no column is called t, time or seconds"):
+        load(path, inputs=["Q"], outputs=["T"])
+    # Named as both it is both.
+    assert load(path, inputs=["T"], outputs=["Q"], time="T").step == 1.0
+    scipy.io.savemat(tmp_path / "heat.mat", {"V": np.column_stack([np.arange(60.0), np.ones(60)])})
+    with pytest.raises(DataError, match="no column is called t, time or seconds"):
+        load(tmp_path / "heat.mat", inputs={"u": "V.1"}, outputs={"y": "V.2"})

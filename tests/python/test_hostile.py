@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import tomllib
+import tracemalloc
 from concurrent.futures import Executor, Future
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm import _core, rig
+from ftlm import _core, analysis, control, rig
 from ftlm.cli.main import app
 from ftlm.order_search import checkpoint as log
 from ftlm.order_search.checkpoint import read_store
@@ -211,6 +212,36 @@ def test_a_number_of_thousands_of_digits_is_an_error_in_words(written, tmp_path)
         ftlm.load(written, columns=path)
 
 
+SMALL_FILES = {
+    "model": lambda path, written: ftlm.load_model(path),
+    "controller": lambda path, written: control.load_controller(path),
+    "parameters": lambda path, written: rig.ArmParameters.of(path),
+    "columns": lambda path, written: ftlm.load(written, columns=path),
+}
+
+
+@pytest.mark.parametrize("kind", SMALL_FILES)
+def test_a_small_file_is_a_regular_file_of_little_size(kind, written, tmp_path):
+    pipe, device, folder, large, absent, closed = (tmp_path / f"{n}.toml" for n in ("p", "d", "f", "l", "a", "c"))
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    folder.mkdir()
+    with open(large, "wb") as stream:
+        stream.truncate(60 << 30)
+    closed.write_bytes(b"\xff\x00" * 100)
+    for path, words in (
+        (pipe, "is no regular file"),
+        (device, "is no regular file"),
+        (folder, "is no regular file"),
+        (large, "has 64424509440 bytes"),
+        (absent, "No such file"),
+        (closed, "c.toml"),
+    ):
+        with pytest.raises(ftlm.DataError, match=words) as refused:
+            SMALL_FILES[kind](path, written)
+        assert str(path) in str(refused.value)
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Calls
 
@@ -218,6 +249,46 @@ def test_a_number_of_thousands_of_digits_is_an_error_in_words(written, tmp_path)
 def test_a_multisine_of_years_is_refused():
     with pytest.raises(ftlm.ModelError, match=r"period = 1e\+09 s of a multisine is longer than the longest run"):
         rig.Excitation("multisine", period=1e9).commands(500.0, 1.0)
+
+
+LINK = ftlm.Model(ftlm.equation("D^2 y = -3 D y - 8 y + 5 u"))
+FREE = ftlm.equation("D^alpha y = a D^beta y + b u")
+#: Arguments that set a size, with numbers that a slip of the finger makes.
+SIZES = {
+    "rate of an excitation": lambda n: rig.Excitation().commands(n, 1.0),
+    "duration of an excitation": lambda n: rig.Excitation().commands(500.0, n),
+    "rate of a recording": lambda n: rig.record(rate=n),
+    "duration of a recording": lambda n: rig.record(duration=n, limit=600.0),
+    "rate of a loop": lambda n: rig.control(lambda *_: (0.0, 0.0), (0.0, 0.0), duration=1.0, rate=n),
+    "duration of a loop": lambda n: rig.control(lambda *_: (0.0, 0.0), (0.0, 0.0), duration=n),
+    "step of a resampling": lambda n: run_of().resample(1.0 / n),
+    "size of a Haar matrix": lambda n: ftlm.haar_matrix(1 << int(n).bit_length()),
+    "size of an operational matrix": lambda n: ftlm.operational_matrix(0.5, 1 << int(n).bit_length(), 1.0),
+    "block pulses": lambda n: ftlm.identify(run_of(), FREE, method="least-squares", m=int(n)),
+    "increment of a grid": lambda n: ftlm.search_orders(run_of(), FREE, ftlm.order_grid(1.0 / n), m=64),
+    "lags": lambda n: ftlm.resid(LINK, run_of(), lags=int(n)),
+    "population": lambda n: ftlm.GeneticAlgorithm(population=int(n)),
+    "seeds": lambda n: ftlm.GeneticAlgorithm(seeds=range(int(n))),
+    "records of a reproduction": lambda n: ftlm.reproduce(records=int(n)),
+    "segments": lambda n: ftlm.consistency(run_of(), LINK.structure, segments=int(n)),
+    "rate of a path": lambda n: control.point_to_point(1.0, 1.0, n),
+    "duration of a path": lambda n: control.point_to_point(1.0, n),
+    "rate of a shaper": lambda n: control.input_shaper(LINK).impulses(n),
+    "samples of a design": lambda n: control.fractional_pid(LINK, crossover=3.0, samples=int(n)),
+    "order of an approximation": lambda n: analysis.approximate(LINK, band=(0.1, 10.0), order=int(n)),
+}
+
+
+@pytest.mark.parametrize("argument", SIZES)
+def test_a_size_is_checked_before_anything_is_allocated(argument):
+    tracemalloc.start()
+    try:
+        for size in (2e8, 1e12):
+            with pytest.raises((ftlm.ModelError, ftlm.DataError)):
+                SIZES[argument](size)
+        assert tracemalloc.get_traced_memory()[1] < 32 << 20
+    finally:
+        tracemalloc.stop()
 
 
 class Empty(Executor):

@@ -14,6 +14,7 @@ import ftlm
 import strangers
 from ftlm.io import binary_reader as reader
 from ftlm.io import delimited_text as text
+from ftlm.io import dialect
 from ftlm.io import isolated_reader as apart
 from test_files import messages, rows, write
 
@@ -227,6 +228,14 @@ def test_a_hundred_thousand_columns_are_read_and_shown_in_part(tmp_path):
     assert len(str(opened)) < 6000
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_a_million_columns_are_refused_before_they_are_parsed(tmp_path, separator, monkeypatch):
+    monkeypatch.setattr(dialect, "_choose_separator", lambda *_: pytest.fail("parsed"))
+    line = separator.join(["1.5"] * 1_000_000)
+    path = write(tmp_path, f"{line}\n{line}\n")
+    messages(["line 1 has 1000000 cells, more than 100000", "transpose"], lambda: ftlm.open_file(path))
+
+
 SCRIPTS = [
     "<script>alert(1)</script>",
     "$(reboot)",
@@ -345,6 +354,20 @@ def test_a_workbook_that_is_none_or_too_large_is_refused(tmp_path):
 
 
 # --- arrays -----------------------------------------------------------------------------------------------------------
+
+
+def test_bytes_behind_an_array_of_numpy_are_refused(tmp_path):
+    """A header that says fewer rows than there are, or another type, gives other numbers without a word."""
+    stored = io.BytesIO()
+    np.save(stored, np.arange(40.0))
+    shorter = stored.getvalue().replace(b"(40,)", b"(39,)")
+    assert len(shorter) == len(stored.getvalue())
+    (tmp_path / "x.npy").write_bytes(shorter)
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("y.npy", shorter)
+    words = ["has more than the 312 bytes that its header declares", "damaged", "save it again"]
+    messages(["'the array'", *words], lambda: ftlm.load(tmp_path / "x.npy", outputs={"y": "c1"}, step=1.0))
+    messages(["'y'", *words], lambda: ftlm.load(tmp_path / "x.npz", outputs={"y": "y"}, step=1.0))
 
 
 def test_arrays_of_numpy(tmp_path):

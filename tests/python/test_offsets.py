@@ -249,7 +249,7 @@ def test_an_offset_that_is_the_input_or_that_a_method_lacks_is_refused():
 
 def test_a_model_keeps_its_offset_and_one_without_is_as_it_was(tmp_path):
     run = fractional_run(1, 0.5)
-    for offset, schema in (("none", 8), ("constant", 8)):
+    for offset, schema in (("none", 9), ("constant", 8)):
         model = ftlm.identify(run, ftlm.equation("D^0.8 y = -a y + b u", offset=offset)).model
         file = model.save(tmp_path / f"{offset}.json")
         held = json.loads(file.read_text())
@@ -513,3 +513,12 @@ def test_powers_of_time_that_an_offset_is_are_left_out(alpha, left):
     (item,) = ftlm.equation(f"D^{alpha} y = -2 y + u").equations
     assert initial_exponents(item, "caputo", "constant") == pytest.approx([*left, alpha])
     assert initial_exponents(item, "caputo", "none") == [0.0, 1.0]
+
+
+def test_a_free_run_that_diverges_has_no_offset_and_says_so():
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.ones(900)}, outputs={"y": np.arange(900.0)}, name="ramp")
+    model = ftlm.Model(ftlm.equation("D^2 y = 0.5 D y + 1e6 y + u", offset="constant"))
+    comparison = ftlm.compare(model, run)
+    assert not np.isfinite(comparison.output_error["y"].nr)
+    assert comparison.offsets == ({"y": {}},)
+    assert "offset in the equation of y in ramp: not estimated, since the free run diverges" in str(comparison)

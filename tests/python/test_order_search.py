@@ -675,7 +675,7 @@ def test_settings_that_mean_nothing_are_refused(run, options, message):
     ("make", "message"),
     [
         (lambda: ftlm.order_grid(increment=0), "order alpha: increment 0 is not positive; the paper's is 0.05"),
-        (lambda: ftlm.order_grid(increment=-0.1), "step -0.1 is not positive"),
+        (lambda: ftlm.order_grid(increment=-0.1), "increment -0.1 is not positive"),
         (lambda: ftlm.order_grid(increment="0.1"), "= '0.1' is not a number"),
         (lambda: ftlm.order_grid(alpha=(0, 2)), "alpha interval 0:2 starts outside (0, 10]"),
         (lambda: ftlm.order_grid(alpha=(1, 11)), "order alpha = 11 is outside [-3, 10]"),

@@ -506,7 +506,7 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
         (["--sine", "strange.csv"], 2, "--sine is given without --square"),
         (["--square", "strange.csv"], 3, "a stage of the arm needs I1, theta11 and theta12"),
         (["--square", "whole.csv", "--sine", "strange.csv"], 3, "lacks I1, theta12, which the square run"),
-        (["--increment", "0"], 2, "step"),
+        (["--increment", "0"], 2, "increment 0 is not positive"),
         (["--evaluations", "5"], 2, "--evaluations 5 is less than two generations"),
         (["--square", "gone.csv"], 3, "gone.csv"),
     ],

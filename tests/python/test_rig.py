@@ -289,14 +289,6 @@ def test_parameters_come_from_a_toml_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("colour = 3", "'colour' in the file is not known"),
-        ("[stage1]\nq = 1.0", "'q' in stage1 is not known"),
-        ("strain_noise = 0.1", "not a pair of numbers"),
-        ("[stage2]\na = true", "not a number"),
-        ("bits = 99", "whole number from 0 to 24"),
-        ("strain_noise = [-0.1, 0.1]", "must not be negative"),
-        ('base = "other"', "base = 'other' is not known"),
-        ('form = "newton"', "form = 'newton' is not known; use 'lagrange' or 'published'"),
         ("coupling = 7.0", "outside [0, 1]"),
         ("[stage1]\ngamma = 1.9", "order 3.05 of theta11 is 1.05 above alpha = 2"),
     ],
@@ -307,6 +299,38 @@ def test_parameters_that_cannot_be_used_are_refused(tmp_path, text, words):
     with pytest.raises(ftlm.ModelError) as refused:
         rig.record(duration=0.5, parameters=path)
     assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("couplin = 3", "unknown field `couplin` (did you mean 'coupling'?)"),
+        ("[stage1]\nq = 1.0", "unknown field `q` - at `$.stage1`"),
+        ("strain_noise = 0.1", "Expected `array`, got `float` - at `$.strain_noise`"),
+        ("strain_noise = [0.1, 0.2, 0.3]", "Expected `array` of length 2, got 3"),
+        ("[stage2]\na = true", "Expected `float`, got `bool` - at `$.stage2.a`"),
+        ("stage2 = []", "Expected `object`, got `array` - at `$.stage2`"),
+        ("bits = 99", "whole number from 0 to 24"),
+        ("bits = 9.5", "Expected `int`"),
+        ("strain_noise = [-0.1, 0.1]", "must not be negative"),
+        ("reach = nan", "reach = nan in the file is not finite"),
+        ("reach = " + "9" * 400, "Number out of range"),
+        ("bits = " + "9" * 5000, "is not a TOML file"),
+        ("reach = 1979-05-27", "Expected `float`, got `date`"),
+        ("reach = " + "[" * 50_000, "is not a TOML file"),
+        ('base = "other"', "base = 'other' is not known"),
+        ("base = []", "Expected `str`, got `array`"),
+        ('form = "newton"', "Invalid enum value 'newton'"),
+        ("\ufeffreach", "is not a TOML file"),
+    ],
+)
+def test_files_of_parameters_that_cannot_be_read_are_refused(tmp_path, text, words):
+    path = tmp_path / "arm.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ftlm.DataError) as refused:
+        rig.record(duration=0.5, parameters=path)
+    assert words in str(refused.value)
+    assert str(refused.value).startswith(("arm.toml: ", f"{str(path)!r} is not a TOML file of parameters of the arm: "))
 
 
 def test_the_stock_filter_of_a_record_is_that_of_a_model():

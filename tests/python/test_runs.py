@@ -63,7 +63,7 @@ BAD_ARRAYS = {
     "scalar": ({"inputs": {"u": 3.0}}, ["'u'", "()"]),
     "none": ({"inputs": {"u": None}}, ["'u'", "None"]),
     "one word": ({"inputs": {"u": "fast"}}, ["'u'", "fast"]),
-    "ragged": ({"inputs": {"u": [[1.0], [1.0, 2.0]]}}, ["'u'", "not an array of numbers"]),
+    "ragged": ({"inputs": {"u": [[1.0], [1.0, 2.0]]}}, ["'u'", "no array of numbers"]),
     "complex": (
         {"inputs": {"u": put(ramp(), [], 0) + 1j * (np.arange(N) >= 40)}},
         ["'u'", "row 40", "10 in all", ".real"],

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
-from sklearn.model_selection import GridSearchCV, TimeSeriesSplit, cross_val_score
+from sklearn.model_selection import GridSearchCV, KFold, TimeSeriesSplit, cross_val_score
 from sklearn.utils.estimator_checks import check_estimator
 
 import ftlm
@@ -95,6 +96,64 @@ def test_several_outputs_and_a_structure_that_is_made_already(record):
     fitted = FractionalRegressor(structure, step=STEP, method="least-squares").fit(X, both)
     assert fitted.predict(X).shape == both.shape
     assert fitted.score(X, both) > 0.999
+
+
+@pytest.fixture(scope="module")
+def frames(record):
+    """Frames of two inputs and of two outputs, each in the order of its name in the structure."""
+    u = record[0][:, 0]
+    v = np.roll(u, 37)
+    truth = ftlm.Model(ftlm.equation("D y = -3 y + 5 u - 2 v; D z = -z + u"))
+    rest = {"y": 0 * u, "z": 0 * u}
+    free = truth.simulate(ftlm.Run.from_arrays(step=STEP, inputs={"u": u, "v": v}, outputs=rest))
+    return pd.DataFrame({"u": u, "v": v}), pd.DataFrame({"y": free["y"], "z": free["z"]})
+
+
+def test_columns_of_a_frame_are_taken_by_name(frames):
+    X, y = frames
+    options = {"structure": "D y = a y + b u + c v; D z = d z + e u", "step": STEP, "method": "least-squares"}
+    plain = FractionalRegressor(**options).fit(X.to_numpy(), y.to_numpy())
+    fitted = FractionalRegressor(**options).fit(X[["v", "u"]], y[["z", "y"]])
+    assert fitted.feature_names_in_.tolist() == ["v", "u"]
+    assert fitted.model_.coefficients == plain.model_.coefficients
+    predicted = fitted.predict(X[["v", "u"]])
+    np.testing.assert_array_equal(predicted[:, ::-1], plain.predict(X.to_numpy()))
+    assert fitted.score(X[["v", "u"]], y[["z", "y"]]) > 0.99
+    with pytest.raises(ValueError, match="feature names should match"):
+        fitted.predict(X)
+    for columns, outputs, words in (
+        (
+            ["q", "p"],
+            ["y", "z"],
+            "X has the columns q, p, and the structure has u, v; rename the columns, or pass X.to_",
+        ),
+        (["u", "v"], ["y", "w"], "y has the columns y, w, and the structure has y, z"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            FractionalRegressor(**options).fit(X.set_axis(columns, axis=1), y.set_axis(outputs, axis=1))
+    # One column is no question of order, and "auto" has no names.
+    one = FractionalRegressor("D z = d z + e u", step=STEP).fit(X[["u"]].rename(columns={"u": "volt"}), y["z"])
+    assert one.model_.coefficients["e"] == pytest.approx(1.0, rel=0.1)
+    auto = FractionalRegressor(orders={"alpha": 1.0}, step=STEP, method="least-squares").fit(X[["v", "u"]], y["y"])
+    assert auto.model_.coefficients["b0_1"] == pytest.approx(5.0, rel=0.1)
+
+
+def test_a_gap_in_the_index_of_a_frame_is_refused(frames):
+    X, y = frames[0][["u"]], frames[1]["z"]
+    going = FractionalRegressor("D z = d z + e u", step=STEP, continues=True, method="least-squares")
+    assert np.all(cross_val_score(going, X, y, cv=TimeSeriesSplit(3), error_score="raise") > 0.99)
+    with pytest.raises(ftlm.DataError, match="does not go on by one step between the fitted rows and those of X"):
+        cross_val_score(going, X, y, cv=TimeSeriesSplit(3, gap=20), error_score="raise")
+    with pytest.raises(ftlm.DataError, match="after row 133 of X, 1 such places in all, and rows are instants"):
+        going.fit(X.drop(range(134, 267)), y.drop(range(134, 267)))
+    with pytest.raises(ftlm.DataError, match="leave out no row in between"):
+        cross_val_score(going, X, y, cv=KFold(3, shuffle=True), error_score="raise")
+    dated = X.set_axis(pd.date_range("2024-01-01", periods=len(X), freq="50ms"))
+    going.fit(dated[:200], y[:200])
+    assert going.predict(dated[200:]).shape == (200,)
+    assert going.predict(dated[:200]).shape == (200,)
+    with pytest.raises(ftlm.DataError, match="between the fitted rows"):
+        going.predict(dated[220:])
 
 
 def test_bad_input_is_refused_in_words(record):

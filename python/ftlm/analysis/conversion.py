@@ -18,6 +18,7 @@ from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats
 
@@ -28,6 +29,7 @@ def _comment(text: str, mark: str) -> str:
     return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
 
+@check_arguments
 def json_text(model: Model) -> str:
     """Return the transfer functions of a model as JSON, exact in powers and coefficients.
 
@@ -62,6 +64,7 @@ def json_text(model: Model) -> str:
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
+@check_arguments
 def matlab_text(model: Model) -> str:
     """Return a MATLAB script with the transfer functions as vectors, and as FOMCON ``fotf`` objects if available.
 
@@ -113,6 +116,7 @@ def matlab_text(model: Model) -> str:
     return "\n".join(lines) + "\n"
 
 
+@check_arguments
 def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> str:
     """Return a Python script that builds the python-control system without ftlm.
 
@@ -153,6 +157,7 @@ def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> 
     return "\n".join(lines) + "\n"
 
 
+@check_arguments
 def export_text(
     model: Model,
     to: Literal["control", "matlab", "json"],

@@ -19,8 +19,9 @@ from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import Complex, Floats, check_choice
+from ftlm.utils.validation import Complex, Floats, as_floats, check_choice
 
 #: A sum of coefficient * s^power, by power.
 Polynomial: TypeAlias = dict[float, float]
@@ -123,6 +124,7 @@ def coupled_outputs(model: Model, *, coupled: bool) -> list[tuple[str, ...]]:
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
+@check_arguments
 def transfer_functions(model: Model, *, coupling: str = "simulated") -> TransferFunctions:
     """Transfer functions of a model by Cramer's rule, without the sensor filter.
 
@@ -174,6 +176,7 @@ def is_coupled(coupling: str) -> bool:
     return coupling == "simulated"
 
 
+@check_arguments
 def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
     """Exact frequency response with fractional orders.
 
@@ -205,7 +208,7 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
     """
     check_no_input_nonlinearity(model, "a frequency response")
     coupled = is_coupled(coupling)
-    omega = np.asarray(w, dtype=np.float64)
+    omega = as_floats("w", w)
     if omega.ndim != 1 or omega.size == 0:
         raise DataError(f"w has shape {omega.shape}; give a vector of frequencies in rad/s")
     bad = ~(np.isfinite(omega) & (omega >= 0))
@@ -260,6 +263,7 @@ def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
     return total
 
 
+@check_arguments
 def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
     """Standard deviations of the frequency response, from the covariance of the model by the delta method.
 
@@ -335,6 +339,7 @@ def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) ->
     return new
 
 
+@check_arguments
 def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
     """Response of every output to a unit step of every input, from rest.
 
@@ -362,7 +367,7 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
         A model so unstable that the response leaves the range of numbers.
     """
     check_no_input_nonlinearity(model, "a step response")
-    t = np.asarray(time, dtype=np.float64)
+    t = as_floats("time", time)
     if t.ndim != 1 or t.size < 3 or not np.all(np.isfinite(t)) or t[0] != 0:
         raise DataError("time must be a vector of at least three instants [s] that begins with 0, such as numpy.arange")
     step = float(t[-1]) / (t.size - 1)

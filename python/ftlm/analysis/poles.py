@@ -25,6 +25,7 @@ from ftlm.analysis.frequency_response import (
 )
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import with_error
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
@@ -110,7 +111,10 @@ def common_base(powers: Sequence[float]) -> float | None:
 
 
 def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
-    """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power; None where there are none."""
+    """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power.
+
+    None without a common base, or if frequencies or coefficients are out of the range of numbers.
+    """
     lowest, highest = min(polynomial), max(polynomial)
     base = common_base([p - lowest for p in polynomial])
     if base is None or (highest - lowest) / base > MAX_ROOT_DEGREE:
@@ -118,15 +122,22 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     if highest - lowest < POWER_TOLERANCE:
         return base or 1.0, np.empty(0, dtype=np.complex128)
     degree = round((highest - lowest) / base)
+    sizes = {power: math.log(abs(value)) for power, value in polynomial.items() if value}
+    if lowest not in sizes or highest not in sizes:
+        return None
     # In units of the mean frequency all coefficients are of a size.
-    unit = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
+    unit = (sizes[lowest] - sizes[highest]) / (highest - lowest)
+    logs = {power: size - sizes[highest] + unit * (power - highest) for power, size in sizes.items()}
+    if max(abs(unit), *logs.values()) > MAX_LOG_FREQUENCY:
+        return None
     coefficients = np.zeros(degree + 1)
-    for power, value in polynomial.items():
+    for power, size in logs.items():
         at = degree - round((power - lowest) / base)
-        coefficients[at] = value / polynomial[highest] * unit ** (power - highest)
-    return base, np.asarray(np.roots(coefficients) * unit**base, dtype=np.complex128)
+        coefficients[at] = math.copysign(math.exp(size), polynomial[power] / math.copysign(1.0, polynomial[highest]))
+    return base, np.asarray(np.roots(coefficients) * math.exp(unit * base), dtype=np.complex128)
 
 
+@check_arguments
 def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     """Poles of a commensurate model on the principal sheet.
 
@@ -153,8 +164,9 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
         roots = roots_in_base(polynomial)
         if roots is None:
             raise ModelError(
-                "the orders have no common base of 0.01 or more (or a degree above 100 in it), so the model has no "
-                "polynomial whose roots could be found; use stability(), or round the orders"
+                "the orders have no common base of 0.01 or more (or a degree above 100 in it), or the poles are out of "
+                "the range of numbers, so the model has no polynomial whose roots could be found; use stability(), or "
+                "round the orders"
             )
         base, values = roots
         angle = np.angle(values)
@@ -166,6 +178,7 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
+@check_arguments
 def stability(model: Model, *, coupling: str = "simulated") -> Stability:
     """Whether a model is stable: by its poles where orders are commensurate, else by the argument principle.
 
@@ -337,6 +350,7 @@ class Mode:
         )
 
 
+@check_arguments
 def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     """Return the modes of a model for any orders, slowest first: frequency, damping and time constant of its poles.
 
@@ -547,6 +561,7 @@ class SteadyState:
     order_error: float | None = None
 
 
+@check_arguments
 def steady_states(model: Model) -> tuple[SteadyState, ...]:
     """Return the steady state of every output for every input that affects it, with coupled equations.
 
@@ -605,6 +620,7 @@ def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
     return out
 
 
+@check_arguments
 def dcgain(model: Model) -> Floats:
     """Steady-state gain of every output from every input that is not modelled.
 

@@ -18,8 +18,9 @@ from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, real_number, short_repr, whole_number
+from ftlm.utils.validation import Floats, as_floats, check_vector, real_number, short_repr, whole_number
 
 #: Maximum errors of the approximation without a warning.
 MAX_GAIN_ERROR_DB, MAX_PHASE_ERROR_DEGREES = 1.0, 5.0
@@ -81,9 +82,10 @@ class Approximation:
         """Number of states."""
         return int(self.a.shape[0])
 
+    @check_arguments
     def frequency_response(self, w: Sequence[float] | Floats) -> NDArray[np.complex128]:
         """Response of the approximation, shape (outputs, inputs, W)."""
-        omega = np.asarray(w, dtype=np.float64)
+        omega = check_vector("w", as_floats("w", w))
         system = 1j * omega[:, None, None] * np.eye(self.states) - self.a
         response = self.c @ np.linalg.solve(system, np.broadcast_to(self.b, (omega.size, *self.b.shape))) + self.d
         return np.asarray(np.moveaxis(response, 0, -1), dtype=np.complex128)
@@ -193,6 +195,7 @@ def _delay_input(builder: _Builder, source: int, delay: float) -> _Signal:
     return {last: 1.0}, {source: direct}, {}
 
 
+@check_arguments
 def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> Approximation:
     """Approximate a model by a rational state-space system.
 
@@ -309,6 +312,7 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
     return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
 
 
+@check_arguments
 def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> Any:
     """Return a python-control system that approximates a model within a band.
 

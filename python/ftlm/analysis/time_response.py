@@ -11,7 +11,7 @@ from ftlm.analysis.frequency_response import parameter_vector, response_inputs, 
 from ftlm.analysis.poles import settling_time
 from ftlm.errors import FtlmError
 from ftlm.model.model import Model, check_model
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_floats
 
 #: Default number of time points.
 DEFAULT_TIME_POINTS = 401
@@ -75,7 +75,7 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
         # Friction has no poles, and no time of its own that a program could tell.
         span = 10.0 if model.structure.has_friction else settling_time(model)
         time = np.linspace(0.0, span, DEFAULT_TIME_POINTS)
-    instants = np.asarray(time, dtype=np.float64)
+    instants = as_floats("time", time)
     centre = step_response(model, instants)
     deviation = _deviation(model, instants, impulse=kind == "impulse")
     if kind == "impulse":

@@ -16,14 +16,14 @@ from ftlm.estimation.identify import identify
 from ftlm.estimation.methods import EstimationMethod, method_with_options
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
-from ftlm.io.load import load
+from ftlm.io.load import base_name, load
 from ftlm.progress import ANNOUNCEMENT_THRESHOLD_S, format_time_left
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Offset, Structure
 from ftlm.structure_selection.result import Selection
 from ftlm.structure_selection.select import select
 from ftlm.utils.resources import estimate_duration, output_error_cost
-from ftlm.utils.validation import check_threads
+from ftlm.utils.validation import check_threads, is_run_name
 
 #: Structures with a name of their own, as Python calls.
 NAMED_STRUCTURES: dict[str, Callable[[], Structure]] = {
@@ -58,17 +58,24 @@ class RunSource:
     Parameters
     ----------
     file
-        File name in the working folder.
+        File name on the page.
     options
         Options as `ftlm.open_file` returns them, the layout as a dictionary.
+    path
+        Path under which the page stores the file; "" for its name in the working folder.
     """
 
     file: str
     options: dict[str, Any] = field(default_factory=dict)
+    path: str = ""
 
     def run(self) -> Run:
-        """Load the run."""
-        return load(self.file, **self.options)
+        """Load the run, named as if the file had its name on the page."""
+        run = load(self.path or self.file, **self.options)
+        if not self.path or run.name != base_name(Path(self.path)):
+            return run
+        name = base_name(Path(self.file))
+        return run._with(name=name if is_run_name(name) else "run")
 
     def script(self, name: str) -> list[str]:
         """Script lines that load the run."""

@@ -1,4 +1,4 @@
-"""Browser session: files in a private folder, models in a queue, and the limits of both."""
+"""Browser session: files in a private folder under their keys, models in a queue, and the limits of both."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from typing import Any
 from ftlm.app.forms import SELECTION_PHASE, FitRequest, RunSource, parse_structures
 from ftlm.app.subprocess_task import Task, TaskError
 from ftlm.errors import DataError, ModelError
+from ftlm.io.load import base_name
 from ftlm.progress import format_time_left
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import nearest, real_number
@@ -50,7 +51,7 @@ class File:
     Parameters
     ----------
     key, name, size
-        Identifier on the page, name in the folder, size in bytes.
+        Identifier on the page and in the folder, name on the page, size in bytes.
     user_options
         Options set by the user, as arguments of `ftlm.open_file`.
     preview
@@ -71,15 +72,20 @@ class File:
     task: Task | None = None
 
     @property
+    def stored_name(self) -> str:
+        """Name in the folder: the key, with the extensions by which readers tell formats apart."""
+        suffixes = re.search(r"(\.[A-Za-z0-9]{1,10}){0,2}\Z", self.name)
+        return self.key + (suffixes[0] if suffixes else "")
+
+    @property
     def is_run(self) -> bool:
         """Whether the file can be loaded as a run."""
         return self.preview is not None and not self.preview["problem"]
 
-    @property
-    def run_source(self) -> RunSource:
-        """File and arguments of `ftlm.load`, all options included."""
+    def run_source(self, folder: Path) -> RunSource:
+        """Return the file and the arguments of `ftlm.load`, all options included."""
         assert self.preview is not None
-        return RunSource(self.name, self.preview["options"])
+        return RunSource(self.name, self.preview["options"], str(folder / self.stored_name))
 
 
 @dataclass
@@ -136,7 +142,7 @@ class Session:
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        self.folder = folder or Path(tempfile.mkdtemp(prefix="ftlm-app-"))
+        self.folder = (folder or Path(tempfile.mkdtemp(prefix="ftlm-app-"))).resolve()
         self.files: dict[str, File] = {}
         self.models: dict[str, Model] = {}
         self._turn = asyncio.Lock()
@@ -147,7 +153,7 @@ class Session:
     # ------------------------------------------------------------------------------------------------------------ files
 
     def check_room(self, name: str, size: int | None) -> str:
-        """Return the name under which a file will be stored; refuse a file beyond the limits."""
+        """Return the name of a file on the page; refuse a file beyond the limits."""
         if len(self.files) >= MAX_FILES:
             raise DataError(f"{MAX_FILES} files are open, as many as there may be; remove one")
         if size is not None:
@@ -168,7 +174,7 @@ class Session:
         taken = {f.name.casefold() for f in self.files.values()}
         stem, dot, suffixes = name.partition(".")
         free, count = name, 1
-        while free.casefold() in taken or (self.folder / free).exists():
+        while free.casefold() in taken:
             count += 1
             free = f"{stem}-{count}{dot}{suffixes}"
         return free
@@ -182,12 +188,11 @@ class Session:
             The file exceeds a size limit, declared or not, or there are too many files.
         """
         free = self.check_room(name, size)
-        path, written = self.folder / free, 0
         # Its name is taken from here on; a second one of that name gets another.
-        file = File(secrets.token_hex(8), free, 0)
+        file, written = File(secrets.token_hex(8), free, 0), 0
         self.files[file.key] = file
         try:
-            with open(path, "xb") as stream:
+            with open(self.folder / file.stored_name, "xb") as stream:
                 async for chunk in chunks:
                     written += len(chunk)
                     self._check_size(name, written, file)
@@ -213,11 +218,11 @@ class Session:
         """Read the preview of a file with the user's options; an earlier reading is stopped."""
         if file.task is not None:
             file.task.stop()
-        asked = {"do": "open", "file": file.name, "options": file.user_options}
-        file.task = task = Task(asked, self.folder, lambda _: None)
+        asked = {"do": "open", "file": str(self.folder / file.stored_name), "options": file.user_options}
+        file.task = task = Task(asked, lambda _: None)
         try:
             async with self._openings:
-                told, error = await task.answer(OPEN_TIMEOUT_S), ""
+                told, error = self._with_names(await task.answer(OPEN_TIMEOUT_S)), ""
         except TaskError as failed:
             told, error = None, self.without_paths(str(failed))
         if file.task is not task:
@@ -240,7 +245,7 @@ class Session:
         if file.task is not None:
             file.task.stop()
         with contextlib.suppress(OSError):
-            (self.folder / file.name).unlink()
+            (self.folder / file.stored_name).unlink()
 
     # ----------------------------------------------------------------------------------------------------------- models
 
@@ -283,7 +288,7 @@ class Session:
             raise DataError(f"{file.name!r} is still being read; wait until its columns are shown")
         if not file.is_run:
             raise DataError(f"{file.name!r} is no run yet: {file.preview['problem'] if file.preview else file.error}")
-        return file.run_source
+        return file.run_source(self.folder)
 
     def start(self, recipe: FitRequest) -> Model:
         """Queue a model.
@@ -337,11 +342,11 @@ class Session:
             asked = {
                 "do": "model",
                 "recipe": model.recipe.to_dict(),
-                "model": f"{model.key}.json",
-                "report": f"{model.key}.html",
-                "store": f"{model.key}.ftlm" if model.recipe.is_choice else None,
+                "model": str(self.folder / f"{model.key}.json"),
+                "report": str(self.folder / f"{model.key}.html"),
+                "store": str(self.folder / f"{model.key}.ftlm") if model.recipe.is_choice else None,
             }
-            model.task = Task(asked, self.folder, lambda said: _record_progress(model, said))
+            model.task = Task(asked, lambda said: _record_progress(model, said))
             try:
                 told = await model.task.answer()
             except TaskError as failed:
@@ -349,7 +354,7 @@ class Session:
                     model.state, model.error = STATE_FAILED, self.without_paths(str(failed))
             else:
                 if model.state == STATE_RUNNING:
-                    model.state, model.description = STATE_MADE, told
+                    model.state, model.description = STATE_MADE, self._with_names(told)
             model.took += time.monotonic() - model.started_at
             model.task = None
             model.version += 1
@@ -374,10 +379,20 @@ class Session:
     # ------------------------------------------------------------------------------------------------------------- both
 
     def without_paths(self, words: str) -> str:
-        """Return a message without folders of this machine."""
-        for folder in {str(self.folder), str(self.folder.resolve())}:
-            words = words.replace(f"{folder}/", "").replace(f"{folder}\\", "").replace(folder, "the page's folder")
+        """Return a message without folders of this machine, with the names of files on the page."""
+        folder = str(self.folder)
+        words = words.replace(f"{folder}/", "").replace(f"{folder}\\", "").replace(folder, "the page's folder")
+        for file in self.files.values():
+            words = words.replace(file.stored_name, file.name).replace(file.key, base_name(Path(file.name)))
         return words
+
+    def _with_names(self, answer: Any) -> Any:
+        """Return an answer of a task with :meth:`without_paths` applied to every text."""
+        if isinstance(answer, dict):
+            return {key: self._with_names(value) for key, value in answer.items()}
+        if isinstance(answer, list):
+            return [self._with_names(value) for value in answer]
+        return self.without_paths(answer) if isinstance(answer, str) else answer
 
     async def close(self) -> None:
         """Stop all work and remove the folder."""

@@ -7,13 +7,14 @@ import contextlib
 import json
 import os
 import signal
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from ftlm.errors import DataError
+from ftlm.utils.resources import python_child
 
+_WORKER_PATH = Path(__file__).with_name("worker.py")
 #: Longest line of a task's answer. A page of charts takes some hundred kilobytes.
 MAX_ANSWER_LINE_BYTES = 64 << 20
 
@@ -28,16 +29,13 @@ class Task:
     Parameters
     ----------
     asked
-        Task for :mod:`ftlm.app.work`, as JSON.
-    folder
-        Working directory of the process.
+        Task for :mod:`ftlm.app.worker`, as JSON.
     told
         Called with each progress report.
     """
 
-    def __init__(self, asked: Mapping[str, Any], folder: Path, told: Callable[[Mapping[str, Any]], None]) -> None:
+    def __init__(self, asked: Mapping[str, Any], told: Callable[[Mapping[str, Any]], None]) -> None:
         self._asked = asked
-        self._folder = folder
         self._told = told
         self._process: asyncio.subprocess.Process | None = None
         self._ended = False
@@ -58,15 +56,13 @@ class Task:
         if self._ended:
             raise TaskError("stopped")
         # A session of its own: Ctrl-C is for the parent, and what it starts itself ends with it.
+        child = python_child(_WORKER_PATH)
         process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-P",
-            "-m",
-            "ftlm.app.worker",
+            *child.pop("args"),
+            **child,
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.DEVNULL,
-            cwd=self._folder,
             limit=MAX_ANSWER_LINE_BYTES,
             start_new_session=True,
         )

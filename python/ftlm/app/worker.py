@@ -1,7 +1,7 @@
 """Worker process that opens a file or fits a model, isolated from hostile files and long fits.
 
-Run as ``python -P -m ftlm.app.work`` in the folder of the files. The first line of standard input is the task, a JSON
-object: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …,
+Run by path (`ftlm.utils.resources.python_child`). The first line of standard input is the task, a JSON object with
+absolute paths: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …,
 "report": …}``. The process ends when standard input ends. Standard output has one JSON object per line:
 ``{"phase": words}``, ``{"done": …, "total": …}`` and finally ``{"answer": …}`` or ``{"error": words}``.
 """

@@ -13,6 +13,7 @@ from ftlm.arm.flexible_link import PARAMETER_SETS, LinkParameters, integer_order
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.fractional_calculus import fractional_derivative
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import Floats
 
 #: Range of the relaxation rates whose sum gives a force of order nu: this factor times 1/T to this factor times 1/h.
@@ -92,6 +93,7 @@ class Energies:
         return self.kinetic - self.potential
 
 
+@check_arguments
 def energies(
     run: Run, *, stage: int = 1, parameters: LinkParameters | None = None, orders: Mapping[str, float] | None = None
 ) -> Energies:

@@ -14,10 +14,12 @@ from ftlm.structure.equation import Equation, Friction, Stribeck, Term
 from ftlm.structure.order import Order
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Hints, Structure, check_offset
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import choose_text, parameter, setting
 from ftlm.utils.validation import short_repr
 
 
+@check_arguments
 @dataclass(frozen=True)
 class LinkParameters:
     """Physical parameters of one joint of the arm.
@@ -46,6 +48,7 @@ class LinkParameters:
         """Inertia ratio r = (J_1 + J_2) / J_2, by which the coefficients of the deflection exceed those of the hub."""
         return (self.hub_inertia + self.link_inertia) / self.link_inertia
 
+    @check_arguments
     def coefficients(self, stage: int) -> dict[str, float]:
         """Coefficients a, b, d, g of both equations of a stage, by name (paper, after (21))."""
         hub, deflection = 2 * stage - 1, 2 * stage
@@ -63,6 +66,7 @@ class LinkParameters:
             f"g{deflection}": -g,
         }
 
+    @check_arguments
     def lagrange_coefficients(self, stage: int) -> dict[str, float]:
         """Coefficients a, b, d, g of the hub's equation and a, b, d of the deflection's as (15) has them."""
         hub, deflection = 2 * stage - 1, 2 * stage
@@ -141,6 +145,7 @@ def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Fo
     return form, input_order
 
 
+@check_arguments
 def order_law(
     stage: int, input_order: InputOrder | None = None, *, form: Form | None = None, velocities: bool = False
 ) -> dict[str, Order]:
@@ -195,6 +200,7 @@ def order_law(
     return {name: Order.parse(text) for name, text in law.items()}
 
 
+@check_arguments
 def flexible_link(
     *,
     stage: Literal[1, 2, "both"] = 1,
@@ -492,6 +498,7 @@ def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equati
     return _append_terms(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
 
 
+@check_arguments
 def link_model(
     *,
     stage: Literal[1, 2, "both"] = 1,

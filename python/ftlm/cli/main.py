@@ -26,6 +26,7 @@ from ftlm.cli.framework import EXIT_INTERRUPTED, Command
 from ftlm.cli.model_commands import compare, export, plot, report, resid, simulate
 from ftlm.cli.other_commands import app as page
 from ftlm.cli.other_commands import demo, orders, reproduce
+from ftlm.utils.formatting import escape_standard_streams
 
 app = typer.Typer(
     name="ftlm",
@@ -91,6 +92,7 @@ def main() -> None:
         # A terminal that knows no Greek must not take a result away after an hour's work.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    escape_standard_streams()
     try:
         app()
     except KeyboardInterrupt:

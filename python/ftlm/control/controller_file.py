@@ -15,8 +15,9 @@ from ftlm.control.fractional_pid import DiscretePid, FractionalPid
 from ftlm.control.lqg import Lqg, Observer
 from ftlm.control.realization import MAX_POLES, Realisation
 from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
-from ftlm.utils.validation import Floats, error_text
+from ftlm.utils.validation import Floats, as_floats, error_text
 
 CONTROLLER_SCHEMA = 1
 #: Algorithm of each kind of controller, as text for implementations without ftlm.
@@ -149,6 +150,7 @@ class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
 CONTROLLER_FORMAT = JsonFormat("controller", "a file that ftlm control wrote", ControllerFile, CONTROLLER_SCHEMA)
 
 
+@check_arguments
 def save_controller(
     controller: DiscretePid | Lqg, path: str | os.PathLike[str], *, model: str = "", force: bool = False
 ) -> None:
@@ -185,6 +187,7 @@ def save_controller(
     write_atomically(path, msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n", force=force)
 
 
+@check_arguments
 def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
     """Read a controller written by :func:`save_controller` or ``ftlm control``.
 
@@ -270,6 +273,7 @@ class JointControllers:
         two sampling rates.
     """
 
+    @check_arguments
     def __init__(self, first: DiscretePid | Lqg | None, second: DiscretePid | Lqg | None = None) -> None:
         self.loops = (first, second)
         self._reads: list[list[int]] = []
@@ -308,8 +312,14 @@ class JointControllers:
         """Return both controllers for JSON."""
         return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
 
+    @check_arguments
     def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
         """Return both currents [A]."""
+        angles, reference = as_floats("angles", angles), as_floats("reference", reference)
+        if angles.shape != (4,) or reference.shape != (2,):
+            raise DataError(
+                f"angles and reference have shapes {angles.shape} and {reference.shape}; give (4,) and (2,)"
+            )
         first, second = (
             0.0
             if loop is None

@@ -16,8 +16,18 @@ from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_o
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr, whole_number
+from ftlm.utils.validation import (
+    Complex,
+    Floats,
+    as_complex,
+    check_vector,
+    nearest,
+    real_number,
+    short_repr,
+    whole_number,
+)
 
 #: Poles extend this factor beyond the band on both sides.
 POLE_RANGE_FACTOR = 30.0
@@ -27,6 +37,7 @@ MAX_BAND_RATIO = 1e9
 ERROR_FREQUENCIES = 200
 
 
+@check_arguments
 @dataclass(frozen=True)
 class FractionalPid:
     """Fractional PID controller kp + ki s^-lam + kd s^mu.
@@ -59,10 +70,12 @@ class FractionalPid:
                 raise ModelError(f"{name} = {value:g} is no order of a fractional PID; give one above 0, at most 2")
             object.__setattr__(self, name, value)
 
+    @check_arguments
     def response(self, w: Floats | Complex) -> Complex:
         """Exact response at frequencies above 0 [rad/s]."""
-        s = 1j * np.asarray(w)
-        return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
+        s = 1j * as_complex("w", w)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
 
     def to_dict(self) -> dict[str, Any]:
         """Return gains and orders for JSON."""
@@ -114,6 +127,7 @@ class DiscretePid:
         Orders above 1, gains that overflow, or an invalid rate, limit, band or order.
     """
 
+    @check_arguments
     def __init__(
         self,
         pid: FractionalPid,
@@ -179,9 +193,10 @@ class DiscretePid:
             for k, n, b, w in zip(bank.keeps, bank.now, bank.before, bank.weights, strict=True)
         ]
 
+    @check_arguments
     def response(self, w: Floats | Complex) -> Complex:
         """Frequency response [rad/s] of the discrete-time controller without saturation."""
-        z = np.exp(1j * np.asarray(w) / self.rate)
+        z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
 
     def reset(self) -> None:
@@ -190,6 +205,7 @@ class DiscretePid:
         self._lags: Floats | None = None
         self._error = 0.0
 
+    @check_arguments
     def __call__(self, error: float) -> float:
         """Return the output for the error of a sample."""
         if self._lags is None:
@@ -317,6 +333,7 @@ class PidDesign(LoopDesign):
     flat: tuple[float, float, float]
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
+    @check_arguments
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return the measured output, and responses to it and to the reference at frequencies [rad/s]."""
         response = DiscretePid(self.pid, self.rate).response(w)
@@ -342,6 +359,7 @@ class PidDesign(LoopDesign):
         return "\n".join(lines)
 
 
+@check_arguments
 def fractional_pid(
     model: Model,
     *,

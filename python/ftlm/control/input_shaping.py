@@ -14,10 +14,11 @@ from ftlm.analysis.poles import modes as model_modes
 from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, check_choice, short_repr, whole_number
+from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, short_repr, whole_number
 
 #: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
 SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
@@ -57,6 +58,7 @@ class Shaper:
         """Delay of a shaped reference [s]."""
         return self.times[-1]
 
+    @check_arguments
     def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
         """Residual vibration of a mode after a shaped step, relative to an unshaped one.
 
@@ -69,6 +71,7 @@ class Shaper:
         """
         return residual_vibration(np.array(self.times), np.array(self.amplitudes), frequency, damping)
 
+    @check_arguments
     def impulses(self, rate: float) -> Floats:
         """Impulses at the samples of a rate [Hz], shape (N,), with exact zeros at the poles and sum 1.
 
@@ -99,6 +102,7 @@ class Shaper:
                 taps = _convolve(np.append(taps, np.zeros(len(part) - 1)), part)
         return taps
 
+    @check_arguments
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
         """Apply the shaper to a reference or input at a sampling rate [Hz]; the length does not change.
 
@@ -118,14 +122,10 @@ class Shaper:
         ModelError
             As :meth:`impulses`.
         """
-        try:
-            given = np.asarray(reference)
-            good = given.dtype.kind in "fiu" and given.ndim in (1, 2) and given.size > 0
-        except (TypeError, ValueError):
-            good = False
-        if not good:
+        given = as_array("reference", reference)
+        if given.dtype.kind not in "fiu" or given.ndim not in (1, 2) or given.size == 0:
             raise DataError("reference is no array of numbers of shape (rows,) or (rows, columns)")
-        x = np.array(given, dtype=np.float64).reshape(len(given), -1)
+        x = as_floats("reference", given).reshape(len(given), -1)
         bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if bad.size:
             raise DataError(f"reference is not finite at row {bad[0]} ({bad.size} such rows in all)")
@@ -151,6 +151,7 @@ class Shaper:
         return f"{self.kind.upper()} shaper of {shown}: {steps}{within}"
 
 
+@check_arguments
 def input_shaper(
     model: Model | complex,
     kind: Literal["zv", "zvd"] = "zv",
@@ -232,7 +233,9 @@ def input_shaper(
 
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
     """Amplitude of the vibration after the last impulse, relative to a single impulse of sum 1 at that time."""
-    w, z = np.broadcast_arrays(np.asarray(frequency, dtype=np.float64), np.asarray(damping, dtype=np.float64))
+    w, z = np.broadcast_arrays(as_floats("frequency", frequency), as_floats("damping", damping))
+    if not (np.all(np.abs(w) < POLE_RANGE_RAD_S[1]) and np.all(np.abs(z) <= 1.0)):
+        raise DataError("frequency or damping is out of range; give rad/s, finite, and damping ratios from -1 to 1")
     pole = w * (-z + 1j * np.sqrt(np.maximum(1.0 - z * z, 0.0)))
     left = np.sum(amplitudes * np.exp(pole[..., None] * (times[-1] - times)), axis=-1)
     return np.asarray(np.abs(left), dtype=np.float64)

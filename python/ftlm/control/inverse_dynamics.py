@@ -14,8 +14,9 @@ from ftlm.control.fractional_pid import least_certain_parameter
 from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Complex, Floats, real_number, short_repr
+from ftlm.utils.validation import Complex, Floats, as_array, real_number, short_repr
 
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
 #: continuation, which the fading memory of a fractional model would never forget.
@@ -95,6 +96,7 @@ class Trajectory:
         )
 
 
+@check_arguments
 def point_to_point(
     distance: float, duration: float, rate: float = 500.0, *, dwell_before: float = 0.3, dwell_after: float = 1.2
 ) -> Floats:
@@ -135,6 +137,7 @@ def point_to_point(
     return np.asarray(reach * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3))
 
 
+@check_arguments
 def inverse_dynamics(
     design: Loop,
     path: ArrayLike,
@@ -250,12 +253,8 @@ def inverse_dynamics(
 
 def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,)."""
-    try:
-        raw = np.asarray(path)
-        good = raw.dtype.kind in "fiu" and raw.ndim == 1 and 16 <= raw.size <= MAX_PATH_ROWS
-    except (TypeError, ValueError):
-        good = False
-    if not good:
+    raw = as_array("path", path)
+    if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
         raise DataError(f"path is no array of 16 to {MAX_PATH_ROWS} numbers, one a sample")
     rows = np.array(raw, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(rows))

@@ -18,8 +18,9 @@ from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_o
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model, check_model
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Complex, Floats, nearest, short_repr
+from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, check_vector, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.
 UNKNOWN_INPUT = "unknown input"
@@ -66,6 +67,7 @@ class Observer:
         whole[:size, :size], whole[:size, size:] = a, b
         return whole, np.vstack([b, [[0.0]]]), np.column_stack([self.rows, np.zeros(len(self.rows))])
 
+    @check_arguments
     def over(self, run: Run) -> dict[str, Floats]:
         """Filter a run: estimates of every output and of the input disturbance from past and present samples.
 
@@ -104,13 +106,14 @@ class Observer:
         shown = self.realisation.c @ states[:-1]
         return dict(zip(self.realisation.outputs, shown, strict=True)) | {UNKNOWN_INPUT: states[-1]}
 
+    @check_arguments
     def rest(self, measured: Floats) -> Floats:
         """Equilibrium states for a measured value of an integrating output; 0 for any other output."""
         states = np.zeros(self.realisation.states)
         column = self.rows[:, 0]
         if self.realisation.poles[0] == 0 and np.any(column):
             at = int(np.argmax(np.abs(column)))
-            states[0] = measured[at] / column[at]
+            states[0] = _measured_values(self, measured)[at] / column[at]
         return states
 
     def __str__(self) -> str:
@@ -118,6 +121,15 @@ class Observer:
         return f"observer from {', '.join(self.measured)}: {self.realisation}; estimates {shown} (standard deviation)"
 
 
+def _measured_values(observer: Observer, measured: Sequence[float] | Floats) -> Floats:
+    """Return measured values of one sample; raise unless there is one of each measured output."""
+    values = as_floats("measured", measured)
+    if values.shape != (len(observer.measured),):
+        raise DataError(f"measured has shape {values.shape}; give one value each of {', '.join(observer.measured)}")
+    return values
+
+
+@check_arguments
 def observer(
     model: Model,
     *,
@@ -265,11 +277,12 @@ class Lqg:
         called, a command that is not finite.
     """
 
+    @check_arguments
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
         self.observer, self.tracked, self.limit = observer, tracked, check_limit(limit)
         realisation = observer.realisation
         self.rate = realisation.rate
-        gains = np.array(feedback, dtype=np.float64).reshape(1, -1)
+        gains = as_floats("feedback", feedback).reshape(1, -1).copy()
         if gains.shape[1] != realisation.states or not np.isfinite(gains).all():
             raise ModelError(f"feedback is no row of {realisation.states} finite numbers, one a state")
         self.feedback = gains
@@ -297,9 +310,10 @@ class Lqg:
         self._states: Floats | None = None
         self._applied = 0.0
 
+    @check_arguments
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
         """Return the command for the measured outputs of a sample, in the observer's order, and a reference."""
-        y = np.asarray(measured, dtype=np.float64)
+        y = _measured_values(self.observer, measured)
         with np.errstate(over="ignore", invalid="ignore"):
             if self._states is None:
                 self._states = np.append(self.observer.rest(y), 0.0)
@@ -313,9 +327,10 @@ class Lqg:
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
+    @check_arguments
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
         """Frequency responses of the command to the measured outputs, (measured, W), and to the reference, (W,)."""
-        z = np.exp(1j * np.asarray(w) / self.rate)
+        z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         a, into = self._transition_matrices()
         system = z[:, None, None] * np.eye(len(a)) - a
         right = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))
@@ -387,11 +402,13 @@ class LqgDesign(LoopDesign):
         """Sampling rate [Hz]."""
         return self.realisation.rate
 
+    @check_arguments
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return the measured outputs, and responses to each of them and to the reference at frequencies [rad/s]."""
         heard, asked = self.controller.response(w)
         return self.controller.observer.measured, -heard, asked
 
+    @check_arguments
     def with_limit(self, limit: float) -> Lqg:
         """Return the controller with a limit of its command."""
         return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)
@@ -417,6 +434,7 @@ class LqgDesign(LoopDesign):
         return "\n".join(lines)
 
 
+@check_arguments
 def lqg(
     model: Model,
     *,

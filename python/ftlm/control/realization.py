@@ -15,8 +15,18 @@ import numpy as np
 from ftlm.analysis.poles import modes
 from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Complex, Floats, error_text, real_number, short_repr, whole_number
+from ftlm.utils.validation import (
+    Complex,
+    Floats,
+    as_floats,
+    check_vector,
+    error_text,
+    real_number,
+    short_repr,
+    whole_number,
+)
 
 #: Number of fitted frequencies; the error is also evaluated between them.
 FIT_FREQUENCIES = 120
@@ -69,9 +79,10 @@ class Realisation:
         """Number of states."""
         return len(self.a)
 
+    @check_arguments
     def response(self, w: Floats) -> Complex:
         """Frequency response [rad/s] of the samples to a held input, shape (outputs, W)."""
-        z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
+        z = np.exp(1j * check_vector("w", as_floats("w", w)) / self.rate)
         system = z[:, None, None] * np.eye(self.states) - self.a
         states = np.linalg.solve(system, np.broadcast_to(self.b, (z.size, *self.b.shape)))[:, :, 0]
         return np.asarray((states @ self.c.T).T)

@@ -19,7 +19,7 @@ from ftlm.analysis.frequency_response import (
 from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
-from ftlm.utils.validation import Complex, Floats
+from ftlm.utils.validation import Complex, Floats, as_complex
 
 #: Number of frequencies of a Nyquist curve, from a thousandth of the crossover to the Nyquist frequency.
 NYQUIST_POINTS = 1500
@@ -126,7 +126,7 @@ class Plant:
         """Response of the model at frequencies [rad/s], which may be complex: s = jw."""
         if np.iscomplexobj(w):
             transfer = transfer_functions(self.model, coupling=self.coupling)
-            s: Complex = np.asarray(1j * np.asarray(w), dtype=np.complex128)
+            s: Complex = 1j * as_complex("w", w)
             above, below = (
                 value_at({p: c for c, p in pairs}, s)
                 for pairs in (transfer.numerators[self.output, self.input], transfer.denominator[self.output])

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import Complex, Floats, as_floats, real_number
+from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, real_number
 
 #: Accepted frequency units and their angular frequency [rad/s]; lower-case m means milli.
 FREQUENCY_UNITS: dict[str, float] = {
@@ -23,6 +24,7 @@ FREQUENCY_UNITS: dict[str, float] = {
 }
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class FrequencyData:
     """Frequency response measured from one input to one output; built by :meth:`from_arrays`.
@@ -66,9 +68,7 @@ class FrequencyData:
         if frequency.size == 0:
             raise DataError(f"{self.name}: there is no frequency, 0 rows; give at least one")
         _refuse(~(frequency > 0), frequency, f"{self.name}: frequency", "is not above 0; leave such rows out")
-        if np.asarray(self.response).dtype.kind not in "fiubc":
-            raise DataError(f"{self.name}: response holds {np.asarray(self.response).dtype} values; give numbers")
-        response = np.array(self.response, dtype=np.complex128)
+        response = as_complex(f"{self.name}: response", self.response)
         if response.shape != frequency.shape:
             raise DataError(
                 f"{self.name}: response has shape {response.shape}, frequency {frequency.shape}; give one value each"
@@ -87,6 +87,7 @@ class FrequencyData:
             object.__setattr__(self, "deviation", _read_only_copy(deviation))
 
     @classmethod
+    @check_arguments
     def from_arrays(
         cls,
         frequency: ArrayLike,
@@ -119,8 +120,8 @@ class FrequencyData:
         """
         factor = frequency_factor(frequency_unit)
         omega = _column(f"{name}: frequency", frequency) * factor
-        known = None if deviation is None else np.asarray(deviation)
-        return cls(omega, np.asarray(response), known, output, input, unit, name)
+        known = None if deviation is None else _column(f"{name}: deviation", deviation)
+        return cls(omega, as_complex(f"{name}: response", response), known, output, input, unit, name)
 
     @property
     def gain(self) -> Floats:
@@ -136,6 +137,7 @@ class FrequencyData:
         out[order] = np.degrees(np.unwrap(np.angle(self.response[order])))
         return out
 
+    @check_arguments
     def slice(self, low: float | None = None, high: float | None = None) -> FrequencyData:
         """Return the data between two angular frequencies, both included.
 

@@ -38,6 +38,7 @@ from ftlm.errors import DataError
 from ftlm.structure.input_nonlinearity import InputNonlinearity
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import Figures
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, join_names, names_to_columns, nearest
 
@@ -115,6 +116,7 @@ class Run:
         return run
 
     @classmethod
+    @check_arguments
     def from_arrays(
         cls,
         *,
@@ -193,6 +195,7 @@ class Run:
         return cls._from_checked(**arguments.checked_fields())
 
     @classmethod
+    @check_arguments
     def from_frame(
         cls,
         frame: object,
@@ -315,6 +318,7 @@ class Run:
         """Metadata for JSON, such as name, seed, input, parameters and faults of a rig. A copy."""
         return copy.deepcopy(self._metadata)
 
+    @check_arguments
     def __getitem__(self, name: str) -> Floats:
         """Return a signal in SI units, shape (N,), read-only; `DataError` for an unknown name."""
         try:
@@ -322,8 +326,9 @@ class Run:
         except (KeyError, TypeError):
             raise self._unknown_signal_error(name) from None
 
+    @check_arguments
     def __contains__(self, name: object) -> bool:
-        return name in self.signals
+        return isinstance(name, str) and name in self.signals
 
     def __repr__(self) -> str:
         lines = [self._headline()]
@@ -348,6 +353,7 @@ class Run:
             f"<tbody>{rows}</tbody></table>" + (f"<ul>{warnings}</ul>" if warnings else "")
         )
 
+    @check_arguments
     def window(self, start: float | None, stop: float | None) -> Run:
         """Return the rows with start ≤ t < stop.
 
@@ -378,6 +384,7 @@ class Run:
             readings = readings.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
         return self._with(_data=data, start=begin, sample_times=readings)
 
+    @check_arguments
     def resample(self, step: float) -> Run:
         """Return this run resampled to another step.
 
@@ -417,6 +424,7 @@ class Run:
         fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
         return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=readings)
 
+    @check_arguments
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run with the mean or least-squares line of some signals subtracted.
 
@@ -454,6 +462,7 @@ class Run:
             facts.append(f"detrended: {words} subtracted from {name}")
         return self._with(_data=data, notes=tuple(facts), sample_times=readings)
 
+    @check_arguments
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
         """Return this run with its inputs passed through known saturations and dead zones, sample by sample."""
         data, readings = dict(self._data), self.sample_times
@@ -463,19 +472,42 @@ class Run:
                 readings = readings.replace_signals(**{limit.signal: limit.apply(readings.data[limit.signal])})
         return self._with(_data=data, sample_times=readings)
 
+    @check_arguments
     def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
         """Return this run with new samples of some of its signals.
 
         Parameters
         ----------
         samples : mapping of str to array
-            New samples by name, shape (N,).
+            New samples by name, shape (N,), in SI units; missing (NaN or masked) ones of outputs alone.
         read : mapping of str to array, optional
             New samples at the original times, for a run with `sample_times`.
-        """
-        readings = self.sample_times and self.sample_times.replace_signals(**(read or {}))
-        return self._with(_data={**self._data, **samples}, sample_times=readings)
 
+        Raises
+        ------
+        DataError
+            If a name is no signal of this run, or its values are not N numbers, finite where it is an input.
+        """
+        checked = self._checked_samples("samples", samples, self.length)
+        readings = self.sample_times
+        if readings is not None:
+            own = {} if read is None else read
+            readings = readings.replace_signals(**self._checked_samples("read", own, readings.times.size))
+        return self._with(_data={**self._data, **checked}, sample_times=readings)
+
+    def _checked_samples(self, argument: str, given: object, length: int) -> dict[str, Floats]:
+        """Return new samples of some signals by name; raise if they do not fit this run."""
+        checked: dict[str, Floats] = {}
+        for name, values in as_mapping(argument, given).items():
+            if name not in self:
+                raise self._unknown_signal_error(name)
+            what, gaps = f"signal {name!r}", name in self.outputs
+            checked[name] = as_vector(values, what, gaps=gaps)[0]
+            check_lengths({f"run {self.name!r}": length, what: checked[name].size})
+            check_values(checked[name], what, 0, gaps=gaps)
+        return checked
+
+    @check_arguments
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.
 
@@ -515,6 +547,7 @@ class Run:
             ),
         )
 
+    @check_arguments
     def with_intersample(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with another intersample behavior of some inputs.
 
@@ -536,6 +569,7 @@ class Run:
         data = self._data if self.sample_times is None else self.sample_times.resample(behaviour, self.step)
         return self._with(_intersample=behaviour, _data={n: v[: self.length] for n, v in data.items()})
 
+    @check_arguments
     def with_outputs(self, values: Mapping[str, Floats]) -> Run:
         """Return this run with additional or replaced outputs, given on its grid without missing samples.
 
@@ -572,6 +606,7 @@ class Run:
             sample_times=readings,
         )
 
+    @check_arguments
     def select(self, names: Iterable[str]) -> Run:
         """Return this run with some of its signals only.
 
@@ -599,6 +634,7 @@ class Run:
         inputs = tuple(name for name in kept if name in self.inputs)
         return self._with(inputs=inputs, outputs=outputs)
 
+    @check_arguments
     def require_outputs(self, names: Iterable[str]) -> None:
         """Raise unless every name is an output of this run that an equation can be estimated from.
 
@@ -645,6 +681,7 @@ class Run:
 
         return picture(self, *signals)
 
+    @check_arguments
     def advice(self, structure: Structure | None = None) -> Advice:
         """Check this run for faults and poor excitation before estimation.
 
@@ -666,6 +703,7 @@ class Run:
 
         return advise(self, structure)
 
+    @check_arguments
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a csv file that `ftlm.load` reads back bit for bit, without being told the columns.
 
@@ -690,6 +728,7 @@ class Run:
 
         write_csv(self, path, force=force)
 
+    @check_arguments
     def to_parquet(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a parquet file that `ftlm.load` reads back bit for bit; needs pyarrow.
 

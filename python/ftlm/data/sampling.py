@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ftlm.errors import DataError
 from ftlm.utils.parameters import Placeholder, parameter
-from ftlm.utils.validation import Floats, as_mapping, bad_rows, join_names, nearest
+from ftlm.utils.validation import Floats, as_array, as_mapping, bad_rows, join_names, nearest
 
 Intersample: TypeAlias = Literal["zoh", "foh"]
 # Every estimator squares values; larger ones overflow in double precision.
@@ -92,21 +92,10 @@ def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats,
     """Return a float64 copy of a vector and its original dtype; with `gaps`, masked values and None become NaN."""
     if gaps and isinstance(given, (list, tuple)):
         given = [np.nan if value is None else value for value in given]
-    if gaps and np.ma.isMaskedArray(given) and np.asarray(given).dtype.kind in "biuf":
-        given = np.ma.filled(np.ma.asarray(given, dtype=np.float64), np.nan)
-    if np.ma.isMaskedArray(given):
-        mask = np.ma.getmaskarray(cast("Any", given))
-        if mask.any():
-            rows = np.flatnonzero(mask)
-            fill = "remove or fill these rows yourself"
-            raise bad_rows(thing, "masked (missing) value", int(rows[0]), rows.size, fill)
-    try:
-        array = np.asarray(given)
-        # pandas columns that allow missing values come as objects although they hold numbers.
-        if array.dtype.kind == "O" and getattr(getattr(given, "dtype", None), "kind", "O") in "biuf":
-            array = cast("Any", given).to_numpy(dtype=np.float64, na_value=np.nan)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise DataError(f"{thing}: not an array of numbers ({error}); pass one number per row") from None
+    array = as_array(thing, given, gaps=gaps)
+    # pandas columns that allow missing values come as objects although they hold numbers.
+    if array.dtype.kind == "O" and getattr(getattr(given, "dtype", None), "kind", "O") in "biuf":
+        array = cast("Any", given).to_numpy(dtype=np.float64, na_value=np.nan)
     if array.dtype.kind in "USTO" or (array.ndim == 1 and array.dtype.kind in "MmV"):
         raise _not_numbers(given, array, thing)
     if array.ndim != 1:
@@ -128,7 +117,7 @@ def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats,
 def as_seconds(given: object, thing: str) -> tuple[Floats, str] | None:
     """Convert dates to seconds since the first (and a note), time differences to seconds; None for other types."""
     try:
-        array = np.asarray(given)
+        array = as_array(thing, given)
         first = array.flat[0] if array.dtype.kind == "O" and array.size else None
         if isinstance(first, datetime.date):
             # Dates with a time zone are in universal time then, as pandas knows and NumPy does not.

@@ -19,6 +19,7 @@ from ftlm.estimation.result import Identification
 from ftlm.findings import Finding, finding, texts
 from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, format_bound
 from ftlm.utils.parameters import parameter, setting
@@ -270,6 +271,7 @@ def values_of(result: Identification) -> dict[str, float]:
     return {**result.orders, **result.coefficients, **result.parameter_values}
 
 
+@check_arguments
 def consistency(
     runs: Run | Sequence[Run],
     structure: Structure,

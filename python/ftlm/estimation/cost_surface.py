@@ -13,6 +13,7 @@ from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Identification, Task
 from ftlm.svg.heat_map import Landscape
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.validation import Floats
 
@@ -22,6 +23,7 @@ POINTS_PER_AXIS, HALF_WIDTH_ERRORS = 11, 4.0
 OPTIMUM_EVALUATIONS = 20
 
 
+@check_arguments
 def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
     """Return the two most correlated orders of a joint fit, and their correlation.
 
@@ -46,6 +48,7 @@ def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
     return names[i], names[j], float(result.fit.correlation[i, j])
 
 
+@check_arguments
 def output_error_landscape(
     result: Identification, orders: tuple[str, str] | None = None, *, refit: bool = True
 ) -> Landscape | None:

@@ -25,6 +25,7 @@ from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import MAX_DEFAULT_SEARCH_ORDER, MAX_IMPROPER_ORDER, MAX_ORDER, MIN_INPUT_ORDER, Order, Values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration
@@ -506,6 +507,7 @@ DURATION_FACTOR_RANGE = (0.4, 4.0)
 WHITENESS_LAGS = 8
 
 
+@check_arguments
 def identify_frequency(
     data: FrequencyData | Sequence[FrequencyData],
     structure: Structure | str,

@@ -24,6 +24,7 @@ from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import line_chart
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
@@ -252,6 +253,7 @@ class FrequencyIdentification:
         """Error of the model on each record."""
         return tuple(error_of(self.model, record) for record in self.data)
 
+    @check_arguments
     def validate(self, data: FrequencyData | Sequence[FrequencyData]) -> FrequencyValidation:
         """Compare the model with responses that it was not fitted to.
 
@@ -269,6 +271,7 @@ class FrequencyIdentification:
         errors = tuple(error_of(self.model, record) for record in others)
         return FrequencyValidation(others, errors, self._assess(errors, others))
 
+    @check_arguments
     def verdict(self, validation: FrequencyValidation | None = None) -> Verdict:
         """Return the verdict on the model.
 
@@ -310,6 +313,7 @@ class FrequencyIdentification:
                 return [finding("response_grows", poles=unstable_poles_text(stable.unstable_poles))]
         return []
 
+    @check_arguments
     def summary(self, validation: FrequencyValidation | None = None) -> str:
         """Return the summary: verdict, equations, parameters, modes, errors and warnings."""
         from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
@@ -362,6 +366,7 @@ class FrequencyIdentification:
             for f in (*bode_figures(model, r), nyquist_figure(model, r), relative_residual_figure(model, r))
         ]
 
+    @check_arguments
     def report(
         self, path: str | os.PathLike[str], *, validation: FrequencyValidation | None = None, force: bool = False
     ) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,8 +26,9 @@ from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Floats, check_choice, check_threads, whole_number
+from ftlm.utils.validation import Floats, check_choice, check_threads, short_repr, whole_number
 
 #: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
 ORDER_RESOLUTION = 0.001
@@ -41,6 +43,8 @@ PARENT_FRACTION = 0.25
 CROSSOVER_DISTRIBUTION_INDEX, MUTATION_DISTRIBUTION_INDEX, CROSSOVER_PROBABILITY = 15.0, 20.0, 0.9
 #: Copies of parents are not evaluated again. The number of generations may exceed the nominal one by this factor.
 MAX_GENERATION_FACTOR = 4
+#: Most seeds of one fit.
+MAX_SEEDS = 1000
 #: Range of the time estimate, relative to the first generation: most later candidates are abandoned early.
 DURATION_FACTOR_RANGE = (0.1, 1.5)
 #: Fitness of candidates that diverge or cannot become parents. PyGAD accepts finite numbers only.
@@ -445,6 +449,7 @@ def differential_evolution_search(
     return GeneticRun(orders, coefficients, each, evaluations, problem.bounds)
 
 
+@check_arguments
 @dataclass(frozen=True, kw_only=True)
 class GeneticAlgorithm:
     """Genetic algorithm on the free run, the paper's baseline; for comparison only.
@@ -470,8 +475,8 @@ class GeneticAlgorithm:
     Raises
     ------
     ModelError
-        Seeds that are none, a population outside [8, 100000], evaluations of less than two generations, bounds that are
-        no interval, an order grid or a norm that is none.
+        Seeds that are none or too many, a population outside [8, 100000], evaluations of less than two generations,
+        bounds that are no interval, an order grid or a norm that is none.
     """
 
     name: ClassVar[str] = "genetic"
@@ -494,9 +499,11 @@ class GeneticAlgorithm:
                 "give more"
             )
         given = self.seeds if isinstance(self.seeds, Iterable) and not isinstance(self.seeds, str) else [None]
-        seeds = [whole_number(s) for s in given]
-        if not seeds or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
-            raise ModelError(f"{setting('seeds')} {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
+        seeds = [whole_number(s) for s in itertools.islice(given, MAX_SEEDS + 1)]
+        if not 0 < len(seeds) <= MAX_SEEDS or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
+            raise ModelError(
+                f"{setting('seeds')} {short_repr(self.seeds)}: give 1 to {MAX_SEEDS} whole numbers from 0 to 4294967295"
+            )
         if not isinstance(self.bounds, Mapping):
             raise ModelError(f"bounds = {self.bounds!r} is no mapping; write {{name: (low, high)}}")
         for name, pair in self.bounds.items():

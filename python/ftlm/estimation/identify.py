@@ -38,6 +38,7 @@ from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
 from ftlm.structure.structure import History, Offset, Structure, check_offset
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
@@ -128,6 +129,7 @@ def _is_testable(runs: tuple[Run, ...]) -> bool:
     return sum(run.length for run in runs) <= MAX_OFFSET_TEST_SAMPLES
 
 
+@check_arguments
 def identify(
     runs: Run | Sequence[Run],
     structure: Structure,
@@ -262,7 +264,7 @@ def assess_fit(fit: Fit) -> Identification:
         fit.task,
         fit.errors,
     )
-    against = tuple(f.to_file() for f in result_findings(result))
+    against = tuple(f.to_file() for f in unique(result_findings(result)))
     if not against:
         return result
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
@@ -335,6 +337,7 @@ def identify_one(
         return None, InternalError(f"internal fault: {type(error).__name__}: {error}; please report it")
 
 
+@check_arguments
 def identify_many(
     runs: Sequence[Run | Sequence[Run]],
     structure: Structure,

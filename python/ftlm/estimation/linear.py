@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ftlm import _core
 from ftlm.data.run import Run
+from ftlm.data.sampling import check_step
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError
 from ftlm.findings import Finding, finding
 from ftlm.order_search.options import RowBasis, SearchSettings
@@ -19,8 +20,9 @@ from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Floats, whole_number
+from ftlm.utils.validation import Floats, as_floats, whole_number
 
 #: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
 #: the iteration has converged.
@@ -170,6 +172,7 @@ class MultiInnovationTrace:
     innovation_length: int
 
 
+@check_arguments
 def multi_innovation_trace(
     run: Run,
     equation: Structure,
@@ -244,6 +247,7 @@ def multi_innovation_trace(
     return MultiInnovationTrace(step, names, error, settings.innovation_length)
 
 
+@check_arguments
 def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> Figure:
     """Draw the simulation error (45) after every step of the recursion (44), as in Figure 4(b).
 
@@ -307,6 +311,7 @@ class Streaming:
         A structure that a stream cannot do, settings out of range.
     """
 
+    @check_arguments
     def __init__(
         self,
         structure: Structure,
@@ -341,10 +346,15 @@ class Streaming:
         self.structure = structure
         known = [name in inputs for name in self.signals]
         equations = [(structure_tuple(e, self.signals), [t.fixed for t in e.terms]) for e in structure.equations]
+        length = whole_number(innovation_length)
+        if length is None or not 1 <= length < 1 << 31:
+            raise ModelError(f"{setting('innovation_length')} {innovation_length!r} is no whole number from 1")
+        step, longest = check_step(step, "step"), check_step(longest, "longest")
         rows = max(2, round(longest / step) + 1)
         self.step = step
-        self._core = _core.Streaming(step, rows, known, equations, innovation_length, prior_covariance)
+        self._core = _core.Streaming(step, rows, known, equations, length, prior_covariance)
 
+    @check_arguments
     def push(self, samples: Floats) -> None:
         """Process samples of shape (n, len(signals)), in SI units and in the order of `signals`.
 
@@ -357,7 +367,10 @@ class Streaming:
         ConvergenceError
             The covariance lost its sign to rounding.
         """
-        self._core.push(np.ascontiguousarray(samples, dtype=np.float64))
+        rows = as_floats("samples", samples)
+        if rows.ndim != 2:
+            raise DataError(f"samples has shape {rows.shape}; give rows of {len(self.signals)} numbers")
+        self._core.push(rows)
 
     @property
     def coefficients(self) -> dict[str, float]:

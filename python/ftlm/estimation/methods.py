@@ -23,6 +23,7 @@ from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, S
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_choice, check_threads
 
@@ -44,6 +45,7 @@ class EstimationMethod(Protocol):
         """Fit a structure whose offset is decided to checked runs; the other arguments are those of `identify`."""
 
 
+@check_arguments
 @dataclass(frozen=True, kw_only=True)
 class OutputError:
     """Output error: orders and coefficients of all equations together, maximum likelihood for white noise.
@@ -98,6 +100,7 @@ class OutputError:
                 f"{parameter('reference')} has none; use {parameter('intervals', 'quadratic')}, or leave it out"
             )
 
+    @check_arguments
     def fit(
         self,
         runs: Sequence[Run],
@@ -177,6 +180,7 @@ class OrderSearchMethod:
         return estimate_order_search(task, self.settings(), m, workers, progress, self.store, self.executor)
 
 
+@check_arguments
 @dataclass(frozen=True, kw_only=True)
 class LeastSquares(OrderSearchMethod):
     """Least squares of the equation error: orders from the order grid, coefficients at the best of them.
@@ -197,6 +201,7 @@ class LeastSquares(OrderSearchMethod):
     name: ClassVar[str] = "least-squares"
 
 
+@check_arguments
 @dataclass(frozen=True, kw_only=True)
 class InstrumentalVariables(OrderSearchMethod):
     """Instrumental variables, refined: orders from the order grid, coefficients without the bias of noise.
@@ -215,6 +220,7 @@ class InstrumentalVariables(OrderSearchMethod):
     name: ClassVar[str] = "instrumental-variables"
 
 
+@check_arguments
 @dataclass(frozen=True, kw_only=True)
 class MultiInnovation(OrderSearchMethod):
     """Multi-innovation of the paper, (44) in closed form: orders from the order grid, coefficients with a prior.

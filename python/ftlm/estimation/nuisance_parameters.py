@@ -11,7 +11,8 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.errors import FtlmError
+from ftlm.data.sampling import MAX_SAMPLE_VALUE
+from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance
 from ftlm.estimation.output_error import (
@@ -36,7 +37,7 @@ from ftlm.simulation.output_samples import initial_exponents, is_in_motion
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Structure, offset_exponents
-from ftlm.utils.linalg import dot, orthonormal, projections, thin_svd
+from ftlm.utils.linalg import column_norms, dot, orthonormal, projections, thin_svd
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, SIGNIFICANCE_LEVEL, autoregression, chi_squared
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
@@ -103,7 +104,13 @@ def evaluate_at_point(
     start = Iterate(orders, coefficients, "given", {}, inputs)
     grid = Objective(problem, runs, [1.0] * len(structure.outputs), every=every)
     here = grid.minimize(start, 1, plain=True)
-    weights = [1.0 / max(level, 1e-300) for level in grid.rms_residuals(here).values()]
+    levels = grid.rms_residuals(here)
+    exact = [output for output, level in levels.items() if not level * MAX_SAMPLE_VALUE > 1.0]
+    if exact:
+        raise ConvergenceError(
+            f"the residuals of {', '.join(exact)} are 0 and have no distribution; use a longer record"
+        )
+    weights = [1.0 / level for level in levels.values()]
     grid = replace(grid, weights=weights)
     if len(weights) > 1:
         # Initial terms bring all outputs closest together, so that they follow the weights.
@@ -148,8 +155,8 @@ def offset_test(
             column[start:stop] = row[start:stop]
             columns.append(column)
     before = np.stack(columns, axis=1)
-    sizes = np.linalg.norm(before, axis=0)
-    left = before / np.where(sizes > 0, sizes, 1.0)
+    norms = column_norms(before)
+    left = before / np.where(norms > 0, norms, 1.0)
     basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
     for _ in range(2):
         left = left - basis @ (basis.T @ left)

@@ -24,6 +24,7 @@ from ftlm.simulation.discretization import compared_values
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import memory_limit, stop_flag
@@ -84,6 +85,7 @@ class ProfileInterval:
         """Whether the interval is unbounded on either side."""
         return not (math.isfinite(self.low) and math.isfinite(self.high))
 
+    @check_arguments
     def __contains__(self, value: float) -> bool:
         return self.low <= value <= self.high
 

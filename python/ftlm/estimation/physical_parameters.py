@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ftlm.errors import ModelError
 from ftlm.estimation.objective import propagated_errors
 from ftlm.estimation.output_error import JointFit
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import real_number
@@ -54,6 +55,7 @@ class PhysicalParameter:
         return f"{self.value:.6g} ± {format_bound(self.standard_error)} {self.unit}"
 
 
+@check_arguments
 def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str, PhysicalParameter]:
     """Compute the physical parameters of a link from its coefficients, given one parameter a stage.
 

@@ -18,6 +18,7 @@ from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
 from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import parameter
@@ -195,6 +196,7 @@ class Identification:
             )
         return physical_parameters(self.fit, known)
 
+    @check_arguments
     def profile(
         self,
         *names: str,
@@ -242,10 +244,12 @@ class Identification:
 
         return result_profiles(self, names, level, check_threads(threads), progress)
 
+    @check_arguments
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
         """Run residual tests on other runs; see :func:`ftlm.resid`."""
         return resid(self.model, runs, lags=lags)
 
+    @check_arguments
     def validate(self, runs: Run | Sequence[Run]) -> Validation:
         """Compute both errors on runs that the model was not identified from, with a verdict.
 
@@ -270,6 +274,7 @@ class Identification:
 
         return validation_with_verdict(self, validate(self, runs))
 
+    @check_arguments
     def report(
         self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
     ) -> Path:
@@ -339,6 +344,7 @@ class Identification:
             "warnings": list(self.warnings),
         }
 
+    @check_arguments
     def verdict(self, validation: Comparison | None = None) -> Verdict:
         """Return the verdict ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
 
@@ -384,6 +390,7 @@ class Identification:
             raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")
         return verdict(self, validation)
 
+    @check_arguments
     def summary(self, validation: Comparison | None = None) -> str:
         """Return the printed summary: verdict, equations, parameters, gain, modes, fit and three warnings.
 

@@ -197,7 +197,8 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
     if endless:
         yield finding("interval_open", parameter=join_names(endless), sides=", ".join(endless))
-    hidden = dict.fromkeys(o for run in result.comparison.offsets for o, values in run.items() if not values)
+    runs = zip(result.comparison.offsets, result.comparison.initial, strict=False)
+    hidden = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
     if hidden:
         yield finding("offset_hidden", output=", ".join(hidden), shown=join_names(list(hidden)))
     for group in group_findings(result.findings):

@@ -25,6 +25,7 @@ from ftlm.findings import NOT_WHITE_CODES, Finding, finding
 from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
 from ftlm.utils.statistics import NORMAL_95
@@ -143,6 +144,7 @@ class DesignTask:
     findings: tuple[Finding, ...]
 
 
+@check_arguments
 def design_input(
     model: Identification | Model,
     *,

@@ -1,8 +1,8 @@
 """Binary reader, run in a separate process because a damaged file can crash the libraries.
 
-Run by path, never imported by the parent: ``python -I reader.py KIND OPTIONS FILE…`` with KIND mat, hdf5, parquet,
-feather, numpy or sheet, and OPTIONS a JSON object with the folders of the packages and the requested sheet. For every
-file it writes one line of JSON to standard output, followed by the numbers:
+Run by path (`ftlm.utils.resources.python_child`), never imported by the parent, with the arguments KIND OPTIONS FILE…:
+KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIONS a JSON object with the requested sheet. For every file
+the reader writes one line of JSON to standard output, followed by the numbers:
 
 ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays as
 little-endian float64, column after column; or ``{"error": why, "way_out": what to do}`` and nothing else. An array may
@@ -312,6 +312,9 @@ def numpy_array(stream: Any, name: str, found: Arrays) -> Any:
     content = stream.read(size)
     if len(content) != size:
         raise UnreadableError(f"{name!r} ends after {len(content)} of {size} bytes")
+    if stream.read(1):
+        # Its header may be damaged, and the numbers then be shifted.
+        raise UnreadableError(f"{name!r} has more than the {size} bytes that its header declares")
     return numpy.frombuffer(content, kind).reshape(shape, order="F" if order else "C")
 
 
@@ -474,7 +477,6 @@ def main(arguments: list[str]) -> None:
     limit_resources()
     kind, told, *paths = arguments
     options = json.loads(told)
-    sys.path.extend(folder for folder in options["folders"] if folder not in sys.path)
     budget = SIZE_LIMIT
     for path in paths:
         budget -= answer(kind, path, sys.stdout.buffer, budget, options["sheet"])

@@ -19,6 +19,7 @@ from ftlm.io.cell_parsing import (
     split_cells,
     unit_of,
 )
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import Placeholder, layout_fields, layout_parameter, parameter
 from ftlm.utils.validation import join_names, nearest, whole_number
 
@@ -35,6 +36,7 @@ SHEET_OPTIONS, TEXT_OPTIONS = (
 _MAX_SKIPPED_LINES = 1 << 40
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Layout:
     """Layout of a text file or sheet; options that are None are detected and reported as assumptions.
@@ -109,6 +111,7 @@ class Layout:
             raise DataError(f"{layout_fields('sheet')} is a {type(self.sheet).__name__}; give the name of a sheet")
 
     @classmethod
+    @check_arguments
     def of(cls, given: object) -> Layout:
         """Build a layout from an argument: None, a layout, or a mapping of its fields."""
         if given is None:
@@ -128,6 +131,7 @@ class Layout:
                 )
         return cls(**given)
 
+    @check_arguments
     def under(self, other: Layout) -> Layout:
         """Merge two layouts; options of the other one take precedence."""
         return replace(self, **other.to_dict())
@@ -136,6 +140,7 @@ class Layout:
         """Return the options that are set, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
+    @check_arguments
     def check_used(self, path: str, kind: str, used: tuple[str, ...]) -> None:
         """Raise if an option is set that this file format does not use."""
         unused = [option for option in self.to_dict() if option not in used]
@@ -200,6 +205,8 @@ def _encoding(given: object) -> str:
 _WORDS_BY_SEPARATOR = {character: word for word, character in SEPARATOR_CHARACTERS.items()}
 SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}
 _SEPARATOR_CANDIDATES = (";", "\t", ",", None)
+#: Most columns of a text file; opening so many takes a few seconds.
+MAX_COLUMNS = 100_000
 _COMMA_THOUSANDS_PATTERN = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _COMMA_PAIRS_PATTERN = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")
 #: Column name of the sparse comment column in LabVIEW files.
@@ -303,6 +310,7 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
             f"{source}: no table below the first {given.skip} lines; say another number with "
             f"{layout_parameter(skip=Placeholder('LINES'))}"
         )
+    _check_width(kept[-2:], source)
     separator, comma, mark, cut = _choose_separator(kept, given, source)
     width = _width(cut)
     first = 0 if given.skip is not None and given.header is not None else _first_row(cut, width)
@@ -320,6 +328,17 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     if names is not None:
         width = len(names)
     return TableDialect(separator, comma, names, line, units, begin, width, layout, assumed, mark)
+
+
+def _check_width(kept: Sequence[tuple[int, str]], source: str) -> None:
+    """Raise for lines with too many columns, whatever separates them."""
+    for at, line in kept:
+        count = max(len(line.split()), *(line.count(mark) + 1 for mark in _SEPARATOR_CANDIDATES if mark is not None))
+        if count > MAX_COLUMNS:
+            raise DataError(
+                f"{source}: line {at} has {count} cells, more than {MAX_COLUMNS}; save a part of the columns, or "
+                "transpose a file with samples in columns"
+            )
 
 
 def _split_lines(

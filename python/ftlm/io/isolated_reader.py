@@ -7,7 +7,6 @@ import io
 import json
 import signal
 import subprocess
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -22,6 +21,7 @@ from ftlm.io.delimited_text import parse_text
 from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.table import Column, FileTable
 from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
+from ftlm.utils.resources import python_child
 from ftlm.utils.validation import bad_rows
 
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
@@ -101,21 +101,20 @@ def _is_hdf5(path: Path) -> bool:
 
 def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list[FileTable]:
     """Read files of one format in a separate process; a crash is attributed to the first unanswered file."""
-    folders = []
-    for package in dict.fromkeys(("numpy", kind.package)):
-        spec = importlib.util.find_spec(package)
-        if spec is None or not spec.submodule_search_locations:
-            raise DataError(
-                f"{str(paths[0])!r}: reading {kind.label} files needs {package.replace('_', '-')}; run: pip install "
-                f"'ftlm[{kind.extra}]'"
-            )
-        folders.append(str(Path(next(iter(spec.submodule_search_locations))).resolve().parent))
+    if importlib.util.find_spec(kind.package) is None:
+        raise DataError(
+            f"{str(paths[0])!r}: reading {kind.label} files needs {kind.package.replace('_', '-')}; run: pip install "
+            f"'ftlm[{kind.extra}]'"
+        )
     files = [str(path.resolve()) for path in paths]
-    told = json.dumps({"folders": folders, "sheet": layout.sheet})
-    command = [sys.executable, "-I", str(_READER_PATH), kind.kind, told, *files]
+    told = json.dumps({"sheet": layout.sheet})
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_READER_TIMEOUT_S, check=False
+            **python_child(_READER_PATH, kind.kind, told, *files),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_READER_TIMEOUT_S,
+            check=False,
         )
     except subprocess.TimeoutExpired as stopped:
         answers = _ReaderOutput(stopped.stdout or b"")

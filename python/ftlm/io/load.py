@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import stat
-import tomllib
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, cast
 
+import msgspec
+
 from ftlm.data.construction import RunArguments
-from ftlm.data.export import MAX_HEADER_BYTES, Header
+from ftlm.data.export import Header
 from ftlm.data.run import Run
 from ftlm.data.sampling import MissingPolicy, check_missing_policy
 from ftlm.data.units import split_time_header, time_unit_of
@@ -21,13 +22,25 @@ from ftlm.io.delimited_text import read_text
 from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Layout
 from ftlm.io.isolated_reader import binary_format_of, read_isolated
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
-from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.arguments import check_arguments
+from ftlm.utils.files import PACKAGE_LOGGER, read_toml
 from ftlm.utils.parameters import NAMED_COLUMNS, parameter
 from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, join_names, names_to_columns, nearest
 
 PathLike: TypeAlias = str | os.PathLike[str]
 _MAX_FILE_BYTES = 1 << 30
-_COLUMN_KEYS = ("time", "step", "inputs", "outputs", "units", "intersample", "layout")
+
+
+class _ColumnsFile(msgspec.Struct, forbid_unknown_fields=True):
+    """Content of a columns file."""
+
+    time: str | int | None = None
+    step: float | None = None
+    inputs: str | list[str] | dict[str, str | int] | None = None
+    outputs: str | list[str] | dict[str, str | int] | None = None
+    units: dict[str, str] | None = None
+    intersample: dict[str, str] | None = None
+    layout: dict[str, str | int] | None = None
 
 
 @dataclass
@@ -43,6 +56,7 @@ class ColumnSelection:
     layout: Layout
 
 
+@check_arguments
 def load(
     path: PathLike | Sequence[PathLike],
     *,
@@ -231,7 +245,8 @@ def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: Loa
                 f"{parameter('step')} is in s"
             )
         return _TimeColumn()
-    column, assumed = pool.time(wanted.time, used)
+    matrices = [column.matrix for column in used if column.matrix is not None]
+    column, assumed = pool.time(wanted.time, matrices, {column.name for column in used})
     label = f"{column.source.name}: column {column.name!r} (time)"
     facts: tuple[str, ...] = () if assumed is None else (str(assumed),)
     if column.timestamps is None:
@@ -378,31 +393,20 @@ def _words(argument: str, given: object) -> dict[str, str]:
 def _columns_file(columns: object) -> Mapping[str, object]:
     if columns is None:
         return {}
-    told: Mapping[str, object]
-    if isinstance(columns, Mapping):
-        told, source = columns, parameter("columns")
-    elif isinstance(columns, (str, os.PathLike)):
-        path = Path(columns)
-        source = repr(str(path))
-        if _size(path) > MAX_HEADER_BYTES:
-            raise DataError(f"{source} is too large for a columns file; pass the TOML file that names the columns")
-        try:
-            told = tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
-        except (OSError, ValueError, RecursionError) as error:
-            # A ValueError also for a number of thousands of digits.
-            raise DataError(
-                f"{source} is not a TOML file ({error}); write a time key and tables [inputs], [outputs] and [units] "
-                "of name = column"
-            ) from None
-    else:
+    if isinstance(columns, (str, os.PathLike)):
+        remedy = "a file with a time and tables [inputs], [outputs] and [units] of name = column"
+        read = msgspec.structs.asdict(read_toml(columns, "names of columns", remedy, _ColumnsFile))
+        return {key: value for key, value in read.items() if value is not None}
+    if not isinstance(columns, Mapping):
         raise DataError(f"{parameter('columns')} is a {type(columns).__name__}; pass a dict or the path of a TOML file")
-    unknown = [key for key in told if key not in _COLUMN_KEYS]
+    known = _ColumnsFile.__struct_fields__
+    unknown = [key for key in columns if key not in known]
     if unknown:
         raise DataError(
-            f"{source}: the key {unknown[0]!r} is unknown{nearest(unknown[0], _COLUMN_KEYS)}, {len(unknown)} in all; "
-            f"the known keys are {join_names(_COLUMN_KEYS)}"
+            f"{parameter('columns')}: the key {unknown[0]!r} is unknown{nearest(unknown[0], known)}, {len(unknown)} in "
+            f"all; the known keys are {join_names(known)}"
         )
-    return told
+    return columns
 
 
 def _apply_header(wanted: ColumnSelection, header: Header) -> None:

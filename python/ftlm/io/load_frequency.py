@@ -14,6 +14,7 @@ from ftlm.io.cell_parsing import split_unit
 from ftlm.io.dialect import Layout
 from ftlm.io.load import PathLike, base_name, read_tables
 from ftlm.io.table import Column, Pool
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import PART_COLUMNS, parameter
 from ftlm.utils.validation import Complex, Floats, join_names, nearest
@@ -172,6 +173,7 @@ class _ResponseColumn:
     word: str
 
 
+@check_arguments
 def load_frequency(
     path: PathLike,
     *,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shlex
@@ -28,6 +29,7 @@ from ftlm.io.load import (
 )
 from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, flag_of, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
@@ -301,6 +303,7 @@ class OpenedFile:
         return words
 
 
+@check_arguments
 def open_file(
     path: PathLike,
     *,
@@ -377,6 +380,14 @@ class _FilePreview:
         rows = max((0 if c.values is None else c.values.size for c in every), default=0)
         return OpenedFile(path, table.kind, rows, shown, table.layout, assumed, options, step, problem, notes)
 
+    def _named_signals(self) -> set[str]:
+        """Return the columns that the user names as inputs or outputs and that exist."""
+        names = set[str]()
+        for spec in (*self.wanted.inputs.values(), *self.wanted.outputs.values()):
+            with contextlib.suppress(DataError):
+                names.add(self.pool.find(spec, "signal").name)
+        return names
+
     def _time(self, every: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
         """Return the time column, assumptions about it, and the problem if there is none."""
         wanted, header = self.wanted, self.table.header
@@ -385,9 +396,8 @@ class _FilePreview:
         if wanted.step is not None:
             return None, (), ""
         matrices = list(dict.fromkeys(c.matrix for c in every if c.matrix is not None))
-        used = [c for c in every if c.matrix is not None] if len(matrices) == 1 else []
         try:
-            clock, assumed = self.pool.time(wanted.time, used)
+            clock, assumed = self.pool.time(wanted.time, matrices if len(matrices) == 1 else [], self._named_signals())
         except DataError as error:
             if is_response(self.pool):
                 return (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -50,7 +51,7 @@ _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 class Column:
     """Column of numbers, or the reason why it cannot be used as one.
 
-    `blank`: all problems are empty cells (NaN); `timestamps`: the column holds dates; `stated`: its unit in the file.
+    `blank`: all problems are empty cells (NaN); `timestamps`: dates of the column; `file_unit`: its unit in the file.
     """
 
     variable: str
@@ -108,8 +109,11 @@ class Pool:
                         f"column {name!r} is in {str(self._columns[name].source)!r} and {str(table.path)!r}; "
                         "rename one of the files"
                     )
-                matrix = None if column.matrix is None else prefix + column.matrix
-                self._columns[name] = replace(column, name=name, matrix=matrix)
+                if prefix:
+                    matrix = None if column.matrix is None else prefix + column.matrix
+                    self._columns[name] = replace(column, name=name, matrix=matrix)
+                else:
+                    self._columns[name] = column
 
     @property
     def columns(self) -> list[Column]:
@@ -164,13 +168,23 @@ class Pool:
             )
         return columns[position]
 
-    def time(self, spec: object, used: list[Column]) -> tuple[Column, Assumption | None]:
-        """Return the time column, given by the user or detected by name and position, and the assumption made."""
+    def time(self, spec: object, matrices: Iterable[str], signals: Collection[str]) -> tuple[Column, Assumption | None]:
+        """Return the time column, given by the user or detected by name and position, and the assumption made.
+
+        Parameters
+        ----------
+        spec
+            Name or position of the column; None: detect it.
+        matrices
+            Matrices in use, whose first columns may be the time.
+        signals
+            Names of the columns used as signals, which are not the time unless `spec` names one.
+        """
         if spec is not None:
             return self.find(spec, "time"), None
         clocks, assumed = [], None
         for table in self._tables:
-            named, why = self._clocks(table)
+            named, why = self._clocks(table, signals)
             if len(named) > 1:
                 raise DataError(
                     f"{table.path.name}: the columns {join_names(column.name for column in named)} may all be the "
@@ -180,8 +194,8 @@ class Pool:
                 assumed = Assumption("time", named[0].name, why, parameter("time", Placeholder("COLUMN")))
             clocks += named
         if not clocks:
-            matrices = dict.fromkeys(column.matrix for column in used if column.matrix is not None)
-            clocks = [self._columns[f"{matrix}.1"] for matrix in matrices]
+            first = [self._columns[f"{matrix}.1"] for matrix in dict.fromkeys(matrices)]
+            clocks = [column for column in first if column.name not in signals]
         if not clocks:
             raise DataError(
                 "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
@@ -192,9 +206,10 @@ class Pool:
             _check_agreement(clocks[0], other)
         return clocks[0], assumed
 
-    def _clocks(self, table: FileTable) -> tuple[list[Column], str]:
+    def _clocks(self, table: FileTable, signals: Collection[str]) -> tuple[list[Column], str]:
         """Candidate time columns of a file by the most reliable criterion, and the reason if it is an assumption."""
-        own = [c for c in self._columns.values() if c.source == table.path and c.matrix is None]
+        others = [c for c in self._columns.values() if c.source == table.path and c.name not in signals]
+        own = [c for c in others if c.matrix is None]
         sure = [c for c in own if is_time_name(c.variable)]
         if sure:
             return sure, ""

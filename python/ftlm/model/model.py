@@ -18,6 +18,7 @@ from ftlm.errors import ModelError
 from ftlm.findings import Finding
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Structure, check_offset_resolved
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import Complex, Floats, check_pulses
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return old if self.findings is UNSET else (*old, *self.findings)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Model:
     """Structure with numerical orders and coefficients.
@@ -171,6 +173,7 @@ class Model:
         """Names of the modeled outputs."""
         return self.structure.outputs
 
+    @check_arguments
     def simulate(
         self,
         run: Run,
@@ -184,18 +187,21 @@ class Model:
 
         return simulate(self, run, tolerance=tolerance, initial=initial, max_m=max_m)
 
+    @check_arguments
     def compare(self, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
         """Compare with measured runs by equation error and output error; see :func:`ftlm.compare`."""
         from ftlm.validation.comparison import compare
 
         return compare(self, runs, m=m)
 
+    @check_arguments
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
         """Test residuals for whiteness and independence of the inputs; see :func:`ftlm.resid`."""
         from ftlm.validation.residual_tests import resid
 
         return resid(self, runs, lags=lags)
 
+    @check_arguments
     def frequency_response(self, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
         """Exact response at angular frequencies [rad/s], shape (outputs, inputs, W).
 
@@ -205,28 +211,33 @@ class Model:
 
         return frequency_response(self, w, coupling=coupling, sensor=sensor)
 
+    @check_arguments
     def step_response(self, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
         """Response to unit steps, shape (outputs, inputs, N); see :func:`ftlm.analysis.step_response`."""
         from ftlm.analysis.frequency_response import step_response
 
         return step_response(self, time, tolerance=tolerance)
 
+    @check_arguments
     def stability(self, *, coupling: str = "simulated") -> Stability:
         """Test stability, with the reason for instability; see :func:`ftlm.analysis.stability`."""
         from ftlm.analysis.poles import stability
 
         return stability(self, coupling=coupling)
 
+    @check_arguments
     def is_stable(self, *, coupling: str = "simulated") -> bool:
         """Whether bounded inputs give bounded outputs; an integrator is not stable in this sense."""
         return self.stability(coupling=coupling).stable
 
+    @check_arguments
     def poles(self, *, coupling: str = "simulated") -> Complex:
         """Poles of a model whose orders have a common base; see :func:`ftlm.analysis.poles`."""
         from ftlm.analysis.poles import poles
 
         return poles(self, coupling=coupling)
 
+    @check_arguments
     def modes(self, *, coupling: str = "simulated") -> tuple[Mode, ...]:
         """Frequency, damping and time constant of every pole, for any orders; see :func:`ftlm.analysis.modes`."""
         from ftlm.analysis.poles import modes
@@ -239,6 +250,7 @@ class Model:
 
         return dcgain(self)
 
+    @check_arguments
     def step(self, time: ArrayLike | None = None) -> Answer:
         """Response to unit steps from rest with its standard deviation, plotted in notebooks.
 
@@ -265,12 +277,14 @@ class Model:
 
         return answer(self, time, "step")
 
+    @check_arguments
     def impulse(self, time: ArrayLike | None = None) -> Answer:
         """Response to unit impulses, averaged over each sampling interval; otherwise as :meth:`step`."""
         from ftlm.plot.model_charts import answer
 
         return answer(self, time, "impulse")
 
+    @check_arguments
     def bode(self, w: ArrayLike | None = None) -> Bode:
         """Gain and phase with 95 % bands, plotted in notebooks.
 
@@ -319,12 +333,14 @@ class Model:
 
         return cls(structure_of(system, inputs, outputs))
 
+    @check_arguments
     def to_control(self, *, band: tuple[float, float], order: int = 5) -> Any:
         """Convert to python-control by Oustaloup's approximation; see :func:`ftlm.analysis.to_control`."""
         from ftlm.analysis.rational_approximation import to_control
 
         return to_control(self, band=band, order=order)
 
+    @check_arguments
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model as JSON, atomically.
 

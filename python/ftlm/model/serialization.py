@@ -17,6 +17,7 @@ from ftlm.structure.input_nonlinearity import InputNonlinearity, NonlinearityKin
 from ftlm.structure.order import Order
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import error_text
 
@@ -259,6 +260,7 @@ def write_model(model: Model, path: str | os.PathLike[str], *, force: bool) -> P
     return write_atomically(path, data + b"\n", force=force)
 
 
+@check_arguments
 def load_model(path: str | os.PathLike[str]) -> Model:
     """Read a model written by :meth:`Model.save`.
 

@@ -15,6 +15,7 @@ from ftlm.simulation.discretization import named_signals
 from ftlm.structure.equation import Equation
 from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import real_number, whole_number
@@ -28,6 +29,7 @@ DEFAULT_MAX_TERM_RATIO = 100.0
 CERTIFIED_SETTINGS: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
 
 
+@check_arguments
 def certify_orders(
     runs: Run | Sequence[Run],
     equation: Structure,

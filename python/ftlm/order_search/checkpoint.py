@@ -1,4 +1,21 @@
-"""Frames (records) of a search checkpoint file: payloads and encoding."""
+"""Checkpoint file of an order search: results of finished rounds, appended in frames under digests, by one writer.
+
+The file begins with a signature. Frames follow, each of
+
+====================  =================================================================================================
+4 bytes               length of the payload, little-endian
+4 bytes               CRC-32 of those 4 bytes and of the frame's offset in the file (8 bytes, little-endian)
+length bytes          payload: one MessagePack map, whose key ``type`` names its kind
+16 bytes              BLAKE2b of the previous digest (zeros for the first frame), the length and the payload
+====================  =================================================================================================
+
+The first payload is :class:`Requests`: all arguments and data of the searches, so that they can be resumed without the
+measured files. A search of one equation then appends :class:`PartialRounds` (a block of rounds with a resumption point)
+and :class:`Rounds` (a finished block); a search under an order law appends :class:`Verdicts` (a finished block of
+candidates) and, at its end, :class:`CoupledTable`. Frames are only appended, and a digest covers all frames before its
+own: a frame that was lost, moved or changed is detected. An incomplete frame at the end of the file is what a power
+failure leaves, and is dropped. Any other incomplete frame is damage, which is reported with its offset.
+"""
 
 from __future__ import annotations
 

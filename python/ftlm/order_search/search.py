@@ -45,6 +45,7 @@ from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, axis_of, check_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import check_threads
 
 Failures = list[tuple[dict[str, float], str]]
@@ -235,6 +236,7 @@ def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core.
     return SearchResult(table, model, counts["candidates"], pruned, failures, m, settings.to_dict(), edges, boxed)
 
 
+@check_arguments
 def search_orders(
     runs: Run | Sequence[Run],
     equation: Structure,
@@ -454,6 +456,7 @@ def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
         ) from error
 
 
+@check_arguments
 def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     """Return the progress of the searches of a checkpoint file, which may be in use.
 
@@ -504,6 +507,7 @@ def _core_callback(progress: Callable[[int, int], None] | None) -> ProgressCallb
     return lambda done, total, _pruned: progress(done, total)
 
 
+@check_arguments
 def landscape(
     runs: Run | Sequence[Run],
     structure: Structure,

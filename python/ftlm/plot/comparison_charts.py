@@ -11,6 +11,7 @@ from ftlm.errors import DataError
 from ftlm.svg.bar_chart import bar_chart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
 from ftlm.svg.line_chart import line_chart
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison
@@ -24,6 +25,7 @@ def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
     return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
 
 
+@check_arguments
 def comparison_charts(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[Figure]:
@@ -56,6 +58,7 @@ def comparison_charts(
     ]
 
 
+@check_arguments
 def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = MAX_LINE_POINTS) -> list[Figure]:
     """Inputs of every run, to stand below its outputs.
 
@@ -84,6 +87,7 @@ def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = M
     ]
 
 
+@check_arguments
 def residual_series(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[Figure]:
@@ -119,6 +123,7 @@ def residual_series(
     return figures
 
 
+@check_arguments
 def compared_bars(
     compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the free run"
 ) -> list[Figure]:
@@ -158,6 +163,7 @@ def compared_bars(
     ]
 
 
+@check_arguments
 def error_chart(
     compared: Sequence[tuple[str, Comparison]],
     output: str,
@@ -203,6 +209,7 @@ def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
     return f"{text} [{unit}]" if unit else text
 
 
+@check_arguments
 def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
     """Chart autocorrelation and cross-correlations of the residuals of every output, with 99 % bands.
 

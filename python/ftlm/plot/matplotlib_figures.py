@@ -31,9 +31,11 @@ from ftlm.plot.comparison_charts import pulse_times, with_unit
 from ftlm.plot.model_charts import Answer, bode_curves, pole_points, response_frequencies
 from ftlm.svg.heat_map import Landscape
 from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.validation import as_array, as_floats
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
@@ -66,7 +68,7 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     """Return (figure, grid of rows by columns) from the given axes or a new figure."""
     if ax is None:
         return figure_of(rows, columns, **options)
-    given = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
+    given = np.atleast_1d(as_array("ax", ax)).ravel()
     strange = [type(a).__name__ for a in given if not hasattr(a, "plot") or not hasattr(a, "figure")]
     if strange:
         raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")
@@ -92,6 +94,7 @@ def label_of(name: str, units: Mapping[str, str]) -> str:
 RESIDUAL_HEIGHT_SHARE = 0.4
 
 
+@check_arguments
 def fit(
     result: Identification | Model | Comparison,
     runs: Run | Sequence[Run] | None = None,
@@ -200,6 +203,7 @@ def _line_of(axis: Any, run: Run, name: str) -> None:
     axis.grid(visible=True, alpha=0.3)
 
 
+@check_arguments
 def run(run: Run, *, ax: Any = None) -> Any:
     """Plot the outputs and inputs of a run.
 
@@ -230,6 +234,7 @@ def run(run: Run, *, ax: Any = None) -> Any:
     return figure
 
 
+@check_arguments
 def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     """Plot correlations of the residuals with themselves and with every input, with 99 % bands.
 
@@ -273,6 +278,7 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     return figure
 
 
+@check_arguments
 def landscape(result: Identification | Landscape, output: str | None = None, *, ax: Any = None) -> Any:
     """Plot the score of an order search, or the cost of a joint fit, over two orders.
 
@@ -327,6 +333,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     return figure
 
 
+@check_arguments
 def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any = None) -> Any:
     """Plot gain and phase of every pair of output and input, with 95 % bands if the model has a covariance.
 
@@ -354,7 +361,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     found = model.model if isinstance(model, Identification) else model
     if not isinstance(found, Model):
         raise ModelError(f"model is {type(found).__name__}; give a model or an identification")
-    omega = response_frequencies(found) if w is None else np.asarray(w, dtype=np.float64)
+    omega = response_frequencies(found) if w is None else as_floats("w", w)
     curves = bode_curves(found, omega)
     figure, axes = axes_for(ax, max(len(curves), 1), 2)
     for i, curve in enumerate(curves):
@@ -379,6 +386,7 @@ def _model_of(model: Model | Identification) -> Model:
     return found
 
 
+@check_arguments
 def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     """Plot poles in the plane of s^q (s for integer orders) with the unstable sector.
 
@@ -419,6 +427,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     return figure
 
 
+@check_arguments
 def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
     """Plot the response to unit steps from rest, with its 95 % band if the model has a covariance.
 
@@ -446,6 +455,7 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
     return _response_figure(_model_of(model).step(time), ax)
 
 
+@check_arguments
 def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
     """Plot the response to unit impulses, averaged over each interval; otherwise as :func:`step`."""
     return _response_figure(_model_of(model).impulse(time), ax)
@@ -468,6 +478,7 @@ def _response_figure(found: Answer, ax: Any) -> Any:
     return figure
 
 
+@check_arguments
 def correlation(result: Identification, *, ax: Any = None) -> Any:
     """Plot the correlation matrix of the estimates of a joint fit.
 
@@ -508,6 +519,7 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     return figure
 
 
+@check_arguments
 def residual_series(result: Identification | Comparison, *, ax: Any = None) -> Any:
     """Plot output-error residuals over time and their histogram.
 
@@ -546,6 +558,7 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
     return figure
 
 
+@check_arguments
 def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     """Plot the fits of several models on the same runs as bars.
 
@@ -598,6 +611,7 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     return figure
 
 
+@check_arguments
 def design(result: DesignedInput, *, ax: Any = None) -> Any:
     """Plot a designed input, its predicted response beside that to a square wave, limits and spectrum.
 
@@ -673,6 +687,7 @@ def _draw_spectrum(axis: Any, result: DesignedInput) -> None:
     axis.legend(fontsize="small", loc="lower right")
 
 
+@check_arguments
 def response(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None = None, *, ax: Any = None
 ) -> Any:
@@ -734,6 +749,7 @@ def response(
     return figure
 
 
+@check_arguments
 def nyquist(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None = None, *, ax: Any = None
 ) -> Any:

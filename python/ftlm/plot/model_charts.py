@@ -17,9 +17,10 @@ from ftlm.simulation.discretization import COULOMB_PREFIX
 from ftlm.svg.complex_plane import plane_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.line_chart import line_chart
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Complex, Floats
+from ftlm.utils.validation import Complex, Floats, as_floats
 
 #: Decibels per unit of the natural logarithm of a gain.
 DECIBELS_PER_NEPER = 20.0 / math.log(10.0)
@@ -37,6 +38,7 @@ def response_frequencies(model: Model, step: float | None = None, duration: floa
     return np.geomspace(middle / 100, middle * 100, 240)
 
 
+@check_arguments
 def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
     """Return gain and phase charts for every pair of output and external input, with 95 % bands if known.
 
@@ -47,7 +49,7 @@ def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
     w
         Frequencies [rad/s]; by default around the corner frequencies of the model.
     """
-    omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
+    omega = response_frequencies(model) if w is None else as_floats("w", w)
     return bode_figures(omega, bode_curves(model, omega))
 
 
@@ -93,6 +95,7 @@ def pole_points(model: Model) -> tuple[float, Complex]:
     return q, np.array(points, dtype=np.complex128)
 
 
+@check_arguments
 def pole_charts(model: Model) -> list[Figure]:
     """Return the pole chart in the plane of s^q, q the highest order over the next integer, with the unstable sector.
 
@@ -202,10 +205,11 @@ class Bode:
 def bode(model: Model, w: ArrayLike | None = None) -> Bode:
     """Return the frequency response of a model with charts; see :meth:`ftlm.Model.bode`."""
     check_model(model)
-    omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
+    omega = response_frequencies(model) if w is None else as_floats("w", w)
     return Bode(omega, tuple(bode_curves(model, omega)))
 
 
+@check_arguments
 def response_charts(found: Response, *, units: Mapping[str, str] | None = None) -> list[Figure]:
     """Return step or impulse response charts of every connected pair of input and output, with 95 % bands.
 

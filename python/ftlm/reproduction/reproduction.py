@@ -29,7 +29,7 @@ from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
-from ftlm.utils.validation import check_threads, join_names, nearest, real_number, whole_number
+from ftlm.utils.validation import check_threads, join_names, nearest, real_number, short_repr, whole_number
 
 #: Candidates that an order search keeps; the tables need only the best.
 TOP_CANDIDATES = 1
@@ -292,6 +292,8 @@ class StageOutcome:
     notes: list[str]
 
 
+#: Most records of an arm.
+MAX_RECORDS = 1000
 #: Job of a worker, called with its progress.
 Job = Callable[[WorkerProgress], StageOutcome | Panel]
 
@@ -303,8 +305,8 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
     for name in arms or ():
         if name not in ARM_VARIANTS:
             raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
-    if (whole_number(records) or 0) < 1:
-        raise ModelError(f"{setting('records')} {records!r} is no whole number from 1")
+    if not 1 <= (whole_number(records) or 0) <= MAX_RECORDS:
+        raise ModelError(f"{setting('records')} {short_repr(records)} is no whole number from 1 to {MAX_RECORDS}")
     return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
+
+import msgspec
+from msgspec import UNSET, UnsetType
 
 from ftlm import _core
 from ftlm.arm.flexible_link import Form, flexible_link
@@ -16,6 +18,8 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
 from ftlm.simulation.discretization import equation_tuple
+from ftlm.utils.arguments import check_arguments
+from ftlm.utils.files import read_toml
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import join_names, nearest, short_repr
 
@@ -32,6 +36,7 @@ ROTATING_INERTIA_SHARE = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
 MAX_SUBSTEP_S = 1e-4
 
 
+@check_arguments
 @dataclass(frozen=True)
 class StageParameters:
     """Parameters of one joint of the simulated arm: orders and coefficients of the law, and Coulomb friction.
@@ -56,11 +61,13 @@ class StageParameters:
     mu: float
     coulomb: float = 0.0
 
+    @check_arguments
     def orders(self, stage: int) -> dict[str, float]:
         """Return the five free orders, by their names in the law."""
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
+    @check_arguments
     def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
         """Return the coefficients of both equations, by their names in the law."""
         h, k = 2 * stage - 1, 2 * stage
@@ -71,6 +78,7 @@ class StageParameters:
         return hub | {f"a{k}": -self.a * self.r, f"b{k}": -self.b, f"d{k}": -self.d * self.r, f"g{k}": -self.g}
 
 
+@check_arguments
 @dataclass(frozen=True)
 class ArmParameters:
     """Parameters of the simulated arm and its sensors.
@@ -127,15 +135,16 @@ class ArmParameters:
     name: str = "effective"
 
     @classmethod
+    @check_arguments
     def of(cls, given: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
         """Return a named parameter set, the set of a TOML file, or the argument itself.
 
         Raises
         ------
         ModelError
-            An unknown name, or an invalid key or number in the file.
+            An unknown name.
         DataError
-            A file that cannot be read.
+            A file that cannot be read, or an invalid key or value in it.
         """
         if isinstance(given, ArmParameters):
             return given
@@ -155,25 +164,21 @@ class ArmParameters:
 
     @classmethod
     def _from_toml(cls, path: Path) -> ArmParameters:
-        try:
-            told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-            raise DataError(f"{str(path)!r} is not a TOML file that can be read ({error}); correct it") from None
+        told = _values_of(
+            read_toml(path, "parameters of the arm", "a file of numbers by name, such as coupling = 0.5", _ArmFile)
+        )
         base = told.pop("base", "effective")
         if base not in PARAMETER_SETS:
-            raise ModelError(
-                f"{path.name}: base = {base!r} is not known{nearest(base, PARAMETER_SETS)}; use "
+            raise DataError(
+                f"{path.name}: base = {short_repr(base)} is not known{nearest(base, PARAMETER_SETS)}; use "
                 f"{join_names(PARAMETER_SETS)}"
             )
         start = PARAMETER_SETS[base]
-        stages = {}
-        for name in ("stage1", "stage2"):
-            table = told.pop(name, {})
-            if not isinstance(table, dict):
-                raise ModelError(f"{path.name}: {name} is not a table; write [{name}] and its numbers below it")
-            stages[name] = replace(getattr(start, name), **_numbers(path, name, table, StageParameters))
-        rest = _numbers(path, "the file", told, ArmParameters)
-        return replace(start, **{**rest, **stages, "name": path.name[:100]})
+        stages = {name: _values_of(told.pop(name, _StageFile())) for name in ("stage1", "stage2")}
+        for where, table in (("the file", told), *stages.items()):
+            _check_values(path, where, table)
+        merged = {name: replace(getattr(start, name), **table) for name, table in stages.items()}
+        return replace(start, **{**told, **merged, "name": path.name[:100]})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the parameters as a JSON-compatible dictionary."""
@@ -210,6 +215,7 @@ class ArmParameters:
             )
         return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
 
+    @check_arguments
     def model(self, *, friction: bool = False) -> Model:
         """Return the model of the arm from currents to angles; with friction it equals the simulation of :meth:`arm`.
 
@@ -245,6 +251,7 @@ class ArmParameters:
         known = {n: v for n, v in orders.items() if n in structure.order_names}
         return Model(structure.with_orders(known).with_coefficients(coefficients), orders=known)
 
+    @check_arguments
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:
         """Return the simulated arm at rest, for runs of at most `horizon` s with samples of `step` s."""
         model = self.model()
@@ -269,31 +276,33 @@ class ArmParameters:
         return _core.VirtualArm(links, sensors, step, MAX_SUBSTEP_S, horizon)
 
 
-def _numbers(path: Path, where: str, table: Mapping[str, Any], kind: type[Any]) -> dict[str, Any]:
-    known = {f.name: f.type for f in fields(kind) if f.name not in ("stage1", "stage2", "name")}
-    found: dict[str, Any] = {}
+def _optional(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
+    """Return the fields of a dataclass as optional keys of a file."""
+    hints = {**get_type_hints(kind), **replaced}
+    return [(name, hint | UnsetType, UNSET) for name, hint in hints.items() if name != "name"]
+
+
+_StageFile = msgspec.defstruct("StageFile", _optional(StageParameters), forbid_unknown_fields=True)
+_ArmFile = msgspec.defstruct(
+    "ArmFile", _optional(ArmParameters, stage1=_StageFile, stage2=_StageFile, base=str), forbid_unknown_fields=True
+)
+
+
+def _values_of(file: msgspec.Struct) -> dict[str, Any]:
+    """Return the keys of a file that are in it."""
+    return {key: value for key, value in msgspec.structs.asdict(file).items() if value is not UNSET}
+
+
+def _check_values(path: Path, where: str, table: Mapping[str, Any]) -> None:
+    """Raise for numbers of a file that are out of range."""
     for key, value in table.items():
-        if key not in known:
-            raise ModelError(
-                f"{path.name}: {key!r} in {where} is not known{nearest(key, known)}; known are {join_names(known)}"
-            )
-        if key == "form":
-            if value not in ("lagrange", "published"):
-                raise ModelError(f"{path.name}: form = {value!r} is not known; use 'lagrange' or 'published'")
-            found[key] = value
-            continue
-        pair = "tuple" in str(known[key])
-        values = value if isinstance(value, list) else [value]
-        good = all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in values)
-        if not good or len(values) != (2 if pair else 1) or isinstance(value, list) != pair:
-            what = "a pair of numbers such as [0.1, 0.2]" if pair else "a number"
-            raise ModelError(f"{path.name}: {key} = {value!r} in {where} is not {what}")
-        if key == "bits" and not (isinstance(value, int) and 0 <= value <= 24):
-            raise ModelError(f"{path.name}: bits = {value!r} is not a whole number from 0 to 24")
+        values = [v for v in (value if isinstance(value, tuple) else (value,)) if not isinstance(v, str)]
+        if not all(map(math.isfinite, values)):
+            raise DataError(f"{path.name}: {key} = {value!r} in {where} is not finite; write a number")
+        if key == "bits" and not 0 <= value <= 24:
+            raise DataError(f"{path.name}: bits = {value!r} is not a whole number from 0 to 24; write one")
         if (key.endswith("noise") and min(values) < 0) or (key in ("travel", "encoder_scale") and min(values) <= 0):
-            raise ModelError(f"{path.name}: {key} = {value!r} in {where} must not be negative")
-        found[key] = tuple(map(float, values)) if pair else value if key == "bits" else float(value)
-    return found
+            raise DataError(f"{path.name}: {key} = {value!r} in {where} must not be negative; write a positive number")
 
 
 _STAGE1 = StageParameters(

@@ -12,7 +12,8 @@ import numpy as np
 
 from ftlm.errors import DataError, ModelError
 from ftlm.io.load import column_names, load
-from ftlm.rig.rig import CURRENT_LIMIT, MAX_RUN_DURATION_S
+from ftlm.rig.rig import CURRENT_LIMIT, MAX_RUN_DURATION_S, check_rate
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number, short_repr
 
@@ -22,6 +23,7 @@ CURRENT_SIGNALS = ("I1", "I2")
 _PAPER_SINE_RAD_S = 6.3
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Excitation:
     """Motor-current signal of an experiment.
@@ -55,6 +57,7 @@ class Excitation:
     seed: int = 0
     file: str | os.PathLike[str] | None = None
 
+    @check_arguments
     def commands(self, rate: float, duration: float) -> Floats:
         """Return the currents [A], shape (round(duration·rate) + 1, 2); the last row is zero.
 
@@ -65,7 +68,14 @@ class Excitation:
         DataError
             A file that cannot be used.
         """
-        rows = round(duration * rate) + 1
+        samples, length = finite_number(rate), finite_number(duration)
+        if samples is None or length is None or not 0 <= length <= MAX_RUN_DURATION_S:
+            raise ModelError(
+                f"{setting('duration')} {short_repr(duration)} s at {short_repr(rate)} Hz is no run of at most "
+                f"{MAX_RUN_DURATION_S:g} s; give its length and its rate"
+            )
+        check_rate(samples)
+        rows = round(length * samples) + 1
         t = np.arange(rows) / rate
         ramp = finite_number(self.ramp)
         if ramp is None or not 0 <= ramp <= duration:

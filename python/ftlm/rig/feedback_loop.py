@@ -25,8 +25,9 @@ from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.excitation import finite_number
 from ftlm.rig.recording import Experiment, check_times
 from ftlm.rig.rig import MAX_RUN_DURATION_S, Board, Rig
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Floats, check_seed, error_text
+from ftlm.utils.validation import Floats, as_array, check_seed, error_text
 
 #: Controller: function of time [s], measured angles [rad] and reference [rad] that returns two currents [A].
 Controller: TypeAlias = Callable[[float, Floats, Floats], Sequence[float] | Floats]
@@ -39,6 +40,7 @@ DEFAULT_RATE_HZ = 500.0
 DEFAULT_TRAVEL_RAD = (math.pi / 2, math.pi / 2)
 
 
+@check_arguments
 def control(
     controller: Controller,
     reference: ArrayLike,
@@ -289,12 +291,8 @@ def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]
 
 def _numbers(reference: ArrayLike) -> Floats:
     """Validate a reference array of shape (rows, 2) or (2,)."""
-    try:
-        raw = np.asarray(reference)
-        good = raw.dtype.kind in "fiu" and raw.ndim in (1, 2) and raw.shape[-1] == 2
-    except (TypeError, ValueError, MemoryError):
-        good = False
-    if not good:
+    raw = as_array("reference", reference)
+    if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
         raise DataError(
             "reference is no array of numbers of shape (rows, 2), hub angles [rad] of one row a sample, and no pair of "
             "angles to hold"

@@ -22,8 +22,9 @@ from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.excitation import CURRENT_SIGNALS, Excitation, finite_number
 from ftlm.rig.quanser import QuanserBoard
-from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, check_thread, describe_signal
+from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, check_rate, check_thread, describe_signal
 from ftlm.rig.virtual_board import VirtualBoard
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import RUN_MESSAGES, check_free
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is_run_name, short_repr
@@ -203,6 +204,7 @@ STOCK_FILTER = (math.sqrt(157.9137), 22.6195 / (2.0 * math.sqrt(157.9137)))
 _BLOCK_ROWS_REAL_TIME, _BLOCK_ROWS_FAST = 32, 500
 
 
+@check_arguments
 def record(
     rig: str | Board = "virtual",
     *,
@@ -657,6 +659,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
         raise ModelError(f"{setting('duration')} {length:g} s is over the limit of {longest:g} s; {way_out}")
     if samples is None or samples <= 0:
         raise ModelError(f"{setting('rate')} {short_repr(rate)} Hz is not a positive number of samples per second")
+    check_rate(samples)
     if length * samples < 2:
         raise ModelError(
             f"{setting('duration')} {length:g} s holds fewer than three samples at {samples:g} Hz; make it longer"

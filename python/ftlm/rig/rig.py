@@ -17,9 +17,10 @@ from types import CodeType, FrameType
 from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
-from ftlm.errors import FtlmError, ModelError, RigFault
+from ftlm.errors import DataError, FtlmError, ModelError, RigFault
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, error_text, real_number
+from ftlm.utils.validation import Floats, as_floats, error_text, real_number
 
 #: Termination signals, including those of a closed terminal.
 _TERMINATION_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
@@ -311,6 +312,7 @@ MOTORS_LIVE_MESSAGE = (
 RIG_COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Limits:
     """Safety limits of every command and sample; pairs are for joints 1 and 2.
@@ -353,6 +355,7 @@ class Limits:
     max_write_delay: float = 0.05
     max_missed_deadlines: int = 20
 
+    @check_arguments
     def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
         """Return the guard that enforces the limits at a sampling interval [s]."""
         return _core.Guard(
@@ -594,10 +597,15 @@ class Rig:
 
         Raises
         ------
+        DataError
+            Commands of another shape, or no numbers.
         RigFault
             A fault has latched; the motors stay at 0 V.
         """
         self._check()
+        commands = as_floats("commands", commands)
+        if commands.ndim != 2 or commands.shape[1] != 2:
+            raise DataError(f"commands has shape {commands.shape}; give two currents [A] a row, shape (n, 2)")
         if self._samples + len(commands) > self.limit * self.rate + 1.5:
             self.fail(f"the time limit of {self.limit:g} s is over; ask for a longer one")
         self._samples += len(commands)

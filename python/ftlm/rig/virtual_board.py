@@ -7,6 +7,7 @@ import os
 import subprocess
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from ftlm.rig.rig import (
     check_watchdog,
     missing_expiration_state,
 )
+from ftlm.utils.resources import python_child
 from ftlm.utils.validation import Floats, check_choice, check_seed, short_repr, whole_number
 
 #: Faults that can be injected: name, and meaning of its number.
@@ -126,7 +128,7 @@ class VirtualBoard:
         if self.real_time:
             check_watchdog(self._rate, seconds)
         try:
-            self._process = watchdog.start(page, keep=self.page is not None)
+            self._process = start_watchdog(page, keep=self.page is not None)
         except OSError as error:
             raise RigFault(f"virtual rig: {error}; check the Python installation") from None
         self._seconds = seconds
@@ -242,6 +244,46 @@ class VirtualBoard:
             self._beat += 1
             page.write_heartbeat(self._beat, volts1, volts2)
             return (volts1, volts2), bool(page.get("enabled"))
+
+
+def start_watchdog(page: watchdog.RegisterPage, *, keep: bool, patience: float = 10.0) -> subprocess.Popen[bytes]:
+    """Start the watchdog process and wait until it is ready.
+
+    Parameters
+    ----------
+    page
+        Registers of the output stage.
+    keep
+        Whether to keep the file when the process ends.
+    patience
+        Longest wait for the process [s].
+
+    Raises
+    ------
+    OSError
+        The process could not be started.
+    """
+    # A separate session, so that Ctrl-C does not reach the watchdog.
+    process = subprocess.Popen(
+        **python_child(Path(watchdog.__file__), str(page.path.resolve()), "keep" if keep else "remove", site=False),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    until = time.monotonic() + patience
+    try:
+        while not page.get("ready"):
+            if process.poll() is not None:
+                raise OSError(f"the watchdog process ended at its start (exit code {process.returncode})")
+            if time.monotonic() > until:
+                raise OSError(f"the watchdog process did not start within {patience:g} s")
+            time.sleep(0.002)
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    return process
 
 
 def _checked_injection(fault: object) -> tuple[str, int, float, float]:

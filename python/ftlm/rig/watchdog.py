@@ -14,7 +14,6 @@ import mmap
 import os
 import signal
 import struct
-import subprocess
 import sys
 import tempfile
 import time
@@ -104,42 +103,6 @@ def create_page_file() -> Path:
     descriptor, name = tempfile.mkstemp(prefix="ftlm-rig-", suffix=".page", dir=folder)
     os.close(descriptor)
     return Path(name)
-
-
-def start(page: RegisterPage, *, keep: bool, patience: float = 10.0) -> subprocess.Popen[bytes]:
-    """Start the watchdog process and wait until it is ready.
-
-    Parameters
-    ----------
-    page
-        Registers of the output stage.
-    keep
-        Whether to keep the file when the process ends.
-    patience
-        Longest wait for the process [s].
-
-    Raises
-    ------
-    OSError
-        The process could not be started.
-    """
-    command = [sys.executable, "-I", "-S", __file__, str(page.path), "keep" if keep else "remove"]
-    # A separate session, so that Ctrl-C does not reach the watchdog.
-    nothing = subprocess.DEVNULL
-    process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
-    until = time.monotonic() + patience
-    try:
-        while not page.get("ready"):
-            if process.poll() is not None:
-                raise OSError(f"the watchdog process ended at its start (exit code {process.returncode})")
-            if time.monotonic() > until:
-                raise OSError(f"the watchdog process did not start within {patience:g} s")
-            time.sleep(0.002)
-    except BaseException:
-        process.kill()
-        process.wait()
-        raise
-    return process
 
 
 def watch(path: str, *, keep: bool) -> None:

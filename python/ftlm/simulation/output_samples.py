@@ -632,12 +632,9 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
 
 def _is_reportable(left: StartResiduals) -> bool:
     """Whether a model explains a run with a history, and not from rest, by enough for a report."""
-    rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) / left.sizes for end in (left.rest, left.history))
-    return bool(
-        np.any(
-            (past <= MAX_RESIDUAL_RATIO * rest)
-            & (rest - past >= MIN_RESIDUAL_DROP)
-            & (past <= MAX_HISTORY_RESIDUAL)
-            & (rest <= MAX_REST_RESIDUAL)
-        )
-    )
+    # An overflow is infinite, and nothing is reported where both are.
+    with np.errstate(over="ignore", invalid="ignore"):
+        ends = [end / left.sizes[:, None] for end in (left.rest, left.history)]
+        rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) for end in ends)
+        large = (past <= MAX_RESIDUAL_RATIO * rest) & (rest - past >= MIN_RESIDUAL_DROP)
+    return bool(np.any(large & (past <= MAX_HISTORY_RESIDUAL) & (rest <= MAX_REST_RESIDUAL)))

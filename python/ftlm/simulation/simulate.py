@@ -21,6 +21,7 @@ from ftlm.simulation.discretization import (
 )
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import check_initial
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number
 
@@ -68,6 +69,7 @@ def respond(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dic
     return responses, initial
 
 
+@check_arguments
 def simulate(
     model: Model,
     run: Run,
@@ -174,6 +176,7 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
     return run.with_outputs({n: np.zeros(run.length) for n in missing})
 
 
+@check_arguments
 def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
     """Simulate an integer-order model by explicit Euler at the step of the run, as in the paper's baseline.
 

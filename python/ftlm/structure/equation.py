@@ -11,9 +11,11 @@ from msgspec import UNSET, UnsetType
 
 from ftlm.errors import ModelError
 from ftlm.structure.order import MAX_IMPROPER_ORDER, MAX_ORDER, MIN_INPUT_ORDER, Order
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import real_number
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Term:
     """Term ``factor * coefficient * D^order signal`` on the right-hand side of an equation.
@@ -43,6 +45,7 @@ class Term:
         """Value of factor * coefficient; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
+    @check_arguments
     def as_text(self, signal: str) -> str:
         """Format the term with a given text for its signal."""
         if isinstance(self.coefficient, str):
@@ -65,6 +68,7 @@ def derivative(order: Order, signal: str) -> str:
     return f"D^{text if plain else f'({text})'} {signal}"
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Stribeck:
     """Stribeck friction near rest: ``factor * coefficient * exp(-(D output / speed)^2) * sign(D output)``.
@@ -92,12 +96,14 @@ class Stribeck:
         """Stiction in excess of Coulomb friction [unit of D^alpha y]; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
 
+    @check_arguments
     def as_text(self, output: str) -> str:
         """Format the Stribeck term for an output."""
         speed = self.speed if isinstance(self.speed, str) else f"{self.speed!r}"
         return f"- {_format_coefficient(self.coefficient, self.factor)} exp(-(D {output}/{speed})^2) sign(D {output})"
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Friction:
     """Coulomb friction ``factor * coefficient * sign(D output)`` of an equation's own output, set-valued at rest.
@@ -157,6 +163,7 @@ class Friction:
             pairs += [(more.name, more.coefficient), (more.speed_name, more.speed)]
         return {name: float(value) for name, value in pairs if name is not None}
 
+    @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
         """Return the friction with some free coefficients fixed; the others stay free."""
         out, more = self, self.stribeck
@@ -174,6 +181,7 @@ class Friction:
             more = replace(more, speed=real_number(name, values[name]), speed_name=name)
         return replace(out, more=more)
 
+    @check_arguments
     def as_text(self, output: str) -> str:
         """Format the friction terms for an output."""
         near = "" if self.stribeck is None else f" {self.stribeck.as_text(output)}"
@@ -187,6 +195,7 @@ def _format_coefficient(coefficient: str | float, factor: float) -> str:
     return f"{-factor * coefficient!r}"
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Equation:
     """Fractional-order equation ``D^order output = sum of terms``.
@@ -290,6 +299,7 @@ class Equation:
                 "another order"
             )
 
+    @check_arguments
     def check_input_orders(self, outputs: Sequence[str]) -> None:
         """Raise if an input makes the velocity of an equation with friction jump; simulated outputs are exempt.
 
@@ -327,6 +337,7 @@ class Equation:
         friction = () if self.friction is None else self.friction.names
         return (*(t.coefficient for t in self.terms if isinstance(t.coefficient, str)), *friction)
 
+    @check_arguments
     def with_orders(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with some free orders fixed; the others stay free.
 
@@ -338,6 +349,7 @@ class Equation:
         terms = tuple(replace(t, order=t.order.substitute(values)) for t in self.terms)
         return Equation(self.output, self.order.substitute(values), terms, self.coulomb)
 
+    @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with some free coefficients fixed; the others stay free.
 
@@ -360,6 +372,7 @@ class Equation:
         """Whether all orders and coefficients are fixed."""
         return not self.order_names and not self.coefficient_names
 
+    @check_arguments
     def as_text(self, inputs: Mapping[str, str]) -> str:
         """Format the equation; ``inputs`` maps an input to its text after delay and nonlinearity."""
         right = " + ".join(t.as_text(inputs.get(t.signal, t.signal)) for t in self.terms).replace("+ -", "- ")

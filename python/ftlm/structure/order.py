@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import TypeAlias
 
 from ftlm.errors import ModelError
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import real_number
 
@@ -27,6 +28,7 @@ ORDER_RESOLUTION = 1e-9
 Values: TypeAlias = float | str | Iterable[float]
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Order:
     """Order of a term: a number, or an affine function of named free orders.
@@ -42,12 +44,14 @@ class Order:
     constant: float = 0.0
     weights: tuple[tuple[str, float], ...] = ()
 
+    @check_arguments
     def substitute(self, values: Mapping[str, float]) -> Order:
         """Substitute values for some free orders; the others stay free."""
         constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
         return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in self.weights if n not in values))
 
     @classmethod
+    @check_arguments
     def parse(cls, text: str | float) -> Order:
         """Parse ``0.5``, ``"alpha"`` or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
 
@@ -84,6 +88,7 @@ class Order:
         """Whether the expression is a single free order."""
         return self.constant == 0 and len(self.weights) == 1 and self.weights[0][1] == 1
 
+    @check_arguments
     def at(self, values: Mapping[str, float]) -> float:
         """Evaluate the order at given free orders, rounded to 1e-9.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from ftlm.errors import ModelError
 from ftlm.structure.order import MAX_ORDER, Order, Values, order_axis, parse_values
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import real_number
 
@@ -17,6 +18,7 @@ DEFAULT_INCREMENT = 0.05
 DEFAULT_ALPHA_RANGE = (1.05, 2.0)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class OrderGrid:
     """Intervals and step of an order search.
@@ -36,6 +38,7 @@ class OrderGrid:
     alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE
     orders: Mapping[str, Values] = field(default_factory=dict)
 
+    @check_arguments
     def values(self, structure: Structure) -> dict[str, tuple[float, ...]]:
         """Return the grid values of each free order of a structure.
 
@@ -72,6 +75,7 @@ class OrderGrid:
         return (values,) if isinstance(values, float) else values
 
 
+@check_arguments
 def order_grid(
     increment: float = DEFAULT_INCREMENT, alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE, **orders: Values
 ) -> OrderGrid:

@@ -22,6 +22,7 @@ from ftlm.structure.input_nonlinearity import (
 from ftlm.structure.order import Order, Values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial, check_offset
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_known, real_number
 
@@ -32,6 +33,7 @@ NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
 _OFFSET_PATTERN = re.compile(r"c\d*")
 
 
+@check_arguments
 def equation(
     text: str,
     *,

@@ -9,6 +9,7 @@ import msgspec
 
 from ftlm.errors import ModelError
 from ftlm.structure.order import MAX_ORDER
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import real_number
 
 
@@ -78,6 +79,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return whole and not any(order for coefficient, order in self.numerator if coefficient)
 
     @classmethod
+    @check_arguments
     def low_pass(cls, signals: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
         """Second-order low-pass filter; the default is that of the arm's stock real-time model.
 

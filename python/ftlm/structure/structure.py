@@ -22,6 +22,7 @@ from ftlm.structure.input_nonlinearity import (
 )
 from ftlm.structure.order import Order, Values, parse_values
 from ftlm.structure.sensor_filter import SensorFilter
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import check_known, real_number
 
@@ -101,6 +102,7 @@ class Hints:
     nominal_coefficients: Mapping[str, float] = field(default_factory=dict)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Structure:
     """Structure of coupled fractional-order equations; orders and coefficients may be free.
@@ -268,6 +270,7 @@ class Structure:
         followed = self.outputs if self.coupling == "simulated" or self.has_friction else ()
         return any(s not in followed and self.is_filtered(s) for s in self.signals)
 
+    @check_arguments
     def filter_states(self, initial: Initial) -> int:
         """Return the number of unknown initial states of the sensor filter for given initial terms.
 
@@ -293,10 +296,12 @@ class Structure:
             )
         return sensor.relative_degree
 
+    @check_arguments
     def has_filter_transient(self, output: str) -> bool:
         """Whether an output may contain the initial transient of the sensor filter."""
         return self.all_filtered or self.is_filtered(output)
 
+    @check_arguments
     def is_filtered(self, signal: str) -> bool:
         """Whether a signal passed the sensor filter."""
         return self.sensor_filter is not None and signal in self.sensor_filter.signals
@@ -365,6 +370,7 @@ class Structure:
             name=f"{self.name}, {', '.join(e.output for e in equations)}",
         )
 
+    @check_arguments
     def equation(self, output: str) -> Structure:
         """Return one equation as a structure of its own, with measured coupling and without order laws.
 
@@ -392,10 +398,12 @@ class Structure:
         single = replace(own, terms=tuple(free_order(k, t) for k, t in enumerate(own.terms)))
         return self._of((single,), "measured")
 
+    @check_arguments
     def with_measured_inputs(self, output: str) -> Structure:
         """Return one equation as a structure with measured coupling; its orders keep their expressions."""
         return self._of(tuple(e for e in self.equations if e.output == output), "measured")
 
+    @check_arguments
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
         """Fix free orders (a number) or set their grid values (see :func:`parse_values`).
 
@@ -416,6 +424,7 @@ class Structure:
         equations = tuple(e.with_orders(numbers) for e in self.equations)
         return replace(self, equations=equations, order_values={n: v for n, v in lattices.items() if n not in numbers})
 
+    @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Structure:
         """Fix free coefficients.
 
@@ -427,6 +436,7 @@ class Structure:
         check_known("coefficient", values, self.coefficient_names)
         return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
 
+    @check_arguments
     def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
         """Set input delays [s]: a number fixes one, (lower, upper) bounds an estimated one.
 
@@ -447,6 +457,7 @@ class Structure:
                 known[name] = delay
         return replace(self, delay=known, free_delays=free)
 
+    @check_arguments
     def with_limits(
         self, *, saturation: Mapping[str, Value] | None = None, dead_zone: Mapping[str, Value] | None = None
     ) -> Structure:
@@ -478,6 +489,7 @@ class Structure:
         late = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
         return tuple([*late, *(limit.free for limit in self.limits if limit.free is not None)])
 
+    @check_arguments
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
         """Fix free input parameters by name, such as ``delay_u`` and ``sat_u``."""
         names = {n: input_name("delay", n) for n in self.free_delays}
@@ -493,6 +505,7 @@ class Structure:
         known = [limit for limit in self.limits if limit.free is None]
         return replace(self, free_delays={}, input_nonlinearities=_or_unset(known))
 
+    @check_arguments
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
         """Texts of inputs with delay or nonlinearity, such as ``sat(u(t - 0.035 s), 0.94)``."""
         out = {n: f"{n}(t - {d:.6g} s)" for n, d in self.delay.items() if d > 0 and digits != "r"}
@@ -504,6 +517,7 @@ class Structure:
         inputs = self.describe_inputs()
         return "\n".join(f"{e.as_text(inputs)}{self.offset_in_words}" for e in self.equations)
 
+    @check_arguments
     def equation_text(self, item: Equation) -> str:
         """Format an identified equation with its delays, nonlinearities and offset."""
         return format_equation(item, self.describe_inputs(".6g")) + self.offset_in_words

@@ -28,6 +28,7 @@ from ftlm.structure_selection.stepwise import (
     evaluate_list,
     select_stepwise,
 )
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_threads
 
@@ -89,6 +90,7 @@ FAILURE_SCORE, FAILURE_SCORE_GAP = math.log(0.5), math.log(2.0)
 MAX_CANDIDATES = 10_000
 
 
+@check_arguments
 def select(
     runs: Run | Sequence[Run],
     candidates: str | Structure | Sequence[Structure] | Mapping[str, Structure],

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from ftlm.errors import DataError
 from ftlm.svg.figure import MIN_DIFFERENCE, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
 from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, truncate_text
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_floats
 
 #: Most bars of a histogram, and its height [px].
 MAX_BARS = 41
@@ -24,6 +25,7 @@ BAR_HEIGHT_PX = 16.0
 MAX_NAME_CHARACTERS = 26
 
 
+@check_arguments
 def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "") -> Figure:
     """Return a histogram with the normal density of the same mean and standard deviation.
 
@@ -41,7 +43,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     DataError
         Fewer than two finite values.
     """
-    every = np.asarray(values, dtype=np.float64).ravel()
+    every = as_floats("values", values, gaps=True).ravel()
     there = every[np.isfinite(every)]
     if there.size < 2:
         raise DataError(f"a histogram needs two finite values at least, not {there.size}; give a longer run")
@@ -125,6 +127,7 @@ def _histogram(
     return svg(width, round(HISTOGRAM_HEIGHT_PX), title, described, out, narrow=narrow)
 
 
+@check_arguments
 def bar_chart(
     names: Sequence[str],
     groups: Sequence[tuple[str, ArrayLike]],
@@ -158,7 +161,7 @@ def bar_chart(
     DataError
         Nothing to draw, more than five series, or a series without one value per name.
     """
-    tables = [(name, np.asarray(values, dtype=np.float64)) for name, values in groups]
+    tables = [(name, as_floats(name, values, gaps=True)) for name, values in groups]
     if not names or not 0 < len(tables) < len(LINE_STYLES):
         raise DataError(
             f"{len(names)} names and {len(tables)} groups of bars; give names, and 1 to {len(LINE_STYLES) - 1} groups"

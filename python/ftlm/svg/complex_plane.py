@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from ftlm.errors import DataError
 from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
 from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number
-from ftlm.utils.validation import Complex
+from ftlm.utils.validation import Complex, as_complex
 
 #: Height of the plot, and half the size of a cross [px].
 PLANE_HEIGHT_PX, CROSS_HALF_SIZE_PX = 260.0, 5.0
@@ -21,6 +22,7 @@ PLANE_HEIGHT_PX, CROSS_HALF_SIZE_PX = 260.0, 5.0
 PLANE_MARGIN_FACTOR = 1.18
 
 
+@check_arguments
 def plane_chart(
     points: Sequence[complex],
     *,
@@ -48,7 +50,7 @@ def plane_chart(
     DataError
         A point that is not finite, or a sector outside (0, pi).
     """
-    values = np.asarray(list(points), dtype=np.complex128)
+    values = as_complex("points", points)
     bad = ~np.isfinite(values)
     if np.any(bad):
         raise DataError(f"point {int(np.argmax(bad))} of {values.size} is not finite; leave it out")
@@ -146,7 +148,7 @@ def locus_chart(
     DataError
         A measured value that is not finite, or none.
     """
-    line, dots = np.asarray(curve, dtype=np.complex128), np.asarray(points, dtype=np.complex128)
+    line, dots = as_complex("curve", curve), as_complex("points", points)
     bad = ~np.isfinite(dots)
     if dots.size == 0 or np.any(bad):
         where = f"value {int(np.argmax(bad))} of {dots.size} is not finite" if dots.size else "there is no value"

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.utils.formatting import SUPERSCRIPT_DIGITS
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_floats
 
 #: Width of the drawing for narrow screens; its text is as large as in the wide one.
 NARROW_WIDTH_PX = 360
@@ -179,7 +179,7 @@ def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     ndarray of int
         Ascending indices. All finite values if they are no more than ``most``.
     """
-    values = np.asarray(y, dtype=np.float64)
+    values = as_floats("y", y, gaps=True)
     finite = np.flatnonzero(np.isfinite(values))
     if finite.size <= most:
         return finite

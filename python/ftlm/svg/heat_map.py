@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm.errors import DataError
 from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol, truncate_text
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_floats
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ HEAT_COLORS = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81",
 NO_SCORE = "#9aa3ad"
 
 
+@check_arguments
 def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
     """Return a heat map of scores over two orders; the best scores are dark.
 
@@ -154,6 +156,7 @@ MAX_CELL_PX, MIN_LABELED_CELL_PX = 46.0, 30.0
 MAX_NAME_CHARACTERS = 12
 
 
+@check_arguments
 def correlation_map(names: Sequence[str], values: ArrayLike, *, title: str, caption: str = "") -> Figure:
     """Return a correlation matrix as colored cells.
 
@@ -173,7 +176,7 @@ def correlation_map(names: Sequence[str], values: ArrayLike, *, title: str, capt
     DataError
         A matrix that is not square or does not fit the names, or values beyond 1.
     """
-    matrix = np.asarray(values, dtype=np.float64)
+    matrix = as_floats("values", values, gaps=True)
     if matrix.shape != (len(names), len(names)) or not len(names):
         raise DataError(f"a matrix of shape {matrix.shape} for {len(names)} names; give one row and column a name")
     beyond = np.abs(matrix) > 1 + 1e-6

@@ -29,8 +29,9 @@ from ftlm.svg.figure import (
     text_width,
     ticks,
 )
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, truncate_text
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, as_floats
 
 #: Positions of a slider, more than its track has pixels.
 SLIDER_POSITIONS = 750
@@ -196,6 +197,7 @@ class _Chart:
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
 
 
+@check_arguments
 def line_chart(
     x: ArrayLike,
     lines: Sequence[tuple[str, ArrayLike]],
@@ -290,7 +292,7 @@ def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
     """Edges of a band behind a line, with gaps at non-finite values."""
     edges = []
     for edge in (low, high):
-        values = np.array(edge, dtype=np.float64)
+        values = as_floats("bands", edge, gaps=True).copy()
         if values.shape != line.x.shape:
             raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
         values = _logarithms(values) if log_y else values
@@ -304,11 +306,11 @@ def _prepare_lines(
     """Return lines ready to draw, and notes about values that cannot be drawn."""
     if not lines:
         raise DataError("a chart needs at least one line; give (name, values) pairs")
-    across = np.array(x, dtype=np.float64)
+    across = as_floats("x", x, gaps=True).copy()
     across = _logarithms(across) if log_x else across
     drawn, notes, coloured = [], [], 0
     for name, values in lines:
-        y = np.array(values, dtype=np.float64)
+        y = as_floats(f"line {name!r}", values, gaps=True).copy()
         if y.ndim != 1 or y.shape != across.shape:
             raise DataError(f"line {name!r} has shape {y.shape}, x {across.shape}; give arrays of one length")
         bad = ~(np.isfinite(y) & np.isfinite(across)) | (np.abs(y) > MAX_DRAWN_VALUE)

@@ -6,19 +6,21 @@ import contextlib
 import importlib
 import logging
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, get_args
 
 import msgspec
+import msgspec.toml
 
 from ftlm._core import __version__
 from ftlm.errors import DataError, ModelError
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import error_text, short_repr
+from ftlm.utils.validation import error_text, nearest, short_repr
 
 #: INFO: files read and written, start and end of fits. WARNING: findings that make a result doubtful.
 PACKAGE_LOGGER = logging.getLogger("ftlm")
@@ -187,8 +189,90 @@ def _move_exclusively(beside: Path, file: Path) -> bool:
     return True
 
 
-#: Longest name in a message.
-MAX_NAME_CHARACTERS = 300
+#: Longest name in a message, and size limit of models, controllers and settings, which take some kilobytes.
+MAX_NAME_CHARACTERS, MAX_SMALL_FILE_BYTES = 300, 1 << 20
+_READ_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+
+
+def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_bytes: int) -> bytes:
+    """Return the bytes of a regular file within a size limit; a pipe or a device is refused, not waited for.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    what, source
+        Name of the content, and remedy: the kind of file to pass.
+    max_bytes
+        Size limit.
+
+    Raises
+    ------
+    DataError
+        A file that cannot be read, is no regular file, or is too large.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise DataError(f"path = {short_repr(path)} is no path of a file; give {source}")
+    file = Path(path)
+    try:
+        descriptor = os.open(file, _READ_FLAGS)
+        state = os.fstat(descriptor)
+        if stat.S_ISREG(state.st_mode) and state.st_size <= max_bytes:
+            with os.fdopen(descriptor, "rb") as stream:
+                return stream.read(max_bytes)
+        os.close(descriptor)
+    except (OSError, ValueError) as error:
+        # What no file system takes is not put into words as it is.
+        name = str(file)
+        shown = (
+            name if name.isprintable() and len(name) <= MAX_NAME_CHARACTERS else short_repr(name, MAX_NAME_CHARACTERS)
+        )
+        why = (error.strerror if isinstance(error, OSError) else None) or error
+        raise DataError(f"{what} {shown} cannot be read: {why}; check the path") from error
+    if not stat.S_ISREG(state.st_mode):
+        raise DataError(f"{file} is no regular file; give {source}")
+    raise DataError(f"{file} has {state.st_size} bytes, no {what} is larger than {max_bytes}; give {source}")
+
+
+F = TypeVar("F", bound=msgspec.Struct)
+
+
+def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F]) -> F:
+    """Return the content of a TOML file.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    what, source
+        Name of the content, and remedy: the kind of file to pass.
+    kind
+        Schema of the content.
+
+    Raises
+    ------
+    DataError
+        A file that cannot be read, is too large, is not TOML, or has another content.
+    """
+    content = read_small_file(path, what, source, MAX_SMALL_FILE_BYTES)
+    try:
+        # Other editors put a byte-order mark first.
+        return msgspec.toml.decode(content.removeprefix(b"\xef\xbb\xbf"), type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        unknown = re.search("unknown field `(.*)`", str(error))
+        why = error_text(error, MAX_NAME_CHARACTERS) + (nearest(unknown[1], _field_names(kind)) if unknown else "")
+        raise DataError(f"{os.fspath(path)!r} is not a TOML file of {what}: {why}; give {source}") from error
+
+
+def _field_names(kind: type[msgspec.Struct]) -> list[str]:
+    """Return the keys of a schema and of its tables."""
+    names = []
+    for field in msgspec.structs.fields(kind):
+        tables = [
+            t for t in (field.type, *get_args(field.type)) if isinstance(t, type) and issubclass(t, msgspec.Struct)
+        ]
+        names += [field.encode_name, *(name for table in tables for name in _field_names(table))]
+    return names
 
 
 class SchemaRecord(Protocol):
@@ -230,7 +314,7 @@ class JsonFormat(Generic[T]):
     source: str
     kind: type[T]
     latest_schema: int
-    max_bytes: int = 1 << 20
+    max_bytes: int = MAX_SMALL_FILE_BYTES
 
     def read(self, path: str | os.PathLike[str]) -> T:
         """Read and decode a file.
@@ -240,22 +324,8 @@ class JsonFormat(Generic[T]):
         DataError
             A file that cannot be read, is too large, has another format, or is of a later version.
         """
-        if not isinstance(path, (str, os.PathLike)):
-            raise DataError(f"path = {short_repr(path)} is no path of a file; give {self.source}")
+        content = read_small_file(path, self.what, self.source, self.max_bytes)
         file = Path(path)
-        try:
-            content = self._content(file)
-        except DataError:
-            raise
-        except (OSError, ValueError) as error:
-            # What no file system takes is not put into words as it is.
-            name = (
-                str(file)
-                if str(file).isprintable() and len(str(file)) <= MAX_NAME_CHARACTERS
-                else short_repr(str(file), MAX_NAME_CHARACTERS)
-            )
-            why = (error.strerror if isinstance(error, OSError) else None) or error
-            raise DataError(f"{self.what} {name} cannot be read: {why}; check the path") from error
         try:
             return msgspec.json.decode(content, type=self.kind)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -263,17 +333,6 @@ class JsonFormat(Generic[T]):
             raise DataError(
                 f"{file} is no ftlm {self.what}: {error_text(error, MAX_NAME_CHARACTERS)}; give {self.source}"
             ) from error
-
-    def _content(self, file: Path) -> bytes:
-        """Return the bytes of a regular file within the size limit."""
-        state = file.stat()
-        if not stat.S_ISREG(state.st_mode):
-            raise DataError(f"{file} is no regular file; give {self.source}")
-        if state.st_size > self.max_bytes:
-            raise DataError(
-                f"{file} has {state.st_size} bytes, no {self.what} is larger than {self.max_bytes}; give {self.source}"
-            )
-        return file.read_bytes()
 
     def _check_later(self, file: Path, content: bytes) -> None:
         """Raise if a file that cannot be decoded comes from a later version."""

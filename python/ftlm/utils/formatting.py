@@ -1,12 +1,14 @@
-"""Formatting: Greek symbols, subscripts, significant digits, word wrap."""
+"""Formatting: Greek symbols, subscripts, significant digits, word wrap, control characters."""
 
 from __future__ import annotations
 
 import math
 import re
 import shutil
+import sys
 import textwrap
 from numbers import Integral
+from typing import Any, TextIO, cast
 
 from markupsafe import Markup
 
@@ -113,3 +115,49 @@ def wrap_text(text: str, lead: str = "", further: str | None = None) -> list[str
         break_on_hyphens=False,
     )
     return [line.replace("\u00a0", " ") for line in lines]
+
+
+#: Characters that a terminal obeys: controls except tab and line feed, marks of the text direction, line separators.
+_CONTROL_PATTERN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u061c\\u200e\\u200f\\u2028-\\u202e\\u2066-\\u2069]")
+
+
+def escape_controls(text: str) -> str:
+    """Return a text with escapes, which JSON reads as well, in place of the characters that a terminal obeys."""
+    return _CONTROL_PATTERN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+class EscapedStream:
+    """Text stream to a terminal, on which names from files and messages of libraries cannot act.
+
+    Parameters
+    ----------
+    stream
+        Stream that receives the escaped text; ftlm's own bars are drawn on it directly.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text with :func:`escape_controls`."""
+        self.stream.write(escape_controls(text))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        """Write texts."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        # A library that finds the bytes below would write around the escapes.
+        if name in ("buffer", "detach"):
+            raise AttributeError(name)
+        return getattr(self.stream, name)
+
+
+def escape_standard_streams() -> None:
+    """Escape all that is printed from now on; streams that are escaped already stay."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if not isinstance(stream, EscapedStream):
+            setattr(sys, name, cast("TextIO", EscapedStream(stream)))

@@ -32,6 +32,13 @@ def vector_norm(row: Floats) -> float:
     return float(np.sqrt(dot(row, row)))
 
 
+def column_norms(columns: Floats) -> Floats:
+    """Euclidean norm of each column, of any scale."""
+    # Squares of large columns overflow.
+    peaks = np.max(np.abs(columns), axis=0, initial=0.0)
+    return np.asarray(peaks * np.linalg.norm(columns / np.where(peaks > 0, peaks, 1.0), axis=0))
+
+
 def triangular_factor(tall: Floats) -> Floats:
     """Triangular factor R of the QR factorization of a tall matrix.
 
@@ -69,7 +76,7 @@ def minimum_norm_solution(tall: Floats, wanted: Floats, rcond: float | None) -> 
 
 def orthonormal(columns: Floats, least: float) -> Floats:
     """Orthonormal basis of columns of any scale; directions below a share ``least`` are dropped."""
-    sizes = np.linalg.norm(columns, axis=0)
+    sizes = column_norms(columns)
     directions, spread, _ = thin_svd(columns / np.where(sizes > 0, sizes, 1.0))
     kept: Floats = directions[:, spread > least * spread.max(initial=0.0)]
     return kept

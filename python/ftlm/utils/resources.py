@@ -1,15 +1,17 @@
-"""Resources: memory limit of a search, machine speed for time estimates, interruptible worker threads."""
+"""Resources: memory limit of a search, machine speed, interruptible worker threads, processes of their own."""
 
 from __future__ import annotations
 
 import os
 import re
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -166,3 +168,29 @@ def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
                 flag.set()
             made.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, Any]:
+    """Return command, environment and working directory of a script of ftlm in a Python process of its own.
+
+    A file that somebody uploaded or downloaded must not become a module of the child. Python therefore runs isolated
+    (``-I``: neither ``PYTHONPATH`` nor the working directory is searched), in the folder of its installation. The
+    absolute folders of this process's modules, except its working directory, are searched after those of Python.
+
+    Parameters
+    ----------
+    script
+        File to run.
+    arguments
+        Arguments of the script.
+    site
+        Whether the site packages are set up at the start, which takes some time.
+    """
+    here = os.getcwd()
+    folders = [folder for folder in sys.path if os.path.isabs(folder) and folder != here]
+    # The package itself may have been found in the working directory.
+    folders.append(str(Path(__file__).resolve().parents[2]))
+    program = f"import runpy, sys; sys.path += {folders!a}; runpy.run_path({str(script)!a}, run_name='__main__')"
+    command = [sys.executable, "-I", *([] if site else ["-S"]), "-c", program, *arguments]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return {"args": command, "env": environment, "cwd": sys.prefix}

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import difflib
+import math
 import operator
 import os
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.errors import DataError, ModelError
 from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.resources import available_memory
 
 #: Environment variable with the default number of threads.
 THREADS_VARIABLE = "FTLM_THREADS"
 #: NumPy dtype kinds of real numbers. `float` drops the imaginary part of a complex number and counts days of a date.
 _REAL_DTYPE_KINDS = frozenset("fiuO")
+#: NumPy dtype kinds of arrays of real numbers.
+_NUMBER_DTYPE_KINDS = frozenset("fiub")
 
 
 def short_repr(value: object, most: int = 60) -> str:
@@ -51,7 +55,7 @@ def check_choice(name: str, value: object, known: Iterable[str]) -> None:
 
 def _is_number(value: object) -> bool:
     """Whether a value may be a real number; complex values are excluded."""
-    if isinstance(value, (str, bytes, bytearray, bool, complex)):
+    if isinstance(value, (str, bytes, bytearray, bool, complex)) or value is np.ma.masked:
         return False
     return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL_DTYPE_KINDS
 
@@ -194,21 +198,97 @@ Floats: TypeAlias = NDArray[np.float64]
 Complex: TypeAlias = NDArray[np.complex128]
 
 
-def as_floats(name: str, values: object) -> NDArray[np.float64]:
-    """Return a float64 array of real numbers, possibly a view of the argument.
+Scalar = TypeVar("Scalar", bound=np.generic)
+#: Values of a sequence, which NumPy reads one by one, and of an array that is not compared with the memory.
+MAX_SEQUENCE_LENGTH = 50_000_000
+#: Dimensions of nested sequences; NumPy visits every path of one that contains itself.
+MAX_DIMENSIONS = 16
+
+
+def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
+    """Return an array of any dtype, possibly a view of the argument; every array of a caller passes here.
+
+    A masked sample is a missing sample: NaN with ``gaps``, an error without.
 
     Raises
     ------
     DataError
-        Text, objects, complex numbers, or rows of different lengths.
+        Masked samples, rows of different lengths, a sequence or an array that does not fit into memory.
     """
+    _check_sequence(name, values)
     try:
+        if isinstance(values, (list, tuple)) and any(np.ma.isMaskedArray(item) for item in values):
+            # NumPy takes what lies under the masks of the items.
+            values = np.ma.stack([np.ma.asarray(item) for item in values])
+        mask = np.ma.getmaskarray(values) if np.ma.isMaskedArray(values) else None
         array = np.asarray(values)
-    except ValueError as error:
-        raise DataError(f"{name} is no array: {str(error).rstrip('.')}; give rows of equal length") from error
-    if array.dtype.kind not in "fiub":
+    except Exception as error:
+        raise DataError(
+            f"{name} is no array of numbers ({error_text(error, 200).rstrip('.')}); give rows of equal length"
+        ) from error
+    if array.size > MAX_SEQUENCE_LENGTH and array.size * 8 > (available_memory() or math.inf):
+        raise DataError(f"{name} has shape {array.shape} and does not fit into memory; give fewer values")
+    if mask is None or not mask.any():
+        return array
+    if gaps and array.dtype.kind in _NUMBER_DTYPE_KINDS:
+        return np.where(mask, np.nan, array)
+    first = int(np.argwhere(np.atleast_1d(mask))[0][0])
+    raise bad_rows(name, "masked (missing) value", first, int(mask.sum()), "remove or fill these rows yourself")
+
+
+def _check_sequence(name: str, values: object) -> None:
+    """Raise for a sequence that is too long or too deep to be read."""
+    depth, first = 0, values
+    while isinstance(first, Sequence) and not isinstance(first, (str, bytes, bytearray, memoryview)):
+        try:
+            length, item = len(first), first[0] if first else None
+        except OverflowError:
+            length, item = MAX_SEQUENCE_LENGTH + 1, None
+        except Exception as error:
+            raise DataError(f"{name} is no array of numbers ({error_text(error, 200)}); give an array") from error
+        if length > MAX_SEQUENCE_LENGTH or depth > MAX_DIMENSIONS:
+            found = f"{MAX_SEQUENCE_LENGTH} values" if length > MAX_SEQUENCE_LENGTH else f"{MAX_DIMENSIONS} dimensions"
+            raise DataError(f"{name} is no array of numbers, but a sequence of more than {found}; give an array")
+        if not length:
+            return
+        depth, first = depth + 1, item
+
+
+def check_vector(name: str, array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Return a vector of at least one value; raise for arrays of other shapes."""
+    if array.ndim != 1 or not array.size:
+        raise DataError(f"{name} has shape {array.shape}; give a vector of at least one number")
+    return array
+
+
+def as_floats(name: str, values: object, *, gaps: bool = False) -> NDArray[np.float64]:
+    """Return a float64 array of real numbers, possibly a view of the argument; see :func:`as_array`.
+
+    Raises
+    ------
+    DataError
+        Text, objects, complex numbers, or what :func:`as_array` refuses.
+    """
+    array = as_array(name, values, gaps=gaps)
+    if array.dtype.kind not in _NUMBER_DTYPE_KINDS:
         raise DataError(f"{name} holds {array.dtype} values; give real numbers")
-    return np.asarray(array, dtype=np.float64, order="C")
+    with np.errstate(over="ignore"):
+        return np.asarray(array, dtype=np.float64, order="C")
+
+
+def as_complex(name: str, values: object) -> NDArray[np.complex128]:
+    """Return a complex128 array of real or complex numbers; see :func:`as_array`.
+
+    Raises
+    ------
+    DataError
+        Text, objects, or what :func:`as_array` refuses.
+    """
+    array = as_array(name, values)
+    if array.dtype.kind not in _NUMBER_DTYPE_KINDS | {"c"}:
+        raise DataError(f"{name} holds {array.dtype} values; give numbers")
+    with np.errstate(over="ignore"):
+        return np.asarray(array, dtype=np.complex128, order="C")
 
 
 def apply_along_axis(

@@ -31,6 +31,7 @@ from ftlm.simulation.simulate import comparison_records, respond
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, symbol_html
 from ftlm.utils.validation import Floats, as_floats
@@ -71,6 +72,7 @@ class Metrics:
 UNKNOWN_METRICS = Metrics(math.nan, math.nan, math.nan, math.nan)
 
 
+@check_arguments
 def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     """Return error (45), RMSE (46), NR (47) and fit of a prediction.
 
@@ -154,7 +156,7 @@ class Comparison:
     offsets
         Unknown constants of the equations, one mapping per run: output -> ``"constant"`` [unit of D^alpha y] (and
         ``"ramp"`` [that unit/s]) -> value. Estimated on each run separately; empty for a model without an offset, and
-        for an output whose initial history makes the offset unidentifiable.
+        for an output whose initial history makes the offset unidentifiable or whose free run diverges.
     without_equation_error
         Outputs without an equation error, with the reason: friction acts on them, or samples are missing.
     """
@@ -247,6 +249,7 @@ MISSING_SAMPLES_REASON = "not every sample of it was read, and the straight line
 HIDDEN_OFFSET_NOTE = "not told apart from what the run did before its start; begin the run at rest to learn it"
 
 
+@check_arguments
 def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
     """Return equation error and output error of a model on measured runs.
 
@@ -347,13 +350,14 @@ def describe_missing_equation_errors(why: Mapping[str, str]) -> list[str]:
 def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
     """Return offsets of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
 
-    Empty for an equation whose run has an initial history: its powers of t make a constant unidentifiable.
+    Empty for an equation whose run has an initial history, since its powers of t make a constant unidentifiable, and
+    for one whose free run diverges, which determines no constant.
     """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
         alone = initial_exponents(item, "caputo", model.structure.offset)
         found = {round(e, 9) for e in initial[item.output] if e > -1}
-        if isinstance(model.structure.initial, str) and not found <= set(alone):
+        if not found or (isinstance(model.structure.initial, str) and not found <= set(alone)):
             out[item.output] = {}
             continue
         exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
@@ -367,10 +371,11 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
 def describe_offsets(comparison: Comparison) -> list[str]:
     """Describe the offsets of every run that has some, one line per output."""
     lines = []
-    for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
+    for (run, _, _), offsets, initial in zip(comparison.per_run, comparison.offsets, comparison.initial, strict=False):
         for output, values in offsets.items():
             if not values:
-                lines.append(f"offset in the equation of {output} in {run}: {HIDDEN_OFFSET_NOTE}")
+                note = HIDDEN_OFFSET_NOTE if initial[output] else "not estimated, since the free run diverges"
+                lines.append(f"offset in the equation of {output} in {run}: {note}")
                 continue
             ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
             lines.append(

@@ -18,6 +18,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.findings import Finding, finding, unique
 from ftlm.structure.structure import Structure
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.linalg import minimum_norm_solution, orthonormal
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import estimate_noise, is_rest
@@ -107,6 +108,7 @@ class Advice:
         return f"<p>Advice on {html.escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
 
 
+@check_arguments
 def advise(run: Run, structure: Structure | None = None) -> Advice:
     """Check a run for faults and poor excitation; see :meth:`ftlm.Run.advice`."""
     return Advice(run.name, tuple(_findings(run, structure)))

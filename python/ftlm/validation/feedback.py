@@ -279,9 +279,7 @@ def _local_past(w: Floats, past: Floats) -> float:
 class _Innovations:
     """Innovations of an input and of an output over several runs, and the tests on them."""
 
-    def __init__(
-        self, missed: list[Floats], moves: list[Floats], others: list[list[Floats]], *, shift: int
-    ) -> None:
+    def __init__(self, missed: list[Floats], moves: list[Floats], others: list[list[Floats]], *, shift: int) -> None:
         shortest = min(u.size for u in moves)
         self.shift = shift
         self.input_lags = min(MAX_INPUT_LAGS, shortest // 10)
@@ -405,7 +403,7 @@ class _Innovations:
             return result("cannot be told", "one stretch alone says so")
         first = max(INNOVATION_COUNTS) + self.input_lags
         last = min(end - begin for begin, end in self.places) // 3
-        far = np.unique(np.linspace(first, last, PLACEBO_COUNT).astype(int)) if last > first else []
+        far = np.unique(np.linspace(first, max(first, last), PLACEBO_COUNT).astype(int)) if last > first else np.zeros(0)
         placebo = max((self._ratio(int(k), clipped)[0] for k in far), default=0.0)
         if ratio < PLACEBO_RATIO * placebo:
             return result("cannot be told", f"outputs far back explain as much (ratio {placebo:.2g})")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ModelError
 from ftlm.svg.html_page import Table
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, Exact
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import whole_number
@@ -50,6 +51,7 @@ class InformationCriteria:
         )
 
 
+@check_arguments
 def information_criteria(tests: Residuals, parameters: int) -> InformationCriteria:
     """Return AIC, AICc and BIC of a model from its residuals; orders count like coefficients.
 

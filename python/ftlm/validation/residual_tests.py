@@ -21,6 +21,7 @@ from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
+from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, symbol_html
 from ftlm.utils.linalg import blockwise_triangular_factor, dot, orthonormal, projections, triangular_factor
 from ftlm.utils.parameters import setting
@@ -447,6 +448,7 @@ class Residuals:
 DEFAULT_LAGS = 25
 
 
+@check_arguments
 def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) -> Residuals:
     """Test whether the residuals of a simulation are white, and independent of the inputs.
 

@@ -1,0 +1,164 @@
+"""Errors of wrong arguments in words: what an argument is, and what its annotation says that it should be."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import os
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from ftlm.errors import FtlmError, ModelError
+from ftlm.utils.parameters import setting
+from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, real_number, short_repr, whole_number
+
+#: Exceptions that arguments of another type cause.
+_FROM_ARGUMENTS = (TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+
+#: Annotations of arguments that are checked by their text, and what they are called in messages.
+_KIND_WORDS = {
+    "float": "a finite number",
+    "complex": "a number",
+    "int": "a whole number",
+    "bool": "True or False",
+    "str": "text",
+    "Mapping": "a mapping of names",
+    "Sequence": "a list",
+    "Iterable": "a list",
+    "Collection": "a list",
+    "tuple": "a tuple",
+    "list": "a list",
+    "Callable": "a function",
+    "os.PathLike": "a path",
+    "None": "None",
+}
+#: Items of a mapping or a list that are checked.
+_MAX_CHECKED_ITEMS = 1000
+#: Size from which a number is named as the cause of a failure.
+_MAX_NUMBER = 2.0**62
+
+
+def check_arguments(decorated: Decorated) -> Decorated:
+    """Decorate a function or a class: an exception that a wrong argument causes becomes a :class:`ModelError`.
+
+    The arguments are compared with their annotations only after the call failed, so that a call that succeeds pays
+    nothing, and an error in words of the function itself stands. Sequences too long to be read are refused before it.
+    """
+    if inspect.isclass(decorated):
+        type.__setattr__(decorated, "__init__", check_arguments(decorated.__init__))
+        return decorated
+
+    @functools.wraps(decorated)
+    def call_function(*given: Any, **named: Any) -> Any:
+        for value in (*given, *named.values()):
+            if isinstance(value, range):
+                _check_range(decorated, given, named)
+        try:
+            return decorated(*given, **named)
+        except Exception as error:
+            # A decorated function below names its own argument, and the caller knows the one of this function.
+            if not isinstance(error, FtlmError) or isinstance(error.__cause__, _FROM_ARGUMENTS):
+                _raise_in_words(decorated, given, named, error)
+            raise
+
+    return cast("Decorated", call_function)
+
+
+def _check_range(function: Callable[..., Any], given: Any, named: Any) -> None:
+    """Raise for the first argument that is a range with more values than can be read."""
+    for name, value in inspect.signature(function).bind_partial(*given, **named).arguments.items():
+        if isinstance(value, range) and value and abs((value[-1] - value[0]) // value.step) >= MAX_SEQUENCE_LENGTH:
+            raise ModelError(
+                f"{setting(name)} {short_repr(value)} has more than {MAX_SEQUENCE_LENGTH} values; give fewer"
+            )
+
+
+def _raise_in_words(function: Callable[..., Any], given: Any, named: Any, error: Exception) -> None:
+    """Raise for the first argument that is not what its annotation says."""
+    signature = inspect.signature(function)
+    try:
+        bound = signature.bind(*given, **named)
+    except TypeError:
+        return
+    for name, value in bound.arguments.items():
+        annotation = signature.parameters[name].annotation
+        kinds = _alternatives(annotation) if isinstance(annotation, str) else []
+        if kinds and not any(_fits(value, kind) for kind in kinds):
+            words = " or ".join(dict.fromkeys(_KIND_WORDS.get(k.partition("[")[0], k) for k in kinds))
+            raise ModelError(
+                f"{setting(name)} {short_repr(value)} is a {type(value).__name__}; give {words}"
+            ) from error
+
+
+def _alternatives(annotation: str) -> list[str]:
+    """Return the members of a union."""
+    found, depth = [""], 0
+    for sign in annotation:
+        depth += (sign == "[") - (sign == "]")
+        if sign == "|" and depth == 0:
+            found.append("")
+        else:
+            found[-1] += sign
+    return [part.strip() for part in found]
+
+
+def _fits(value: object, kind: str) -> bool:
+    """Whether a value is what an annotation without alternatives says; True for annotations that are not known."""
+    name, _, inner = kind.partition("[")
+    inner = inner.removesuffix("]")
+    if name == "None":
+        return value is None
+    if name == "bool":
+        return isinstance(value, bool)
+    if name == "str":
+        return isinstance(value, str)
+    if name == "os.PathLike":
+        return isinstance(value, os.PathLike)
+    if name in ("float", "complex"):
+        return (name == "complex" and isinstance(value, complex)) or (type(value) in (int, float) and _is_real(value))
+    if name == "int":
+        return whole_number(value) is not None and _is_real(value)
+    if name == "Hashable":
+        return isinstance(value, Hashable)
+    if name == "Literal":
+        return isinstance(value, str)
+    if name == "Mapping":
+        key, _, of = inner.partition(", ")
+        items = list(value.items())[:_MAX_CHECKED_ITEMS] if isinstance(value, Mapping) else None
+        return items is not None and all(_fits_any(k, key) and _fits_any(v, of) for k, v in items)
+    if name == "Callable":
+        return callable(value)
+    if name in ("Sequence", "Iterable", "Collection", "tuple", "list"):
+        if isinstance(value, (bytes, Mapping, np.ndarray)) or not isinstance(value, Iterable):
+            return False
+        members = inner.removesuffix(", ...").split(", ") if name == "tuple" else [inner]
+        same = len(set(members)) == 1
+        if isinstance(value, str):
+            return _fits_any(value, members[0])
+        return not (same and isinstance(value, (list, tuple))) or all(
+            _fits_any(v, members[0]) for v in value[:_MAX_CHECKED_ITEMS]
+        )
+    if name in ("Any", "object") or not name.isidentifier() or not name[0].isupper() or name in _OPEN_NAMES:
+        return True
+    return any(base.__name__ == name for base in type(value).__mro__)
+
+
+#: Names of annotations that stand for several types.
+_OPEN_NAMES = {"ArrayLike", "Floats", "Complex", "Values", "Weights", "Controller", "EstimationMethod"}
+_OPEN_NAMES |= {"OrderParameters", "Self", "Intersample", "Initial"}
+
+
+def _fits_any(value: object, annotation: str) -> bool:
+    return not annotation or any(_fits(value, kind) for kind in _alternatives(annotation))
+
+
+def _is_real(value: object) -> bool:
+    try:
+        return math.isfinite(real_number("value", value)) and abs(real_number("value", value)) < _MAX_NUMBER
+    except ModelError:
+        return False
