@@ -94,10 +94,10 @@ if _typing.TYPE_CHECKING:
     from ftlm.validation.comparison import Metrics as Metrics
     from ftlm.validation.comparison import compare as compare
     from ftlm.validation.comparison import metrics as metrics
+    from ftlm.validation.feedback import FeedbackTest as FeedbackTest
     from ftlm.validation.information_criteria import InformationCriteria as InformationCriteria
     from ftlm.validation.information_criteria import information_criteria as information_criteria
     from ftlm.validation.residual_tests import CorrelationTest as CorrelationTest
-    from ftlm.validation.residual_tests import FeedbackTest as FeedbackTest
     from ftlm.validation.residual_tests import OutputResiduals as OutputResiduals
     from ftlm.validation.residual_tests import Residuals as Residuals
     from ftlm.validation.residual_tests import resid as resid
@@ -150,7 +150,8 @@ _MODULE_BY_NAME = {
         "structure_selection.select": "select",
         "validation.comparison": "Comparison Metrics compare metrics",
         "validation.information_criteria": "InformationCriteria information_criteria",
-        "validation.residual_tests": "CorrelationTest FeedbackTest OutputResiduals Residuals resid",
+        "validation.feedback": "FeedbackTest",
+        "validation.residual_tests": "CorrelationTest OutputResiduals Residuals resid",
     }.items()
     for name in names.split()
 }

@@ -372,16 +372,23 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "loop_found": FindingKind(
         "loop",
         LEVEL_WITH_CARE,
-        "{output}: {how} (statistic {statistic:.3g}, 99 % limit {limit:.3g}): a closed loop{or_else}, and residuals "
-        "are not white: the noise that comes back with {input} biases estimates, which their intervals do not know; "
-        "record what drives the loop and name it with {ask[reference]}, or open the loop",
-        "{shown} answers {output}, a closed loop, and what comes back biases the numbers",
+        "{output}: {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
+        "noise: a closed loop, and the noise that comes back with {input} biases estimates{effect}, which their "
+        "intervals do not know; record what drives the loop and name it with {ask[reference]}, or open the loop",
+        "{input} answers {output}, a closed loop, and what comes back biases the numbers",
     ),
     "loop_harmless": FindingKind(
         "loop",
         LEVEL_FACT,
-        "{output}: {how} (statistic {statistic:.3g}, 99 % limit {limit:.3g}): a closed loop{or_else}; with white "
-        "residuals output error has no bias from it, equation-error methods have",
+        "{output}: {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
+        "noise: a closed loop, which moves estimates of output error{effect} alone; those of equation-error methods "
+        "are biased",
+    ),
+    "moves_within_row": FindingKind(
+        "loop",
+        LEVEL_FACT,
+        "{output}: residuals follow {input} of the same row alone (correlation {value:.2g}): {input} answers {output} "
+        "within a row, or feeds through to it directly: then add that term",
     ),
     "too_short_for_tests": _rule(
         "residuals", LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run"

@@ -109,7 +109,7 @@ def test_feedback_is_told_from_a_lacking_term(small_model):
     lag = int(found.outputs["y"].inputs["u"].lags[np.argmax(np.abs(found.outputs["y"].inputs["u"].values))])
     assert lag == -3
     assert "closed loop" in str(found)
-    assert residual_findings(found) == []
+    assert [f.code for f in residual_findings(found)] == ["loop_harmless"]
 
 
 # ------------------------------------------------------------------------------------------------ what is tested

@@ -103,6 +103,25 @@ def fit_with_instruments(
     )
 
 
+def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> float:
+    """Return the largest bias of a parameter by feedback, in its standard errors.
+
+    It is the first Gauss-Newton step of a fit with instruments (see :func:`fit_with_instruments`), where `answers` are
+    the inputs without the part that answers the residuals. Infinite if there is no such step.
+    """
+    weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
+    every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
+    try:
+        measured, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
+        attempt, slopes, instruments = _evaluate_moments(measured, clean, joint.values)
+    except FtlmError:
+        return math.inf
+    step = np.linalg.pinv(instruments @ slopes.T) @ (instruments @ np.asarray(attempt.outcome["residuals"]))
+    errors = np.array([joint.standard_errors[n] for n in joint.names])
+    known = np.isfinite(errors) & (errors > 0)
+    return float(np.max(np.abs(step[known]) / errors[known], initial=0.0))
+
+
 def _evaluate_moments(measured: Objective, clean: Objective, values: Floats) -> tuple[Iterate, Floats, Floats]:
     """Return residuals, sensitivities on measured inputs, and sensitivities on noise-free inputs."""
     orders, coefficients, inputs = measured.problem.split(values.tolist())

@@ -13,7 +13,10 @@ from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
+from ftlm.estimation.closed_loop import run_with_inputs
+from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
+from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.model_checks import (
     dead_channel_findings,
@@ -248,6 +251,7 @@ def assess_fit(fit: Fit) -> Identification:
     except DataError:
         # A run that is too short for correlations; everything else can be told.
         pass
+    tests = None if tests is None else _with_feedback_bias(fit, tests)
     findings += [] if tests is None else _residual_findings(fit, tests)
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
@@ -268,6 +272,32 @@ def assess_fit(fit: Fit) -> Identification:
     if not against:
         return result
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
+
+
+def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
+    """Return the tests with the bias that found feedback can make of a joint fit."""
+    fed = {
+        signal: test.response
+        for o in tests.outputs.values()
+        for signal, test in o.feedback_tests.items()
+        if test.response
+    }
+    runs = fit.task.runs
+    plain = not fit.task.structure.has_friction and all(run.sample_times is None for run in runs)
+    if fit.joint is None or not fed or "reference" in fit.settings or not plain:
+        return tests
+    answers = [
+        run_with_inputs(run, {n: run[n] - np.pad(v[k], 1) for n, v in fed.items()}) for k, run in enumerate(runs)
+    ]
+    problem = FreeProblem.of(replace(fit.task.structure, initial=fit.joint.initial))
+    bias = feedback_bias(fit.joint, problem, runs, answers)
+    outputs = {
+        name: replace(
+            o, feedback_tests={n: replace(t, bias=bias) if t.has_feedback else t for n, t in o.feedback_tests.items()}
+        )
+        for name, o in tests.outputs.items()
+    }
+    return replace(tests, outputs=outputs)
 
 
 def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:

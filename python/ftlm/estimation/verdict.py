@@ -299,10 +299,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
         shown = ", ".join(f"{o} still follow {join_names(signals)}" for o, signals in following.items())
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
         yield finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
-    for output, tests in judged.items():
-        if tests.feedback and not tests.whiteness.passed and not looped:
-            signals = ", ".join(tests.feedback)
-            yield finding("loop_found", output=output, input=signals, shown=join_names(tests.feedback))
+    yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not r.whiteness.passed]
     if coloured:

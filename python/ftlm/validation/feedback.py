@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,7 +21,7 @@ FeedbackState = Literal["command", "none", "found", "cannot be told"]
 FEEDBACK_LEVEL = 0.005
 INNOVATION_COUNTS = (3, 12)
 #: Shortest run, and most rows that are tested.
-MIN_FEEDBACK_ROWS, MAX_FEEDBACK_ROWS = 150, 20_000
+MIN_FEEDBACK_ROWS, MAX_FEEDBACK_ROWS = 150, 8_000
 #: Most lags of the input's own past, of other inputs and of the output, each also limited by a share of the run.
 MAX_INPUT_LAGS, MAX_OTHER_LAGS, MAX_OUTPUT_LAGS = 60, 20, 40
 #: An input of so few levels, or of so few levels a row, has no innovation that a linear past leaves.
@@ -43,6 +43,8 @@ MIN_FEEDBACK_POWER = 0.01
 #: Shares of the largest noise in the measured input that are tried, and how far shifts in time are taken as placebos.
 INPUT_NOISE_SHARES = (0.2, 0.4, 0.6, 0.75, 0.87, 0.94)
 PLACEBO_COUNT, PLACEBO_RATIO = 19, 1.2
+#: The same where what is new in the input is no innovation everywhere: outputs far back measure what that does.
+PLACEBO_RATIO_IN_DOUBT = 10.0
 #: Parts of the run over which the agreement must be steady, and the least share of the median one.
 STEADY_PARTS, STEADY_SHARE = 8, 0.05
 #: Rows of the short blocks whose color and past are tested.
@@ -72,6 +74,8 @@ class FeedbackTest:
         Share of the variance of the input's innovation that past outputs explain.
     rows
         Rows that were tested.
+    bias
+        Largest bias that the answer can make of a parameter, in its standard errors; None if it is not known.
     response
         Part of the input that answers the residuals, one array per run in the unit of the input; empty unless found.
     """
@@ -81,6 +85,7 @@ class FeedbackTest:
     ratio: float = 0.0
     share: float = 0.0
     rows: int = 0
+    bias: float | None = None
     response: tuple[Floats, ...] = field(default=(), repr=False, compare=False)
 
     @property
@@ -90,7 +95,7 @@ class FeedbackTest:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        figures = {"ratio": self.ratio, "share": self.share, "rows": self.rows}
+        figures = {"ratio": self.ratio, "share": self.share, "rows": self.rows, "bias": self.bias}
         return {"state": self.state, "reason": self.reason, "has_feedback": self.has_feedback, **figures}
 
 
@@ -170,7 +175,7 @@ def feedback_test(
             for_rows = np.diff([changes[k][0], *ends])
             held = np.repeat(response, for_rows)
             there[changes[k][0] : changes[k][0] + held.size] = held
-    return FeedbackTest(test.state, test.reason, test.ratio, test.share, test.rows, tuple(responses))
+    return replace(test, response=tuple(responses))
 
 
 def _filled(residuals: Floats) -> Floats:
@@ -223,7 +228,7 @@ def _line_columns(u: Floats) -> list[Floats]:
         omega = 2 * math.pi * place / size
         columns += [np.cos(omega * time), np.sin(omega * time)]
         basis = np.column_stack([np.ones(count), *columns])
-        x = u - basis @ minimum_norm_solution(basis, u, 1e-8)
+        x = _project_out(basis, u)
     return columns
 
 
@@ -381,16 +386,19 @@ class _Innovations:
         share = float(1 - np.sum((target - fitted) ** 2) / np.sum(target**2))
 
         def result(state: FeedbackState, reason: str = "") -> FeedbackTest:
-            response = self._response(fitted, rows) if state == "found" else ()
-            return FeedbackTest(state, reason, ratio, share, count, response)
+            response = self._response(columns, rows) if state == "found" else ()
+            return FeedbackTest(state, reason, ratio, share, count, response=response)
 
         # No two signals that were made beforehand explain most of what is new in a rough input.
         if share >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
             return result("found")
+        doubt = ""
         if _local_color(clipped) > 1:
-            return result("cannot be told", "its innovations have a tone of their own")
-        if _local_past(clipped, self.past[:, :2]) > 1:
-            return result("cannot be told", "its innovations follow its past here and there, as a sweep's do")
+            doubt = "its innovations have a tone of their own"
+        elif _local_past(clipped, self.past[:, :2]) > 1:
+            doubt = "its innovations follow its past here and there, as a sweep's do"
+        if doubt and ratio <= PLACEBO_RATIO_IN_DOUBT:
+            return result("cannot be told", doubt)
         if ratio <= 1:
             return result("none")
         if count * share * self.scale**2 < MIN_FEEDBACK_POWER:
@@ -403,10 +411,10 @@ class _Innovations:
             return result("cannot be told", "one stretch alone says so")
         first = max(INNOVATION_COUNTS) + self.input_lags
         last = min(end - begin for begin, end in self.places) // 3
-        far = np.unique(np.linspace(first, max(first, last), PLACEBO_COUNT).astype(int)) if last > first else np.zeros(0)
-        placebo = max((self._ratio(int(k), clipped)[0] for k in far), default=0.0)
-        if ratio < PLACEBO_RATIO * placebo:
-            return result("cannot be told", f"outputs far back explain as much (ratio {placebo:.2g})")
+        far = np.unique(np.linspace(first, last, PLACEBO_COUNT).astype(int)).tolist() if last > first else []
+        placebo = max((self._ratio(k, clipped)[0] for k in far), default=1.0)
+        if ratio < (PLACEBO_RATIO_IN_DOUBT * max(placebo, 1.0) if doubt else PLACEBO_RATIO * placebo):
+            return result("cannot be told", doubt or f"outputs far back explain as much (ratio {placebo:.2g})")
         return result("found")
 
     def _ratio_with_noisy_input(self, rows: NDArray[np.intp]) -> float:
@@ -439,10 +447,15 @@ class _Innovations:
             least = min(least, max(_score_ratio(w, chosen) for chosen in sets))
         return least
 
-    def _response(self, fitted: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
-        """Part of the input that answers the output, by run: its innovations through the input's own past."""
+    def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
+        """Part of the input that answers the output, by run: its innovations through the input's own past.
+
+        Where an answer was found, what the input shares with the residual of the same row is an answer, too.
+        """
+        now = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
+        columns = np.column_stack([columns, now / max(float(np.linalg.norm(now)), 1e-300)])
         innovations = np.zeros(self.inputs.size)
-        innovations[rows] = self.scale * fitted
+        innovations[rows] = columns @ minimum_norm_solution(columns, self.innovation[rows], 1e-12)
         weighted = self.past * self.weights[:, None]
         gram = weighted.T @ self.past
         gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
