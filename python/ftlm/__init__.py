@@ -47,6 +47,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.estimation.verdict import Verdict as Verdict
     from ftlm.experiment_design.design_input import design_input as design_input
     from ftlm.experiment_design.result import DesignedInput as DesignedInput
+    from ftlm.findings import Finding as Finding
     from ftlm.fractional_calculus import block_pulse_matrix as block_pulse_matrix
     from ftlm.fractional_calculus import fractional_derivative as fractional_derivative
     from ftlm.fractional_calculus import fractional_integral as fractional_integral
@@ -93,10 +94,10 @@ if _typing.TYPE_CHECKING:
     from ftlm.validation.comparison import Metrics as Metrics
     from ftlm.validation.comparison import compare as compare
     from ftlm.validation.comparison import metrics as metrics
+    from ftlm.validation.feedback import FeedbackTest as FeedbackTest
     from ftlm.validation.information_criteria import InformationCriteria as InformationCriteria
     from ftlm.validation.information_criteria import information_criteria as information_criteria
     from ftlm.validation.residual_tests import CorrelationTest as CorrelationTest
-    from ftlm.validation.residual_tests import FeedbackTest as FeedbackTest
     from ftlm.validation.residual_tests import OutputResiduals as OutputResiduals
     from ftlm.validation.residual_tests import Residuals as Residuals
     from ftlm.validation.residual_tests import resid as resid
@@ -124,6 +125,7 @@ _MODULE_BY_NAME = {
         "estimation.verdict": "Validation Verdict",
         "experiment_design.design_input": "design_input",
         "experiment_design.result": "DesignedInput",
+        "findings": "Finding",
         "fractional_calculus": "block_pulse_matrix fractional_derivative fractional_integral haar_inverse haar_matrix "
         "haar_transform operational_matrix",
         "io.dialect": "Assumption Layout",
@@ -148,7 +150,8 @@ _MODULE_BY_NAME = {
         "structure_selection.select": "select",
         "validation.comparison": "Comparison Metrics compare metrics",
         "validation.information_criteria": "InformationCriteria information_criteria",
-        "validation.residual_tests": "CorrelationTest FeedbackTest OutputResiduals Residuals resid",
+        "validation.feedback": "FeedbackTest",
+        "validation.residual_tests": "CorrelationTest OutputResiduals Residuals resid",
     }.items()
     for name in names.split()
 }

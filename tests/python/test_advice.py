@@ -59,15 +59,15 @@ def with_faults(u, y, rng):
     """The same run with each fault in turn, of random size, sign and place."""
     n, size = y.size, np.std(y)
     sign = rng.choice([-1, 1])
-    yield "offset", u, y + sign * rng.uniform(0.3, 2) * size
+    yield "starts_off_zero", u, y + sign * rng.uniform(0.3, 2) * size
     yield "drift", u, y + sign * rng.uniform(1, 3) * size * np.arange(n) / n
     limit = np.quantile(np.abs(y), rng.uniform(0.7, 0.97))
     yield "saturation", u, np.clip(y, -limit, limit)
     dead, first = y.copy(), int(rng.uniform(0, 0.6) * n)
     dead[first : first + int(rng.uniform(0.06, 0.3) * n)] = 0.0 if rng.random() < 0.5 else y[first]
-    yield "dead", u, dead
-    yield "constant", u, np.full(n, 0.3)
-    yield "constant", np.ones(n), y
+    yield "channel_off", u, dead
+    yield "constant_output", u, np.full(n, 0.3)
+    yield "constant_input", np.ones(n), y
     spiked, at = y.copy(), rng.choice(np.arange(5, n - 5), rng.integers(1, 5), replace=False)
     spiked[at] += rng.choice([-1, 1], at.size) * rng.uniform(0.25, 2, at.size) * np.ptp(y)
     yield "spikes", u, spiked
@@ -81,7 +81,7 @@ def test_injected_faults_are_found_and_clean_runs_raise_no_alarm():
         alarms += [(seed, f.sentence) for f in advice]
         for fault, *signals in with_faults(u, y, rng):
             injected[fault] = injected.get(fault, 0) + 1
-            found[fault] = found.get(fault, 0) + (fault in made(h, *signals).advice().kinds)
+            found[fault] = found.get(fault, 0) + (fault in made(h, *signals).advice().codes)
     assert alarms == []
     recall = {fault: found[fault] / count for fault, count in injected.items()}
     assert min(recall.values()) >= 0.95, recall
@@ -104,14 +104,14 @@ def test_feedback_is_told_from_a_command(closed, seed):
         # The command is computed from the last row's measurement, as by a controller of its own.
         u[k] = 0.0 if k == 0 else (gain * (reference[k] - y[k - 1]) if closed else error)
         x = decay * x + (1 - decay) / a * b * u[k]
-    assert ("feedback" in made(h, u, y).advice().kinds) == closed
+    assert ("loop_in_data" in made(h, u, y).advice().codes) == closed
 
 
 def test_one_sine_excites_little_and_its_lines_are_counted():
     t = np.arange(4000) * 0.005
     wave = np.sin(6.3 * t)
     y = np.sin(6.3 * t - 0.5) * (1 - np.exp(-t)) + 1e-3 * np.random.default_rng(1).standard_normal(t.size)
-    (finding,) = (f for f in made(0.005, wave, y).advice() if f.kind == "excitation")
+    (finding,) = (f for f in made(0.005, wave, y).advice() if f.code == "one_sine")
     assert "one sine at 6.2" in finding.sentence
     assert "persistently exciting of order 2" in finding.sentence
     for lines in (1, 2, 3, 7):
@@ -157,7 +157,7 @@ def test_short_runs_are_named(small_model):
     # A mode of 4 s seen for one second.
     t = np.arange(500) * 0.002
     swing = made(0.002, np.sign(np.sin(9 * t)), 1 - np.cos(2 * np.pi / 4 * t))
-    assert "short" in swing.advice().kinds
+    assert "short" in swing.advice().codes
     assert "still moving at the end" in str(swing.advice())
 
 
@@ -176,7 +176,7 @@ def test_a_channel_that_was_zeroed_is_told_from_a_machine_at_rest():
     late = u.copy()
     late[:200] = 0.0
     resting = np.convolve(late, 0.02 * 0.98 ** np.arange(900))[:n]
-    assert "dead" not in made(0.01, late, resting).advice().kinds
+    assert "channel_off" not in made(0.01, late, resting).advice().codes
 
 
 def test_a_fit_to_a_channel_that_was_off_says_so():
@@ -190,7 +190,7 @@ def test_a_fit_to_a_channel_that_was_off_says_so():
     y[:60] = 0.0
     run = made(0.01, u, y)
     said = [w for w in ftlm.identify(run, structure).warnings if "exactly" in w]
-    (found,) = [f for f in run.advice() if f.kind == "dead"]
+    (found,) = [f for f in run.advice() if f.code == "channel_off"]
     assert said == [f"run {run.name}: {found.sentence}"]
 
 
@@ -205,9 +205,9 @@ def test_advice_prints_counts_and_is_json(small_run):
     advice = hostile.advice()
     assert "<b>" not in advice._repr_html_()
     document = json.loads(json.dumps(advice.to_dict()))
-    assert document[0]["kind"] == "constant"
-    assert document[0]["signal"] == "u"
-    assert "1 in all 200 rows" in document[0]["sentence"]
+    assert document[0]["code"] == "constant_input"
+    assert document[0]["input"] == "u"
+    assert "1 in all 200 rows" in document[0]["text"]
 
 
 def test_advice_changes_nothing_and_takes_hostile_runs():
@@ -237,22 +237,22 @@ def test_the_arms_record_of_2011():
     text = str(advice)
     assert "theta12 is exactly 0 rad from 0 s to 1.004 s" in text
     assert "theta22 is exactly 0 rad from 0 s to 0.204 s" in text
-    assert [f.signal for f in advice if f.kind == "feedback"]
-    assert set(advice.kinds) <= {"dead", "feedback", "offset"}
+    assert [f.input for f in advice if f.code == "loop_in_data"]
+    assert set(advice.codes) <= {"channel_off", "loop_in_data", "starts_off_zero"}
     later = ftlm.load(DATA / "two_link_psf" / "psf.csv", window=(1.1, 19.5), **ARM).advice()
-    assert set(later.kinds) == {"feedback", "offset"}
+    assert set(later.codes) == {"loop_in_data", "starts_off_zero"}
 
 
 @needs_data
 def test_the_arm_under_lqr():
     advice = ftlm.load(DATA / "two_link_lqr" / "lqr.csv", window=(0.1, 19.9), **ARM).advice()
-    assert {f.signal for f in advice if f.kind == "feedback"} == {"I1", "I2"}
-    assert set(advice.kinds) == {"feedback", "offset"}
+    assert {f.input for f in advice if f.code == "loop_in_data"} == {"I1", "I2"}
+    assert set(advice.codes) == {"loop_in_data", "starts_off_zero"}
 
 
 @needs_data
 def test_the_heating_system_does_not_start_at_rest():
     table = np.loadtxt(DATA / "heating" / "heating_system.dat")
     run = ftlm.Run.from_arrays(step=2.0, inputs={"u": table[:, 1]}, outputs={"T": table[:, 2]}, units={"T": "degC"})
-    assert run.advice().kinds == ("offset",)
+    assert run.advice().codes == ("starts_off_zero",)
     assert "129.3 degC" in str(run.advice())

@@ -14,7 +14,7 @@ PACKAGE = Path(ftlm.__file__).parent
 LAYERS = (
     {"errors", "_core", "_version"},
     {"utils"},
-    {"progress"},
+    {"progress", "findings"},
     {"svg", "structure", "fractional_calculus"},
     {"data"},
     {"io", "model"},

@@ -24,7 +24,7 @@ from ftlm.estimation.confidence_intervals import (
     nonlinear_parameters,
     profile_intervals,
 )
-from ftlm.estimation.model_checks import identifiability_warnings
+from ftlm.estimation.model_checks import identifiability_findings
 from ftlm.estimation.objective import Iterate
 from ftlm.estimation.output_error import Loss
 from ftlm.report.html_report import model_page
@@ -225,7 +225,7 @@ def schema_without_doubts(path: Path) -> int:
     """Schema that a model has where nothing spoke against it and nothing was kept for another experiment."""
     read = ftlm.load_model(path)
     assert read.estimate is not None
-    trusted = msgspec.structs.replace(read.estimate, against=msgspec.UNSET, free=msgspec.UNSET)
+    trusted = msgspec.structs.replace(read.estimate, against=msgspec.UNSET, findings=msgspec.UNSET, free=msgspec.UNSET)
     ftlm.Model.save(replace(read, estimate=trusted), path, force=True)
     return json.loads(path.read_text())["schema"]
 
@@ -461,10 +461,10 @@ def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification)
 def test_warnings_follow_the_profile(found: ftlm.Identification) -> None:
     assert found.fit is not None
     problem = likelihood_of(found).grid.problem
-    before = identifiability_warnings(replace(found.fit, profiles={}), problem)
-    after = identifiability_warnings(found.fit, problem)
-    assert [w for w in before if w.startswith("coefficient c")]
-    assert not [w for w in after if w.startswith("coefficient c")]
+    before = identifiability_findings(replace(found.fit, profiles={}), problem)
+    after = identifiability_findings(found.fit, problem)
+    assert [f for f in before if (f.code, f.parameter) == ("not_different_from_0", "c")]
+    assert not [f for f in after if (f.code, f.parameter) == ("not_different_from_0", "c")]
 
 
 # ------------------------------------------------------------------------------------------------ a real run

@@ -12,7 +12,7 @@ import ftlm
 from ftlm import _core
 from ftlm.plot.comparison_charts import residual_charts
 from ftlm.utils.statistics import autoregression, chi_squared_99, is_white, whiten_series
-from ftlm.validation.residual_tests import residual_warnings
+from ftlm.validation.residual_tests import residual_findings
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 
@@ -109,7 +109,7 @@ def test_feedback_is_told_from_a_lacking_term(small_model):
     lag = int(found.outputs["y"].inputs["u"].lags[np.argmax(np.abs(found.outputs["y"].inputs["u"].values))])
     assert lag == -3
     assert "closed loop" in str(found)
-    assert residual_warnings(found) == []
+    assert [f.code for f in residual_findings(found)] == ["loop_harmless"]
 
 
 # ------------------------------------------------------------------------------------------------ what is tested
@@ -173,7 +173,7 @@ def test_an_unstable_model_fails_in_words(small_run):
     assert not found.passed
     assert "leaves the range of numbers" in str(found)
     json.dumps(found.to_dict(), allow_nan=False)
-    assert "leaves the range" in residual_warnings(found)[0]
+    assert "leaves the range" in residual_findings(found)[0].text
 
 
 def test_residuals_print_and_are_json(small_model, noisy):
@@ -333,7 +333,7 @@ def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatc
     assert (test.conclusive, test.passed, test.failed, test.verdict) == (False, False, False, "undecided")
     assert found.to_dict()["outputs"]["y"]["inputs"]["u"]["conclusive"] is False
     assert "undecided" in str(found)
-    assert any("whether residuals follow u is undecided: its limit is" in w for w in residual_warnings(found))
+    assert "follow_undecided" in [f.code for f in residual_findings(found)]
     assert "undecided" in found._repr_html_()
     assert "undecided: its limit is" in residual_charts(found)[1].caption
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from ftlm.findings import texts
 
 WORDS = "D^alpha y = a D^0.6 y + c y + b u"
 
@@ -61,16 +62,16 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
     from dataclasses import replace
 
     from ftlm.estimation.free_parameters import FreeProblem
-    from ftlm.estimation.model_checks import identifiability_warnings as _uncertain
+    from ftlm.estimation.model_checks import identifiability_findings
 
     structure = ftlm.equation(WORDS, orders={"alpha": "1.5:1.7:0.1"})
     joint = ftlm.identify(noisy, structure).fit
     problem = FreeProblem.of(structure)
-    assert not [w for w in _uncertain(joint, problem) if "alpha" in w]
+    assert not [w for w in identifiability_findings(joint, problem) if "alpha" in w.text]
     for value in (0.3**2, np.nan, np.inf):
         covariance = joint.covariance.copy()
         covariance[0, 0] = value
-        words = _uncertain(replace(joint, covariance=covariance), problem)
+        words = texts(identifiability_findings(replace(joint, covariance=covariance), problem))
         said = "these runs do not tell alpha apart" if value == np.inf else "order alpha cannot be told from these runs"
         assert any(w.startswith(said) for w in words), value
 
@@ -78,7 +79,7 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
 def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
     from dataclasses import replace
 
-    from ftlm.estimation.model_checks import correlation_warnings
+    from ftlm.estimation.model_checks import correlation_findings
 
     joint = ftlm.identify(noisy, ftlm.equation(WORDS)).fit
     n = len(joint.names)
@@ -90,7 +91,7 @@ def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
 
     def said_of(shares):
         spread = np.asarray(shares) * sizes
-        return correlation_warnings(replace(joint, covariance=alike * np.outer(spread, spread)))
+        return list(texts(correlation_findings(replace(joint, covariance=alike * np.outer(spread, spread)))))
 
     assert said_of(np.full(n, 0.01)) == []
     assert said_of([0.2, *np.full(n - 1, 0.01)]) == []

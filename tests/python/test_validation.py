@@ -11,7 +11,7 @@ import oracles
 from ftlm import _core
 from ftlm.simulation import output_samples as past
 from ftlm.simulation.output_samples import simulate_samples
-from ftlm.validation.comparison import compare_means, near_identity_warnings
+from ftlm.validation.comparison import compare_means, near_identity_findings
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The four figures
@@ -242,13 +242,13 @@ def figures(nr):
 )
 def test_free_runs_far_worse_than_their_equation_error_are_named(own, equation, output, words):
     text = "D^1.5 y = " + " ".join(f"+ 1 D^{order} y" for order in own) + " + u"
-    found = near_identity_warnings(ftlm.equation(text), figures(equation), figures(output))
+    found = near_identity_findings(ftlm.equation(text), figures(equation), figures(output))
     if words is None:
         assert found == []
     else:
         (warning,) = found
-        assert warning.startswith("y: ")
-        assert words in warning
+        assert warning.output == "y"
+        assert words in warning.text
 
 
 def test_an_unstable_model_is_compared_and_said_to_be_useless():

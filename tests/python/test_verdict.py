@@ -1,8 +1,9 @@
 """The verdict: its rules on records whose fault is known, and the first screen that leads with it."""
 
-import ast
 import json
 import math
+import re
+import string
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,8 +19,8 @@ from ftlm.estimation import estimators as estimating
 from ftlm.estimation import nuisance_parameters as history
 from ftlm.estimation.output_error import ProfileInterval, fit_output_error
 from ftlm.estimation.verdict import saved_verdict
+from ftlm.findings import FINDING_CATALOGUE, FINDING_TOPICS, MAX_SUMMARY_FINDINGS, Finding, finding, group_findings
 from ftlm.report.html_report import model_page
-from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, OTHER_KIND, WARNING_KINDS, group_warnings, warning_kind
 from loops import loop
 
 SOURCE = Path(ftlm.__file__).parent
@@ -93,15 +94,15 @@ def test_a_validation_that_leaves_much_more_is_with_care(found, checked):
 
 
 @pytest.mark.parametrize(
-    "warning",
+    "doubt",
     [
-        "the delay of u cannot be told from these runs: its standard error exceeds its bounds",
-        "nothing tells fs and vs in these runs",
-        "r says little of u (F = 2, 10 are needed): a weak instrument",
+        finding("input_number_not_told", parameter="delay_u", words="delay of u"),
+        finding("stribeck_slow_untold", output="y", ratio=2.0, speed=1.0, slow=0, total=9),
+        finding("reference_weak", input="u", reference="r", f=2.0, needed=10.0),
     ],
 )
-def test_what_no_number_says_speaks_against_a_model(found, checked, warning):
-    doubted = replace(found, warnings=(*found.warnings, warning))
+def test_what_no_number_says_speaks_against_a_model(found, checked, doubt):
+    doubted = replace(found, findings=(*found.findings, doubt))
     assert doubted.verdict(checked).level == "with care"
 
 
@@ -224,18 +225,19 @@ def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, chec
         assert judged.level == ("with care" if reason else "trust")
 
 
-def test_rough_intervals_speak_against_a_model(found, checked):
-    doubted = worse(found, warnings=(ROUGH,)).verdict(checked)
-    assert (doubted.level, doubted.remedy) == ("with care", "intervals='profile' finds them")
-    assert doubted.reason.startswith("some intervals are rough: the cost is no parabola along a0")
+def test_rough_intervals_are_a_fact(found, checked):
+    doubted = worse(found, findings=(ROUGH,))
+    assert doubted.verdict(checked).trusted
+    assert doubted.warnings == (
+        "the cost is no parabola along a0, and its profile there would take long: these intervals are rough; "
+        "intervals='profile' finds them",
+    )
 
 
-#: Warnings as fits give them: of weight, and of numbers that are vague and not very.
-ROUGH = (
-    "the cost is no parabola along a0, and its profile there would take long: these intervals are rough; "
-    "intervals='profile' finds them"
-)
-TIED = "a0 and b0 cannot be told apart in these runs (correlation 0.9960)"
+#: Findings as fits give them: facts, one of weight.
+ROUGH = finding("intervals_rough", parameter="a0")
+TIED = finding("numbers_correlated", parameter="a0 and b0", why="correlation 0.9960")
+BOUND = finding("on_bound", parameter="alpha", what="order alpha", value="2")
 
 
 @pytest.mark.parametrize("words", ["D y = 2 u", "D^2 y = 2 u", "D^2 y = -0.3 D y + u", "D^1.5 y = -D^0.5 y + u"])
@@ -262,12 +264,12 @@ def test_a_swing_that_nothing_damps_is_with_care(found, checked):
         assert told or "may never die away (damping 0.27 ± " in judged.reason
 
 
-#: Faults by name: words of the plant, of the structure, what else identify is given, what it warns of.
+#: Faults by name: words of the plant, of the structure, what else identify is given, what it finds.
 FAULTS = {
     "none": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, []),
     "not very vague": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, [TIED]),
     "rough": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, [ROUGH]),
-    "on a bound": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, ["order alpha = 2 is on its bound; widen it"]),
+    "on a bound": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, [BOUND]),
     "a missing mode": ("D^3 y = -6 D^2 y - 14 D y - 36 y + 24 u", "D^2 y = a1 D y + a0 y + b0 u", {}, []),
     "no errors": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {"method": "multi-innovation"}, []),
     "errors of instruments": (
@@ -284,9 +286,9 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_saved_model_is_judged_as_its_result_was(fault, tmp_path, monkeypatch):
-    plant, words, given, warnings = FAULTS[fault]
-    real = estimating.identifiability_warnings
-    monkeypatch.setattr(estimating, "identifiability_warnings", lambda *args: [*real(*args), *warnings])
+    plant, words, given, doubts = FAULTS[fault]
+    real = estimating.identifiability_findings
+    monkeypatch.setattr(estimating, "identifiability_findings", lambda *args: [*real(*args), *doubts])
     found = ftlm.identify(record(SQUARE, plant), ftlm.equation(words), **given)
     other = record(CHIRP, plant, seed=2, name="chirp")
     saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
@@ -297,22 +299,38 @@ def test_a_saved_model_is_judged_as_its_result_was(fault, tmp_path, monkeypatch)
         assert live.trusted == (bool(runs) and fault in TRUSTED)
 
 
-TRUSTED = ("none", "not very vague", "errors of instruments", "integrates")
+TRUSTED = ("none", "not very vague", "rough", "errors of instruments", "integrates")
 
 
-def test_what_spoke_against_a_model_is_kept_in_words_alone(found, tmp_path):
-    document = json.loads(found.model.save(tmp_path / "m.json").read_text("utf-8"))
+def test_a_saved_model_keeps_the_records(found, tmp_path):
+    path = tmp_path / "m.json"
+    document = json.loads(found.model.save(path).read_text("utf-8"))
     assert "against" not in document["estimate"]
-    for bad in ([{"level": "trust", "reason": "x"}], [{"level": "with care", "reason": ""}], ["x"], {}):
+    for bad in ([{"level": "trust", "reason": "x"}], [{"numbers": {}}], ["x"], {}, [{"code": 3}]):
         document["estimate"]["against"] = bad
-        (tmp_path / "m.json").write_text(json.dumps(document), encoding="utf-8")
+        path.write_text(json.dumps(document), encoding="utf-8")
         with pytest.raises(ftlm.DataError, match="is no ftlm model"):
-            ftlm.load_model(tmp_path / "m.json")
-    document["estimate"]["against"] = [{"level": "do not use", "reason": "<script>x</script>"}]
-    (tmp_path / "m.json").write_text(json.dumps(document | {"schema": 8}), encoding="utf-8")
-    model = ftlm.load_model(tmp_path / "m.json")
-    assert saved_verdict(model, []).level == "do not use"
-    assert "<script>x" not in model_page(model, tmp_path / "m.html").read_text("utf-8")
+            ftlm.load_model(path)
+    # A code of a later version is shown as its text, and one that lacks its numbers by the text of its file.
+    for code, level, reason in (("later", "with care", "<script>x</script>"), ("poor_fit", "do not use", "poor_fit")):
+        document["estimate"]["against"] = [
+            {"code": code, "written": "<script>x</script>" if level == "with care" else ""}
+        ]
+        document["estimate"]["findings"] = document["estimate"]["against"]
+        path.write_text(json.dumps(document | {"schema": 9}), encoding="utf-8")
+        model = ftlm.load_model(path)
+        judged = saved_verdict(model, [])
+        assert (judged.level, judged.reason) == (level, reason)
+        assert "<script>x" not in model_page(model, tmp_path / "m.html", force=True).read_text("utf-8")
+
+
+def test_findings_survive_a_file(found, tmp_path):
+    infinite = finding("explains_little", output="y", nr=math.inf)
+    kept = replace_estimate(found.model, findings=(infinite.to_file(), BOUND.to_file()))
+    read = ftlm.load_model(kept.save(tmp_path / "m.json")).estimate.findings
+    assert [f.text for f in read] == [infinite.text, BOUND.text]
+    assert read[0].text == "y: the free run explains little of the output (NR inf)"
+    assert read[0].to_dict()["level"] == "do not use"
 
 
 def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checked):
@@ -368,53 +386,111 @@ def test_what_is_no_validation_is_refused(found, bad):
 # Warnings in groups
 
 
-def test_every_mark_stands_in_a_sentence_of_the_program():
-    strings = ""
-    for path in sorted(SOURCE.rglob("*.py")):
-        if path.name == "concerns.py":
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.JoinedStr):
-                strings += "".join(p.value if isinstance(p, ast.Constant) else "{}" for p in node.values) + "\n"
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                strings += node.value + "\n"
-    assert [mark for kind in WARNING_KINDS for mark in kind.marks if mark not in strings] == []
-
-
-def test_warnings_are_grouped_the_most_serious_first():
-    said = [
-        "theta11: residuals are not white (Ljung-Box 3): the model leaves something out",
-        "order alpha = 1.6 is on the edge of its interval; widen it",
-        "theta11: residuals still follow I1 (correlation 0.3)",
-        "the model is not stable: 1 pole: its free run grows without bound, however well it fits",
-        "time read in ms, as the header 'time [ms]' says",
+def test_nothing_reads_a_sentence():
+    """Severity is in codes: no module searches the words of findings, warnings, reasons or remedies."""
+    words = r"(?:warning|finding|concern|reason|remedy|sentence|\.text)s?(?:\[\d+\])?"
+    methods = "startswith|endswith|removeprefix|partition|split|find"
+    searches = re.compile(
+        rf"""["'] (?:not )?in (?:\w+\.)?{words}\b|\b{words}\.(?:{methods})\("""
+        rf"""|re\.\w+\([^)]*\b{words}\)|\bin w\b.* for w in .*warnings"""
+    )
+    found = [
+        (path.relative_to(SOURCE).as_posix(), line.strip())
+        for path in sorted(SOURCE.rglob("*.py"))
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if searches.search(line)
     ]
-    found = group_warnings([*said, said[0]])
-    assert [c.kind.name for c in found] == ["unstable", "residuals", "edge", "other"]
-    assert found[1].warnings == (said[0], said[2])
+    assert found == []
+    assert searches.search('own = [w for w in fit.warnings if "are not white" in w or "x" in warnings]')
+    assert searches.search("name = warning.partition(';')")
+
+
+def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_path):
+    poor = replace(found, findings=(BOUND, TIED, finding("offset_missing", output="y", share=30.0, test="x")))
+    model = replace_estimate(found.model, findings=(BOUND.to_file(),), against=(BOUND.to_file(),))
+    before = poor.verdict(checked), saved_verdict(model, [])
+    for code, kind in FINDING_CATALOGUE.items():
+        reason = f"{code} a closed loop" if kind.reason else ""
+        monkeypatch.setitem(
+            FINDING_CATALOGUE, code, replace(kind, template="grows without bound| is quantised", reason=reason)
+        )
+    after = poor.verdict(checked), saved_verdict(model, [])
+    assert [v.level for v in after] == [v.level for v in before]
+    assert [len(v.reasons) for v in after] == [len(v.reasons) for v in before]
+    assert poor.warnings == ("grows without bound is quantised",) * 3
+    again = replace(found.model, estimate=model.estimate).save(tmp_path / "m.json")
+    assert saved_verdict(ftlm.load_model(again), []).level == before[1].level
+
+
+@pytest.mark.parametrize(
+    "name", ["before the rig stopped", "psf, a channel that was off; a closed loop", "{code} | %s"]
+)
+def test_the_name_of_a_run_is_no_reason(found, checked, name):
+    noted = finding("data_note", run=name, text=f"resampled as {name}")
+    judged = replace(found, findings=(noted,)).verdict(checked)
+    assert judged.trusted
+    assert noted.text == f"run {name}: resampled as {name}"
+    fallen = finding("fit_falls", run=name, output=name, before=99.0, after=50.0, where="")
+    assert fallen.text.startswith(f"{name}: the fit of {name} falls from 99 % on")
+
+
+def test_every_entry_of_the_catalogue_renders():
+    fields = {"run": "r", "output": "y", "input": "u", "parameter": "a", "method": "least-squares"}
+    for code, kind in FINDING_CATALOGUE.items():
+        assert kind.topic in FINDING_TOPICS
+        topic = FINDING_TOPICS[kind.topic]
+        templates = "".join((kind.template, kind.reason, kind.remedy, kind.prefix, topic.remedy, topic.alternative))
+        names = {n.partition("[")[0] for _, n, _, _ in string.Formatter().parse(templates) if n}
+        numbers = dict.fromkeys(names - {*fields, "ask", "choose", "remedy", "written", "signal"}, 1)
+        item = Finding(code, **fields, numbers=numbers)
+        for said in (item.text, item.reason, item.remedy):
+            assert said != code
+            assert not set("{}|") & set(said), (code, said)
+        assert item.text
+
+
+def test_remedies_know_the_method():
+    for method, remedy in (
+        ("least-squares", "add what drives it, a delay or a term; or use method='output-error'"),
+        ("output-error", "add what drives it, a delay or a term"),
+    ):
+        assert Finding("explains_little", method=method).remedy == remedy
+
+
+def test_findings_are_grouped_the_most_serious_first():
+    said = [
+        finding("output_not_white", output="theta11", statistic=3.0, lags=25, limit=2.0),
+        finding("on_edge", parameter="alpha", value=1.6),
+        finding("residuals_follow_input", output="theta11", input="I1", value=0.3, lag=1, limit=0.1),
+        finding("free_run_grows", stability="not stable: 1 pole", poles="1 pole"),
+        finding("data_note", run="r", text="time read in ms, as the header 'time [ms]' says"),
+    ]
+    found = group_findings([*said, said[0]])
+    assert [g.first.kind.topic for g in found] == ["unstable", "residuals", "edge", "other"]
+    assert found[1].findings == (said[0], said[2])
     assert found[1].count == " (and 1 more alike)"
-    assert warning_kind("anything") is OTHER_KIND
-    assert sum(len(c.warnings) for c in found) == len(said)
-    assert group_warnings([]) == ()
-    # What is of no kind stands alone.
-    assert [c.warnings for c in group_warnings(["this", "that"])] == [("this",), ("that",)]
+    assert sum(len(g.findings) for g in found) == len(said)
+    assert group_findings([]) == ()
+    # What is of no topic stands alone.
+    notes = [finding("data_note", text=text) for text in ("this", "that")]
+    assert [g.findings for g in group_findings(notes)] == [(notes[0],), (notes[1],)]
 
 
 def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
     many = (
-        *(f"the prior (K0 = {k}) pulls" for k in range(3)),
-        "order x = 1 is on its bound; widen it",
-        "coefficient law: a",
-        "y is quantised in steps",
-        "y: a closed loop",
+        *(finding("prior_pulls", output="y", prior=k, share=3.0, length=7) for k in range(3)),
+        BOUND,
+        finding("coefficient_law_broken", parameter="a", value=1.0, wanted=2.0),
+        finding("quantised", run="r", output="y", step=1.0, noise=0.1),
+        finding("loop_found", output="y", input="u", how="u answers y", statistic=9.0, limit=1.0, or_else=""),
     )
-    poor = worse(found, warnings=many)
+    poor = worse(found, findings=many)
     text = str(poor)
-    assert sum(line.startswith("! ") for line in text.splitlines()) == MAX_SUMMARY_WARNINGS == 3
-    assert "! y: a closed loop" in text
+    assert sum(line.startswith("! ") for line in text.splitlines()) == MAX_SUMMARY_FINDINGS == 3
+    assert "! y: u answers y" in text
     assert "(4 more warnings: print(result.details()))" in text
-    assert all(f"warning: {w}" in poor.details() for w in many)
-    assert poor.warnings == many
+    assert all(f"warning: {w}" in poor.details() for w in poor.warnings)
+    assert poor.findings == many
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -486,20 +562,14 @@ def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_p
     estimate = replace_estimate(saved, standard_errors={**saved.estimate.standard_errors, "b0": None})
     judged = saved_verdict(estimate, [])
     assert (judged.level, judged.reason) == ("do not use", "the runs do not tell b0 apart")
-    warned = replace_estimate(saved, warnings=("order alpha = 2 is on its bound; widen it",))
+    warned = replace_estimate(saved, against=(BOUND,))
     assert saved_verdict(warned, [saved.compare(other)]).reason == (
         "an order or a number is on its bound: order alpha = 2 is on its bound"
     )
-    # Residuals next to nothing decide as little as they do in a result.
-    for word in (
-        "y: residuals are not white (Ljung-Box 60, 99 % limit 40)",
-        "u answers what y did a closed loop",
-    ):
-        for fit, level in ((99.95, "trust"), (99.0, "with care")):
-            red = replace_estimate(saved, fit={"y": fit}, warnings=(word,))
-            checked = saved.compare(other)
-            exact = replace(checked, output_error={"y": replace(checked.output_error["y"], fit=99.9, nr=0.001)})
-            assert saved_verdict(red, [exact]).level == level, (word, fit)
+    # Sentences of earlier versions are shown and not judged.
+    old = replace_estimate(saved, warnings=("order alpha = 2 is on its bound; widen it",))
+    assert saved_verdict(old, [saved.compare(other)]).remedy == "identify it again"
+    assert "order alpha = 2 is on its bound; widen it" in model_page(old, tmp_path / "o.html").read_text("utf-8")
     better = replace_estimate(saved, fit={"y": 130.0})
     assert "falls from 130 to" in saved_verdict(better, [saved.compare(other)]).reason
     grown = ftlm.Model(ftlm.equation("D y = 0.3 y + u"))

@@ -18,7 +18,7 @@ from ftlm.data.run import Run
 from ftlm.data.units import SIGNAL_UNITS, TIME_UNITS
 from ftlm.io.dialect import DATE_ORDERS, DECIMAL_CHARACTERS, SEPARATOR_CHARACTERS, THOUSANDS_CHARACTERS
 from ftlm.plot.comparison_charts import comparison_charts
-from ftlm.report.html_report import behavior_tables, first_warnings, title_of, verdict_box
+from ftlm.report.html_report import behavior_tables, first_findings, title_of, verdict_box
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import chart_script, style_sheet
@@ -187,7 +187,7 @@ def model_summary(made: FittedModel) -> dict[str, Any]:
     """Return the page content of a model; markup consists of escaped parts."""
     result, checked = made.result, made.validation
     judged = result.verdict(checked)
-    warnings, left = first_warnings(list(dict.fromkeys([*result.warnings, *(checked.warnings if checked else ())])))
+    warnings, left = first_findings([*result.findings, *(checked.findings if checked else ())])
     figures = []
     if checked is not None:
         figures += comparison_charts(checked, units=result.model.units, label="validation", points=MAX_CHART_POINTS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +11,17 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.fit import Fit
+from ftlm.findings import Finding, finding
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import minimum_norm_solution
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import autoregression, is_constant
 from ftlm.utils.validation import Floats, nearest
-from ftlm.validation.residual_tests import DEFAULT_LAGS, past_regressors
+from ftlm.validation.residual_tests import DEFAULT_LAGS
 
+#: Number of single past samples among the regressors. Older samples are averaged over blocks that grow by this factor.
+DENSE_PAST_SAMPLES = 25
+BLOCK_GROWTH_FACTOR = 1.5
 #: Numbers of reference lags with a coefficient of their own, and fewest samples of the shortest run for each. Earlier
 #: samples are averaged over blocks of growing width.
 DENSE_LAG_COUNTS = (3, 6, 12, 25, 50, 100)
@@ -26,8 +30,8 @@ MIN_ROWS_PER_LAG = 15
 MIN_FIRST_STAGE_F = 10.0
 
 
-def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[str]]:
-    """Return runs whose inputs are replaced by their part explained by a reference, and warnings.
+def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[Finding]]:
+    """Return runs whose inputs are replaced by their part explained by a reference, and findings.
 
     Controller and loop form one linear filter from reference to input. Least squares over all runs fits it, as in the
     first step of the two-stage method (Van den Hof and Schrama, An indirect method for transfer function estimation
@@ -74,7 +78,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
         if dense == DENSE_LAG_COUNTS[0] or dense * MIN_ROWS_PER_LAG < shortest
     ]
     answers: dict[str, list[Floats]] = {}
-    warnings = []
+    findings = []
     for name in inputs:
         measured = np.concatenate([run[name] for run in runs])
         # Every coefficient too many takes a share of the noise with it: the least Bayesian criterion.
@@ -84,13 +88,29 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
         answers[name] = np.split(fits[best], ends)
         found = first_stage_f(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
         if found < MIN_FIRST_STAGE_F:
-            warnings.append(
-                f"{reference} says little of {name} beside the noise in it (F = {found:.2g}, {MIN_FIRST_STAGE_F:g} "
-                "are needed): a "
-                "weak instrument, with which estimates are biased and their intervals too narrow; move the reference "
-                "more, or longer"
-            )
-    return [_run_with_inputs(run, k, answers) for k, run in enumerate(runs)], warnings
+            numbers = {"f": found, "needed": MIN_FIRST_STAGE_F}
+            findings.append(finding("reference_weak", input=name, reference=reference, **numbers))
+    return [run_with_inputs(run, {n: a[k] for n, a in answers.items()}) for k, run in enumerate(runs)], findings
+
+
+def past_regressors(
+    signal: Floats, first: int, reach: int, *, dense: int = DENSE_PAST_SAMPLES, wider: float = BLOCK_GROWTH_FACTOR
+) -> list[Floats]:
+    """Return samples of a signal ``first`` to ``dense`` samples back, then means of growing blocks up to ``reach``.
+
+    Samples before the first one are taken as equal to it, so ``reach`` may be at most the length of the signal.
+    """
+    count = signal.size
+    padded = np.concatenate([np.full(count, signal[0]), signal])
+    moved = padded - signal[0]
+    sums = np.concatenate([[0.0], np.cumsum(moved)])
+    columns = [moved[count - lag : 2 * count - lag] for lag in range(first, min(dense, reach) + 1)]
+    start, width = dense + 1, max(2, dense // 4)
+    while start + width <= reach:
+        end = count - start + 1
+        columns.append((sums[end : end + count] - sums[end - width : end - width + count]) / width)
+        start, width = start + width, int(width * wider) + 1
+    return columns
 
 
 def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
@@ -114,10 +134,11 @@ def _criterion(missed: Floats, coefficients: int) -> float:
     return missed.size * math.log(max(power, 1e-300)) + coefficients * math.log(missed.size)
 
 
-def _run_with_inputs(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
+def run_with_inputs(run: Run, answers: Mapping[str, Floats]) -> Run:
+    """Return a run with other values of some inputs."""
     return Run.from_arrays(
         step=run.step,
-        inputs={n: answers[n][number] if n in answers else run[n] for n in run.inputs},
+        inputs={n: answers[n] if n in answers else run[n] for n in run.inputs},
         outputs={n: run[n] for n in run.outputs},
         units={n: u for n, u in run.units.items() if u},
         intersample=run.intersample,
@@ -126,8 +147,8 @@ def _run_with_inputs(run: Run, number: int, answers: dict[str, list[Floats]]) ->
     )
 
 
-def mark_reference_fit(fit: Fit, reference: str, warnings: Sequence[str]) -> Fit:
-    """Return a fit with the reference recorded in its settings and warnings."""
+def mark_reference_fit(fit: Fit, reference: str, findings: Sequence[Finding]) -> Fit:
+    """Return a fit with the reference recorded in its settings and findings."""
     # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
-    own = [w for w in fit.warnings if "are not white" not in w]
-    return replace(fit, warnings=[*own, *warnings], settings={**fit.settings, "reference": reference})
+    own = [f for f in fit.findings if f.code != "residuals_not_white"]
+    return replace(fit, findings=[*own, *findings], settings={**fit.settings, "reference": reference})

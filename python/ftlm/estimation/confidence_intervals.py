@@ -22,6 +22,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance, covariance_of
 from ftlm.estimation.output_error import JointFit, Loss, ProfileInterval, fit_output_error
 from ftlm.estimation.result import Identification
+from ftlm.findings import Finding, finding
 from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import interruptible_pool
@@ -564,8 +565,8 @@ def with_intervals(
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
     loss: Loss = "squares",
-) -> tuple[JointFit, list[str]]:
-    """Return a joint fit with the requested intervals, and warnings about them.
+) -> tuple[JointFit, list[Finding]]:
+    """Return a joint fit with the requested intervals, and findings about them.
 
     ``"auto"`` profiles the parameters whose Wald interval is inaccurate, ``"profile"`` all. If a profile leads to a
     lower optimum, the fit is repeated from there.
@@ -574,14 +575,14 @@ def with_intervals(
     # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
     if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * fitted):
         return joint, []
-    warnings: list[str] = []
+    findings: list[Finding] = []
     spent = 0
     for turn in range(MAX_RESTARTS + 1):
         try:
             valley = ProfileLikelihood.of(joint, problem, runs)
         except FtlmError:
             # No finite free run where the weights of the last descent are taken anew: what is known stays.
-            return joint, warnings
+            return joint, findings
         names = valley.names if intervals == "profile" else nonlinear_parameters(valley, DEFAULT_INTERVAL_LEVEL)
         pulses, least = joint.samples * joint.refinement, MIN_INITIAL_BUDGET_PER_BOUND * 2 * len(names)
         pulses *= FREE_ORDER_COST_FACTOR if joint.orders else 1
@@ -596,7 +597,7 @@ def with_intervals(
             break
         if not is_lower_on_finer_grid(valley.grid, joint.finest_grid_values, found.lower_optimum):
             # What only this grid carries is a mode of the scheme; along it the cost tells nothing of the numbers.
-            return joint, warnings
+            return joint, findings
         start = dict(zip(problem.names, found.lower_optimum.tolist(), strict=True))
         tried, level = len(joint.starts), joint.noise
         try:
@@ -608,16 +609,10 @@ def with_intervals(
             continue
         joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
         before, after = (", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise))
-        warnings = [
-            f"none of {tried} starts led to this optimum, but the search for intervals did (residuals {before} before, "
-            f"{after} now): there may be others"
-        ]
+        findings = [finding("lower_optimum_found", starts=tried, before=before, after=after)]
     if found.incomplete_names:
-        warnings.append(
-            f"the cost is no parabola along {', '.join(found.incomplete_names)}, and its profile there would take "
-            f"long: these intervals are rough; {parameter('intervals', 'profile')} finds them"
-        )
-    return replace(joint, profiles=found.intervals), warnings
+        findings.append(finding("intervals_rough", parameter=", ".join(found.incomplete_names)))
+    return replace(joint, profiles=found.intervals), findings
 
 
 def is_lower_on_finer_grid(grid: Objective, before: Floats, after: Floats) -> bool:

@@ -16,6 +16,7 @@ from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.result import Identification
+from ftlm.findings import Finding, finding, texts
 from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.arguments import check_arguments
@@ -144,20 +145,22 @@ class Consistency(ReportMixin):
         )
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """Limitations of the comparison: parameters that are not identifiable, and warnings of each segment."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Limitations of the comparison: parameters that are not identifiable, and findings on each segment."""
         out = []
         if self.not_identifiable and self.consistent is not None:
-            out.append(f"{', '.join(self.not_identifiable)}: not told by some part, so any other agrees with it")
+            out.append(finding("not_told_by_part", parameter=", ".join(self.not_identifiable)))
         for name, result in zip(self.names, self.results, strict=True):
             if result.fit is not None and not result.fit.converged:
-                out.append(f"{name}: the fit ended before it stood still")
-        if any(w.startswith("residuals of ") and "white" in w for r in self.results for w in r.warnings):
-            out.append(
-                "residuals are not white: the structure leaves something out, which parts that are excited in other "
-                "ways may answer with other numbers; then it is the structure and not the machine that changes"
-            )
+                out.append(finding("part_not_converged", run=name))
+        if any(f.code == "residuals_not_white" for r in self.results for f in r.findings):
+            out.append(finding("parts_not_white"))
         return tuple(out)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return texts(self.findings)
 
     def numbers_table(self) -> Table:
         """Return a table of the parameters of each segment, with intervals and differences."""
@@ -244,6 +247,7 @@ class Consistency(ReportMixin):
                 name: dict(zip(self.names, row, strict=True))
                 for name, row in zip(self.names, self.cross_validation, strict=True)
             },
+            "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
             "identifications": [r.to_dict() for r in self.results],
         }

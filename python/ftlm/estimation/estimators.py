@@ -18,12 +18,13 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.confidence_intervals import Intervals, with_intervals
 from ftlm.estimation.fit import Fit, ProgressCallback, initial_terms_text, make_model, offset_setting
 from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_starts
-from ftlm.estimation.linear import estimate_coefficients, step_bias_warnings
-from ftlm.estimation.model_checks import coefficient_law_warnings, identifiability_warnings, sample_warnings
+from ftlm.estimation.linear import estimate_coefficients, step_bias_findings
+from ftlm.estimation.model_checks import coefficient_law_findings, identifiability_findings, sample_findings
 from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_initial_conditions
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, Loss
 from ftlm.estimation.result import Task
+from ftlm.findings import Finding, finding
 from ftlm.model.model import Model
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import SearchSettings
@@ -33,7 +34,6 @@ from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.linalg import orthonormal, projections, vector_norm
-from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
 
@@ -101,6 +101,25 @@ def fit_with_instruments(
         refinement=every,
         converged=converged,
     )
+
+
+def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> float:
+    """Return the largest bias of a parameter by feedback, in its standard errors.
+
+    It is the first Gauss-Newton step of a fit with instruments (see :func:`fit_with_instruments`), where `answers` are
+    the inputs without the part that answers the residuals. Infinite if there is no such step.
+    """
+    weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
+    every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
+    try:
+        measured, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
+        attempt, slopes, instruments = _evaluate_moments(measured, clean, joint.values)
+    except FtlmError:
+        return math.inf
+    step = np.linalg.pinv(instruments @ slopes.T) @ (instruments @ np.asarray(attempt.outcome["residuals"]))
+    errors = np.array([joint.standard_errors[n] for n in joint.names])
+    known = np.isfinite(errors) & (errors > 0)
+    return float(np.max(np.abs(step[known]) / errors[known], initial=0.0))
 
 
 def _evaluate_moments(measured: Objective, clean: Objective, values: Floats) -> tuple[Iterate, Floats, Floats]:
@@ -178,7 +197,7 @@ def estimate_output_error(
     )
     course.advance_to(0.7)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
-    lower: list[str] = []
+    lower: list[Finding] = []
     if answers is not None:
         joint = fit_with_instruments(joint, problem, task.runs, answers)
     else:
@@ -186,14 +205,11 @@ def estimate_output_error(
             joint, problem, task.runs, intervals, threads=threads, progress=course.subtask(1.0, 0.9), loss=loss
         )
     course.advance_to(1.0)
-    warnings = [*lower, *identifiability_warnings(joint, problem), *sample_warnings(task.runs, joint, problem)]
+    findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = replace(structure, initial="history")
-        warnings.append(
-            f"{', '.join(r.name for r in task.runs)}: the first values look like rest, but the residuals of a fit from "
-            f"rest ask for what was before; {parameter('initial', 'history')} was used"
-        )
+        findings.append(finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
@@ -216,7 +232,7 @@ def estimate_output_error(
             **offset_setting(structure),
             **loss_setting(joint),
         },
-        warnings,
+        findings,
         joint=joint,
         covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
     )
@@ -266,10 +282,10 @@ def estimate_order_search(
             **offset_setting(structure),
         },
         [
-            *fit.warnings,
-            *step_bias_warnings(task.runs, at_orders, settings, fit),
-            *coefficient_law_warnings(model),
-            *(f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in edges),
+            *fit.findings,
+            *step_bias_findings(task.runs, at_orders, settings, fit),
+            *coefficient_law_findings(model),
+            *(finding("on_edge", parameter=n, value=v) for n, v in edges),
         ],
         searches,
         errors,

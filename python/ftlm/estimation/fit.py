@@ -9,6 +9,7 @@ from typing import Any
 from ftlm.errors import ModelError
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Task
+from ftlm.findings import Finding
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
 from ftlm.structure.structure import History, Initial, Structure
@@ -33,8 +34,8 @@ class Fit:
         Number of free parameters.
     settings
         Settings that the result depends on, besides the task.
-    warnings
-        Warnings of the estimator itself.
+    findings
+        Findings of the estimator itself.
     searches, errors, joint, covariance
         Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
         model parameters, if the estimator gives them.
@@ -47,7 +48,7 @@ class Fit:
     model: Model
     parameters: int
     settings: dict[str, Any]
-    warnings: list[str]
+    findings: list[Finding]
     searches: dict[str, SearchResult] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     joint: JointFit | None = None

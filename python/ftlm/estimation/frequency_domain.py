@@ -10,6 +10,7 @@ from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
@@ -17,6 +18,7 @@ from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.frequency_result import FrequencyIdentification
 from ftlm.estimation.levenberg_marquardt import LeastSquaresResult, constrained_least_squares
 from ftlm.estimation.objective import covariance_of
+from ftlm.findings import Finding, finding
 from ftlm.model.model import Estimate, Model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.structure.equation import Equation, Term
@@ -620,8 +622,8 @@ def identify_frequency(
         exact=best.cost <= NEGLIGIBLE_RESIDUAL_SHARE**2 * total,
     )
     PACKAGE_LOGGER.info("identified: %s", result.verdict())
-    for warning in result.warnings:
-        PACKAGE_LOGGER.warning("%s", warning)
+    for item in result.findings:
+        PACKAGE_LOGGER.warning("%s", item)
     return result
 
 
@@ -792,7 +794,7 @@ def _result(
     free = left.size - values.size
     chi = best.cost / free
     too_large = kind == "deviation" and best.cost > chi_squared_99(free)
-    warnings: list[str] = []
+    findings: list[Finding] = []
     if kind == "deviation" and not too_large:
         covariance = covariance_of(steep.T, [np.zeros(e.size) for e in series], float(free))
     else:
@@ -803,21 +805,15 @@ def _result(
     names = problem.names
     standard = dict(zip(names, errors.tolist(), strict=True))
     if too_large:
-        warnings.append(
-            f"residuals are {math.sqrt(chi):.3g} times the standard deviations that the data state (99 %): the model "
-            "leaves something out, or they are too small; intervals are widened to what is left over"
-        )
+        findings.append(finding("deviations_exceeded", ratio=math.sqrt(chi)))
     if not white:
-        warnings.append(
-            "residuals are not white: from one frequency to the next they follow each other, so the model leaves "
-            "something out"
-        )
+        findings.append(finding("response_not_white"))
     if not best.converged:
-        warnings.append("the fit ended before it stood still")
-    warnings += [f"an order or a delay is on its bound: {w}" for w in held]
-    warnings += _identifiability_warnings(problem, values, standard)
+        findings.append(finding("response_not_converged"))
+    findings += [finding("response_on_bound", bound=bound) for bound in held]
+    findings += _identifiability_findings(problem, values, standard)
     named = dict(zip(names, values.tolist(), strict=True))
-    model = _model(problem, records, named, values, covariance, standard, warnings)
+    model = _model(problem, records, named, values, covariance, standard, findings)
     intervals = {n: (named[n] - factor * e, named[n] + factor * e) for n, e in standard.items()}
     return FrequencyIdentification(
         model,
@@ -832,7 +828,7 @@ def _result(
         best.converged,
         reached,
         white,
-        tuple(warnings),
+        tuple(findings),
     )
 
 
@@ -853,17 +849,17 @@ def _series(records: Sequence[FrequencyData], left: Floats) -> list[Floats]:
     return [*np.split(left[:half], ends[:-1]), *np.split(left[half:], ends[:-1])]
 
 
-def _identifiability_warnings(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[str]:
-    """Return warnings about parameters that the data determine poorly or not at all."""
+def _identifiability_findings(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[Finding]:
+    """Return findings on parameters that the data determine poorly or not at all."""
     unseen = [n for n, e in standard.items() if not math.isfinite(e)]
     out = []
     if unseen:
-        out.append(f"moved together they change nothing: {', '.join(unseen)}; leave a term out, or fix one of them")
+        out.append(finding("response_not_told_apart", parameter=", ".join(unseen)))
     for name, value in zip(problem.names, values.tolist(), strict=True):
         error = standard[name]
         vague = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)
         if math.isfinite(error) and vague:
-            out.append(f"{name} = {value:.4g} ± {error:.2g} cannot be told from other values; fix it, or leave it out")
+            out.append(finding("response_number_vague", parameter=name, value=value, error=error))
     return out
 
 
@@ -874,7 +870,7 @@ def _model(
     values: Floats,
     covariance: Floats,
     standard: Mapping[str, float],
-    warnings: Sequence[str],
+    findings: Sequence[Finding],
 ) -> Model:
     """Return the model with its estimate, as stored in its file."""
     orders = {n: round(named[n], 9) for n in problem.orders}
@@ -906,7 +902,7 @@ def _model(
         values=dict(named),
         standard_errors={n: e if math.isfinite(e) else None for n, e in standard.items()},
         covariance=spread,
-        warnings=tuple(warnings),
+        findings=tuple(f.to_file() for f in findings) or UNSET,
     )
     return Model(found, orders, units, None, {"identified from": "frequency response"}, estimate)
 

@@ -16,7 +16,9 @@ from markupsafe import Markup
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError
-from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_html
+from ftlm.estimation.model_checks import unstable_poles_text
+from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_from, verdict_html
+from ftlm.findings import Finding, finding, group_findings, texts
 from ftlm.model.model import Model
 from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
@@ -27,7 +29,6 @@ from ftlm.utils.formatting import Cell, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
-from ftlm.validation.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, group_warnings
 
 if TYPE_CHECKING:
     pass
@@ -138,7 +139,6 @@ def relative_residual_figure(model: Model, record: FrequencyData) -> Figure:
 MAX_RELATIVE_ERROR = 0.5
 #: A validation is worse if its error exceeds this multiple of the estimation error and this relative error.
 VALIDATION_ERROR_RATIO, MIN_VALIDATION_ERROR = 3.0, 0.02
-NOT_TRIED = "no response that it was not fitted to has been tried"
 
 
 @dataclass(frozen=True)
@@ -215,8 +215,8 @@ class FrequencyIdentification:
         Number of initial guesses that reached this optimum, and total number.
     white
         Whether the residuals are white over frequency (99 %).
-    warnings
-        Warnings about the model.
+    findings
+        Findings about the model.
     """
 
     model: Model
@@ -231,7 +231,12 @@ class FrequencyIdentification:
     converged: bool
     start_counts: tuple[int, int]
     white: bool
-    warnings: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = field(default=())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return texts(self.findings)
 
     @property
     def orders(self) -> dict[str, float]:
@@ -278,52 +283,35 @@ class FrequencyIdentification:
         return self._assess(None) if validation is None else validation.verdict
 
     def _assess(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
-        found: list[tuple[str, str, str]] = []
+        found: list[Finding] = []
         own = self.errors
         for error in (*own, *(others or ())):
             if not error.rms <= 100 * MAX_RELATIVE_ERROR:
-                what = f"it misses {error.rms:.3g} % of {error.output} from {error.input} ({error.name})"
-                found.append((LEVEL_DO_NOT_USE, what, "add a term, a delay or a free order"))
-        grows = self._grows()
-        if grows:
-            found.append(
-                (
-                    LEVEL_DO_NOT_USE,
-                    grows,
-                    "measure a wider band, bound the coefficient that pushes, or take fewer terms",
-                )
-            )
-        for concern in group_warnings(self.warnings):
-            if concern.kind.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE):
-                found.append((concern.kind.level, concern.warnings[0].partition(";")[0], concern.kind.format_remedy()))
+                subject = {"run": error.name, "output": error.output, "input": error.input}
+                found.append(finding("response_missed", **subject, rms=error.rms))
+        found += self._unstable_poles()
+        found += [group.first for group in group_findings(self.findings)]
         if others is not None:
             most = max(e.rms for e in own)
             lost = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
             if lost:
-                words = f"it misses {most:.3g} % of its own data and {lost[0].rms:.3g} % of {lost[0].name}"
-                found.append((LEVEL_WITH_CARE, words, "fewer free numbers, or both records in one fit"))
+                found.append(finding("response_lost", run=lost[0].name, own=most, rms=lost[0].rms))
         same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
         if others is None or same:
-            found.append(
-                (LEVEL_WITH_CARE, NOT_TRIED, choose_text("validate(load_frequency(file))", "--validation FILE"))
-            )
-        found.sort(key=lambda item: item[0] != LEVEL_DO_NOT_USE)
-        if found:
-            level, reason, remedy = found[0]
-            return Verdict(level, reason, remedy, tuple(dict.fromkeys(r for _, r, _ in found)))
+            found.append(finding("response_not_validated"))
+        against = verdict_from(found)
+        if against is not None:
+            return against
         shown = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
         return Verdict(TRUST_LEVEL, f"it predicts what it was not fitted to (error {shown}), residuals are noise")
 
-    def _grows(self) -> str:
-        """Return a text about poles with a positive real part; empty if there are none."""
+    def _unstable_poles(self) -> list[Finding]:
+        """Return a finding on poles with a positive real part, if there are any."""
         with contextlib.suppress(FtlmError):
             stable = self.model.stability(coupling="simulated")
-            if math.isnan(stable.unstable_poles):
-                return ""
             if stable.unstable_poles > 0:
-                count = int(stable.unstable_poles)
-                return f"its free run grows without bound ({count} pole{'s' * (count > 1)} with a positive real part)"
-        return ""
+                return [finding("response_grows", poles=unstable_poles_text(stable.unstable_poles))]
+        return []
 
     @check_arguments
     def summary(self, validation: FrequencyValidation | None = None) -> str:
@@ -347,7 +335,7 @@ class FrequencyIdentification:
             [
                 *lines,
                 *(f"note: {w}" for r in self.data for w in r.warnings),
-                *finding_lines(self.warnings, choose_text("result.warnings", "--verbose shows all")),
+                *finding_lines(self.findings, choose_text("result.warnings", "--verbose shows all")),
             ]
         )
 
@@ -398,10 +386,10 @@ class FrequencyIdentification:
         DataError
             The file exists and ``force`` is not set, or cannot be written.
         """
-        from ftlm.report.html_report import behavior_figures, behavior_tables, first_warnings, title_of, verdict_box
+        from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
         from ftlm.report.typesetting import equation_html, parameter_table
 
-        shown, more = first_warnings(self.warnings)
+        shown, more = first_findings(self.findings)
         equations = [equation_html(e, self.model.structure.delay) for e in self.model.equations]
         first = Section(
             "Model",
@@ -451,6 +439,7 @@ class FrequencyIdentification:
             "converged": self.converged,
             "starts": list(self.start_counts),
             "white": self.white,
+            "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
 

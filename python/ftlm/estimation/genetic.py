@@ -16,8 +16,9 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction, make_model
-from ftlm.estimation.model_checks import coefficient_law_warnings
+from ftlm.estimation.model_checks import coefficient_law_findings
 from ftlm.estimation.result import Task
+from ftlm.findings import finding
 from ftlm.order_search.options import Norm
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import Record, order_grid_tuple, prepare
@@ -554,18 +555,15 @@ class GeneticAlgorithm:
         bounds = {n: b for end in ends.values() for n, b in end.bounds.items()}
         seeds, identified = list(self.seeds), structure.with_orders(orders).with_coefficients(coefficients)
         model = make_model(task, self.name, identified, orders, record.m, seeds=str(seeds))
-        warnings = coefficient_law_warnings(model)
+        findings = coefficient_law_findings(model)
         for name, (low, high) in bounds.items():
             value = {**orders, **coefficients}[name]
             if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
-                warnings.append(f"{name} = {value:.4g} is on its bound for the genetic algorithm; widen it")
+                findings.append(finding("genetic_on_bound", parameter=name, value=value))
         for name, end in ends.items():
             low, high = min(end.errors.values()), max(end.errors.values())
             if high > MAX_SEED_ERROR_RATIO * low:
-                warnings.append(
-                    f"{name}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}; "
-                    "it has not found the optimum of each"
-                )
+                findings.append(finding("seeds_disagree", output=name, low=low, high=high))
         used = {
             "method": self.name,
             "norm": self.norm,
@@ -577,4 +575,4 @@ class GeneticAlgorithm:
             "errors": {name: {str(seed): e for seed, e in end.errors.items()} for name, end in ends.items()},
             "evaluations": {name: sum(end.evaluations.values()) for name, end in ends.items()},
         }
-        return Fit(task, self.name, model, len(orders) + len(coefficients), used, warnings, at_optimum=False)
+        return Fit(task, self.name, model, len(orders) + len(coefficients), used, findings, at_optimum=False)

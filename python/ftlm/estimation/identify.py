@@ -1,4 +1,4 @@
-"""Decision about offsets of the equations: tested on request, otherwise reported by a warning."""
+"""Identification: fit with a decision about offsets, checks of the fit, many identifications."""
 
 from __future__ import annotations
 
@@ -13,26 +13,30 @@ from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
+from ftlm.estimation.closed_loop import run_with_inputs
+from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
+from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.model_checks import (
-    dead_channel_warnings,
-    discretization_warnings,
-    excitation_warnings,
-    friction_direction_warnings,
-    stability_warnings,
-    stribeck_warnings,
+    dead_channel_findings,
+    discretization_findings,
+    excitation_findings,
+    friction_direction_findings,
+    stability_findings,
+    stribeck_findings,
 )
 from ftlm.estimation.nuisance_parameters import (
     DEFAULT_PULSES_PER_SAMPLE,
     OffsetTest,
     fit_without_history,
     offset_test,
-    unrequested_offset_warnings,
+    unrequested_offset_findings,
 )
 from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification
-from ftlm.estimation.verdict import result_findings, saved_findings
+from ftlm.estimation.verdict import result_findings
+from ftlm.findings import Finding, finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
@@ -44,8 +48,9 @@ from ftlm.utils.resources import run_in_worker
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
+from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
-from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_warnings, run_residual_tests
+from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
 
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
@@ -62,8 +67,8 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
         if structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
             return fit
-        said = unrequested_offset_warnings(fit_offset_test(fit), fit.model.outputs) or _history_offset_warnings(fit)
-        return replace(fit, warnings=[*fit.warnings, *said])
+        said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
+        return replace(fit, findings=[*fit.findings, *said])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
@@ -81,8 +86,8 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
 
 
-def _history_offset_warnings(fit: Fit) -> list[str]:
-    """Return a warning if a constant explains the data as well as a history of initial terms.
+def _history_offset_findings(fit: Fit) -> list[Finding]:
+    """Return a finding if a constant explains the data as well as a history of initial terms.
 
     A constant is part of the model, whereas initial terms hold for one run only.
     """
@@ -93,11 +98,8 @@ def _history_offset_warnings(fit: Fit) -> list[str]:
     if few is None:
         return []
     less = joint.initial_terms - few.initial_terms
-    return [
-        f"what {', '.join(fit.model.outputs)} did before the runs is estimated with {joint.initial_terms} powers of "
-        f"time; an unknown constant in the equation explains as much with {less} numbers fewer: if a sensor's zero, a "
-        f"load or a mean may be there, {parameter('offset', 'auto')} estimates it"
-    ]
+    outputs = ", ".join(fit.model.outputs)
+    return [finding("constant_instead_of_past", output=outputs, terms=joint.initial_terms, fewer=less)]
 
 
 def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
@@ -209,8 +211,8 @@ def identify(
     PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
     result = assess_fit(fit_with_offset_decision(several, structure, estimate))
     PACKAGE_LOGGER.info("identified: %s", result.verdict())
-    for warning in result.warnings:
-        PACKAGE_LOGGER.warning("%s", warning)
+    for item in result.findings:
+        PACKAGE_LOGGER.warning("%s", item)
     return result
 
 
@@ -230,18 +232,18 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
 
 
 def assess_fit(fit: Fit) -> Identification:
-    """Validate a fit: both errors, residual tests, information criteria and warnings."""
+    """Validate a fit: both errors, residual tests, information criteria and findings."""
     runs, model = as_runs(fit.task.runs), fit.model
     free = simulate_runs(model, runs)
     comparison = compare_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
-    warnings = [*comparison.warnings, *fit.warnings]
-    warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings]
-    warnings += dead_channel_warnings(runs, fit.task.structure) + excitation_warnings(runs, fit.task.structure)
-    warnings += (
-        discretization_warnings(model, comparison)
-        + stability_warnings(model)
-        + friction_direction_warnings(model, free)
-        + stribeck_warnings(model, runs, free)
+    findings = [*comparison.findings, *fit.findings]
+    findings += [note for run in runs for note in data_notes(run)]
+    findings += dead_channel_findings(runs, fit.task.structure) + excitation_findings(runs, fit.task.structure)
+    findings += (
+        discretization_findings(model, comparison)
+        + stability_findings(model)
+        + friction_direction_findings(model, free)
+        + stribeck_findings(model, runs, free)
     )
     tests, criteria = None, None
     try:
@@ -250,43 +252,67 @@ def assess_fit(fit: Fit) -> Identification:
     except DataError:
         # A run that is too short for correlations; everything else can be told.
         pass
-    warnings += [] if tests is None else _residual_warnings(fit, tests)
-    unique = tuple(dict.fromkeys(warnings))
-    known = _estimate(fit, comparison, criteria, unique)
+    tests = None if tests is None else _with_feedback_bias(fit, tests)
+    findings += [] if tests is None else _residual_findings(fit, tests)
+    every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
+    known = _estimate(fit, comparison, criteria, every)
     result = Identification(
         replace(model, estimate=known),
         fit.method,
         comparison,
         fit.searches,
         fit.settings,
-        unique,
+        every,
         fit.joint,
         tests,
         criteria,
         fit.task,
         fit.errors,
     )
-    against = tuple(result_findings(result))
-    if not (against or saved_findings(known)):
+    against = tuple(f.to_file() for f in unique(result_findings(result)))
+    if not against:
         return result
-    # Warnings alone do not say what weighs, so the file does.
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
 
 
-def _residual_warnings(fit: Fit, tests: Residuals) -> list[str]:
-    """Return warnings of failed residual tests; a joint fit already reports colored residuals."""
+def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
+    """Return the tests with the bias that found feedback can make of a joint fit."""
+    fed = {
+        signal: test.response
+        for o in tests.outputs.values()
+        for signal, test in o.feedback_tests.items()
+        if test.response
+    }
+    runs = fit.task.runs
+    plain = not fit.task.structure.has_friction and all(run.sample_times is None for run in runs)
+    if fit.joint is None or not fed or "reference" in fit.settings or not plain:
+        return tests
+    answers = [
+        run_with_inputs(run, {n: run[n] - np.pad(v[k], 1) for n, v in fed.items()}) for k, run in enumerate(runs)
+    ]
+    problem = FreeProblem.of(replace(fit.task.structure, initial=fit.joint.initial))
+    bias = feedback_bias(fit.joint, problem, runs, answers)
+    outputs = {
+        name: replace(
+            o, feedback_tests={n: replace(t, bias=bias) if t.has_feedback else t for n, t in o.feedback_tests.items()}
+        )
+        for name, o in tests.outputs.items()
+    }
+    return replace(tests, outputs=outputs)
+
+
+def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
+    """Return findings of failed residual tests; a joint fit already reports colored residuals."""
     if "reference" in fit.settings:
         # The loop is known, and its noise is no part of what the model was estimated from.
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
-        return residual_warnings(tests)
-    return [
-        w for w in residual_warnings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if "residuals are not white (" not in w
-    ]
+        return residual_findings(tests)
+    return [f for f in residual_findings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if f.code != "output_not_white"]
 
 
 def _estimate(
-    fit: Fit, comparison: Comparison, criteria: InformationCriteria | None, warnings: tuple[str, ...]
+    fit: Fit, comparison: Comparison, criteria: InformationCriteria | None, findings: tuple[Finding, ...]
 ) -> Estimate:
     """Return the estimate that the model file stores."""
     joint, values, errors = fit.joint, dict(fit.model.orders), {}
@@ -302,7 +328,7 @@ def _estimate(
         covariance=fit.covariance,
         fit={n: finite(f) for n, f in comparison.fit_percent.items()},
         information={} if criteria is None else {n: finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
-        warnings=warnings,
+        findings=tuple(f.to_file() for f in findings) or UNSET,
         intervals=profiles or UNSET,
         free=UNSET if joint is None else parameter_set(joint, fit.task.structure),
     )

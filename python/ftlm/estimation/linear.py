@@ -13,6 +13,7 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import check_step
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError
+from ftlm.findings import Finding, finding
 from ftlm.order_search.options import RowBasis, SearchSettings
 from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
 from ftlm.structure.equation import Equation
@@ -37,13 +38,13 @@ MAX_STEP_BIAS_ERRORS = 0.5
 
 @dataclass(frozen=True)
 class CoefficientFit:
-    """Coefficients at given orders: values, standard errors if known, number of pulses and warnings."""
+    """Coefficients at given orders: values, standard errors if known, number of pulses and findings."""
 
     m: int
     initial: Initial
     values: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
 
 def estimate_coefficients(
@@ -62,7 +63,7 @@ def estimate_coefficients(
             raw = _multi_innovation(item, records, settings, settings.prior_covariance)
             # A prior so weak that the data alone decide.
             weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
-            fit.warnings.extend(_prior_warnings(item.output, raw, weak, settings))
+            fit.findings.extend(_prior_findings(item.output, raw, weak, settings))
         fit.values.update(named_coefficients(item, raw))
     return fit
 
@@ -84,7 +85,7 @@ def _multi_innovation(item: Equation, records: list[Record], settings: SearchSet
 
 
 def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Record]) -> None:
-    """Fill in coefficients, standard errors and warnings by refined instrumental variables.
+    """Fill in coefficients, standard errors and findings by refined instrumental variables.
 
     Coupled equations are simulated together, so every instrument depends on the inputs alone. The standard errors hold
     at the given orders.
@@ -103,13 +104,9 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             IV_RELATIVE_TOLERANCE,
         )
         if not found["converged"]:
-            fit.warnings.append(
-                f"{outputs}: instrumental variables did not stand still in {found['iterations']} steps; the "
-                "coefficients are those of the least output error met. Too much noise for these terms: use "
-                f"{parameter('method', 'output-error')}"
-            )
+            fit.findings.append(finding("instruments_not_converged", output=outputs, iterations=found["iterations"]))
         if found["damped"]:
-            fit.warnings.append(f"{outputs}: the free run of these coefficients is unstable; do not trust them")
+            fit.findings.append(finding("instruments_unstable", output=outputs))
         for item, (raw, _, _, _), covariance in zip(group, found["estimates"], found["covariances"], strict=True):
             fit.values.update(named_coefficients(item, raw))
             free = [t for t in item.terms if t.fixed is None]
@@ -118,10 +115,10 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             fit.errors.update({str(t.coefficient): s / abs(t.factor) for t, s in pairs})
 
 
-def step_bias_warnings(
+def step_bias_findings(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, fit: CoefficientFit
-) -> list[str]:
-    """Return a warning if the step changes a coefficient by more than its standard error allows.
+) -> list[Finding]:
+    """Return a finding if the step changes a coefficient by more than its standard error allows.
 
     The scheme has order 2. One third of the change from twice the step therefore remains (Richardson).
     """
@@ -140,23 +137,17 @@ def step_bias_warnings(
     finer = f"raise m, up to {carried}, or " if fit.m < carried else ""
     # Far from the limit a third of the move says no more than that it is large.
     amount = f"about {moved[worst]:.2g}" if moved[worst] <= 10 else "more than 10"
-    return [
-        f"at {fit.m} pulses the step alone moves coefficient {worst} by {amount} standard errors, which do "
-        f"not count it; {finer}use {parameter('method', 'output-error')}, which refines the step"
-    ]
+    return [finding("step_bias", parameter=worst, m=fit.m, amount=amount, finer=finer)]
 
 
-def _prior_warnings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[str]:
-    """Return a warning if the prior covariance, not the data, determines the size of a coefficient."""
+def _prior_findings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[Finding]:
+    """Return a finding if the prior covariance, not the data, determines the size of a coefficient."""
     shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
     if worst <= MAX_PRIOR_SHIFT:
         return []
-    return [
-        f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
-        f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs "
-        f"the data against it. Raise prior_covariance or use {parameter('method', 'least-squares')}"
-    ]
+    numbers = {"prior": settings.prior_covariance, "share": 100 * min(worst, 9.99)}
+    return [finding("prior_pulls", output=output, length=settings.innovation_length, **numbers)]
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.estimation.output_error import Loss
 from ftlm.estimation.result import Identification, Task
+from ftlm.findings import Finding
 from ftlm.model.model import Model
 from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
 from ftlm.order_search.search import check_executor, threads_per_task
@@ -115,7 +116,7 @@ class OutputError:
                 f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the "
                 f"instrument {parameter('reference', self.reference)} does not know; leave one of the two out"
             )
-        workers, answers, weak = check_threads(threads), None, list[str]()
+        workers, answers, weak = check_threads(threads), None, list[Finding]()
         if self.reference is not None:
             answers, weak = instrument_runs(runs, structure, self.reference)
         begin = self.start.model if isinstance(self.start, Identification) else self.start

@@ -23,6 +23,7 @@ from ftlm.estimation.output_error import (
     Loss,
     fit_output_error,
 )
+from ftlm.findings import Finding, finding
 from ftlm.progress import ShareTracker
 from ftlm.simulation.initial_conditions import (
     common_initial_conditions,
@@ -37,7 +38,6 @@ from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Structure, offset_exponents
 from ftlm.utils.linalg import column_norms, dot, orthonormal, projections, thin_svd
-from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, SIGNIFICANCE_LEVEL, autoregression, chi_squared
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
@@ -48,7 +48,7 @@ DEFAULT_PULSES_PER_SAMPLE = 2
 OFFSET_COLLINEARITY_TOLERANCE = 1e-6
 #: Smallest reported effect of an offset, as a fraction of the standard deviation of the output.
 MIN_OFFSET_SIZE_RATIO = 1e-3
-#: Significance level of the warning about an offset that was not requested.
+#: Significance level of the finding on an offset that was not requested.
 UNREQUESTED_OFFSET_LEVEL = 1e-4
 #: Maximum number of evaluations from the grid point to the nearby optimum.
 MAX_REFINEMENT_EVALUATIONS = 40
@@ -226,15 +226,12 @@ def _colored_covariance(directions: Floats, noise: Floats, blocks: list[list[tup
     return total
 
 
-def unrequested_offset_warnings(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]:
-    """Return a warning if an offset that was not requested would explain the residuals."""
+def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str]) -> list[Finding]:
+    """Return a finding if an offset that was not requested would explain the residuals."""
     if test is None or not test.exceeds(UNREQUESTED_OFFSET_LEVEL, size=MIN_OFFSET_SIZE_RATIO):
         return []
-    return [
-        f"an unknown constant in the equation of {', '.join(outputs)} explains {100 * min(test.share, 1):.2g} % of "
-        f"what the model misses ({test.statistic_text}): a sensor's zero, a load, a voltage at rest; use "
-        f"{parameter('offset', 'constant')} or {parameter('offset', 'auto')}"
-    ]
+    numbers = {"share": 100 * min(test.share, 1), "test": test.statistic_text}
+    return [finding("offset_missing", output=", ".join(outputs), **numbers)]
 
 
 def errors_with_orders(

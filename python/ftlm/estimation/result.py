@@ -13,6 +13,7 @@ from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.output_error import JointFit, ProfileInterval
 from ftlm.estimation.physical_parameters import PhysicalParameter, physical_parameters
+from ftlm.findings import Finding, texts
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
 from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
@@ -71,8 +72,8 @@ class Identification:
         all orders were given.
     settings
         Settings of the estimator.
-    warnings
-        Warnings about the model.
+    findings
+        Findings about data, fit and model.
     fit
         Optimum of the joint output error with its covariance; None for the equation-error methods.
     residuals
@@ -90,12 +91,17 @@ class Identification:
     comparison: Comparison
     searches: dict[str, SearchResult]
     settings: dict[str, Any]
-    warnings: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = field(default=())
     fit: JointFit | None = None
     residuals: Residuals | None = None
     information: InformationCriteria | None = None
     task: Task | None = field(default=None, repr=False)
     coefficient_errors: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return texts(self.findings)
 
     @property
     def orders(self) -> dict[str, float]:
@@ -334,6 +340,7 @@ class Identification:
             "information": None if self.information is None else self.information.to_dict(),
             "searches": {name: s.to_dict() for name, s in self.searches.items()},
             "choice": None if self.fit is None else self.fit.choice,
+            "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
 
@@ -416,7 +423,7 @@ class Identification:
         if errors:
             others = ", but those written out: by profile likelihood" if self.profiles else ""
             lines.append(f"  (value ± standard error; 95 % intervals are ± 1.96 of these{others})")
-        lines.append(str(replace(self.comparison, warnings=())))
+        lines.append(str(replace(self.comparison, findings=())))
         if self.residuals is not None:
             white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
             free = ", ".join(f"{o} {w}" for o, w in self.residuals.independence.items())

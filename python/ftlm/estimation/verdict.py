@@ -4,40 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, cast
+from typing import Any
 
 from markupsafe import Markup
 from msgspec import UNSET
+from msgspec.structs import replace
 
 from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError
+from ftlm.estimation.model_checks import join_names, unstable_poles_text
 from ftlm.estimation.result import Identification
-from ftlm.model.model import Estimate, Model, ModelFinding
+from ftlm.findings import FINDING_TOPICS, LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, finding, group_findings
+from ftlm.model.model import Estimate, Model
 from ftlm.utils.formatting import format_bound
-from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import MAX_FIT_DROP_POINTS, MAX_NORMALIZED_RESIDUAL, Comparison, Metrics
-from ftlm.validation.findings import (
-    LEVEL_DO_NOT_USE,
-    LEVEL_WITH_CARE,
-    WARNING_KINDS,
-    WarningKind,
-    group_warnings,
-    warning_kind,
-)
 from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO
 
 TRUST_LEVEL = "trust"
-NOT_TRIED = "no run that it was not fitted to has been tried"
 #: Largest relative standard error of a well-determined coefficient, and largest standard error of an order. Half the 95
 #: % interval then equals the coefficient, or the increment of 0.5 between common mechanisms.
 MAX_COEFFICIENT_ERROR_RATIO, MAX_ORDER_ERROR = 0.5, 0.25
 #: Limits of the validation loss: ratio to the estimation loss, and percentage below which the ratio does not matter.
 VALIDATION_LOSS_LIMITS = ((3.0, 10.0), (5.0, 5.0))
-_KINDS_BY_NAME = {kind.name: kind for kind in WARNING_KINDS}
+UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
+#: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by
+#: rounding alone, and a parameter may be uncertain, but not by much.
+RULED_TOPICS = ("residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
 
 
 @dataclass(frozen=True)
@@ -85,7 +80,7 @@ class Validation(Comparison):
 
     Parameters
     ----------
-    output_error, equation_error, per_run, simulated, measured, step, m, initial, warnings, times
+    output_error, equation_error, per_run, simulated, measured, step, m, initial, findings, times
         See :class:`ftlm.Comparison`.
     output_samples, offsets, without_equation_error
         See :class:`ftlm.Comparison`.
@@ -114,17 +109,13 @@ def validation_with_verdict(result: Identification, comparison: Comparison) -> V
     return Validation(**own, verdict=verdict(result, comparison))
 
 
-def _make_finding(level: str, reason: str, remedy: str) -> ModelFinding:
-    return ModelFinding(cast(Literal["do not use", "with care"], level), reason, remedy)
-
-
 def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
     """Return the verdict on a result, by the rules of :meth:`ftlm.Identification.verdict`.
 
-    Warnings of weight that no rule names count in the order of :data:`ftlm.validation.findings.KINDS`.
+    Findings of weight that no rule covers count in the order of :data:`ftlm.findings.FINDING_TOPICS`.
     """
     runs = () if validation is None else (validation,)
-    tried = validation is not None and _is_other(validation)
+    tried = validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
     against = _combined_verdict([*result_findings(result)], result.fit_percent, runs, tried)
     if against is not None:
         return against
@@ -135,35 +126,32 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
 
 
 def _combined_verdict(
-    own: Sequence[ModelFinding], before: Mapping[str, float], runs: Sequence[Comparison], tried: bool
+    own: Sequence[Finding], before: Mapping[str, float], runs: Sequence[Comparison], tried: bool
 ) -> Verdict | None:
     """Return the verdict from all findings, by itself and on other runs; None without findings."""
-    found = [a for a in own if a.level == LEVEL_DO_NOT_USE]
-    for comparison in runs:
-        found += _poor_fits("the validation run of ", comparison)
-    for comparison in runs:
-        found += _validation_losses(before, comparison)
-    found += [a for a in own if a.level == LEVEL_WITH_CARE]
-    if not tried:
-        found.append(_make_finding(LEVEL_WITH_CARE, NOT_TRIED, choose_text("validate(run)", "--validation FILE")))
-    bad = [a for a in found if a.level == LEVEL_DO_NOT_USE] + [a for a in found if a.level == LEVEL_WITH_CARE]
+    found = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison)]
+    found += [f for comparison in runs for f in _validation_losses(before, comparison)]
+    own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
+    return verdict_from([*own_first, *found, *own, *([] if tried else [finding("not_validated")])])
+
+
+def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
+    """Return the verdict by the most serious of these findings; None if none speaks against the model."""
+    listed = list(findings)
+    bad = [f for level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) for f in listed if f.level == level]
     if not bad:
         return None
-    return Verdict(bad[0].level, bad[0].reason, bad[0].remedy, tuple(dict.fromkeys(a.reason for a in bad)))
+    return Verdict(bad[0].level, bad[0].reason, bad[0].remedy, tuple(dict.fromkeys(f.reason for f in bad)))
 
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Return the verdict on a saved model, from its file and from comparisons with runs."""
     known, own = model.estimate, [*_unstable_poles(model)]
     if known is None:
-        own.append(
-            _make_finding(
-                LEVEL_WITH_CARE, "its file says nothing of how it was identified", "compare it with measured runs"
-            )
-        )
+        own.append(finding("origin_unknown"))
         judged = _combined_verdict(own, {}, validation, True)
     else:
-        own += saved_findings(known) if known.against is UNSET else known.against
+        own += saved_findings(known)
         before = {n: f for n, f in known.fit.items() if f is not None}
         seen = any(name in known.runs for c in validation for name, _, _ in c.per_run)
         judged = _combined_verdict(own, before, validation, bool(validation) and not seen)
@@ -173,88 +161,63 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     return Verdict(TRUST_LEVEL, f"it predicts runs it was not fitted to ({fits}), and nothing spoke against its fit")
 
 
-def saved_findings(known: Estimate) -> list[ModelFinding]:
-    """Return the findings about a model whose file stores only warnings and standard errors."""
-    found = []
+def saved_findings(known: Estimate) -> list[Finding]:
+    """Return the findings against a saved model, those of the fit first."""
+    found = [] if known.against is UNSET else list(known.against)
     unseen = [n for n, e in known.standard_errors.items() if e is None]
-    if unseen:
-        found.append(
-            _make_finding(
-                LEVEL_DO_NOT_USE,
-                f"the runs do not tell {_join_names(unseen)} apart",
-                _KINDS_BY_NAME["unseen"].format_remedy(),
-            )
-        )
-    before = {n: f for n, f in known.fit.items() if f is not None}
-    for concern in group_warnings([w for w in known.warnings if not _of_noise(w, before)]):
-        if concern.kind.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) and concern.kind.name not in (
-            "unstable",
-            "unseen",
-        ):
-            reason = f"{concern.kind.what}: {_first_clause(concern.warnings[0])}"
-            found.append(_make_finding(concern.kind.level, reason, concern.kind.format_remedy()))
-    if not known.standard_errors:
-        found.append(
-            _make_finding(
-                LEVEL_WITH_CARE,
-                f"{known.method} gives no standard errors",
-                f"use {parameter('method', 'output-error')}",
-            )
-        )
+    if unseen and not any(f.topic is UNSEEN_TOPIC for f in found):
+        found.append(finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen)))
+    if known.warnings:
+        found.append(finding("sentences_alone"))
     return found
 
 
-def result_findings(result: Identification) -> Iterator[ModelFinding]:
+def result_findings(result: Identification) -> Iterator[Finding]:
     """Yield the findings about a result by itself, most serious first within a level."""
-    kinds = {c.kind.name: c for c in group_warnings(result.warnings)}
+    for item in _against_result(result):
+        yield replace(item, method=result.method)
 
-    def of(kind: WarningKind, reason: str = "", remedy: str = "") -> ModelFinding:
-        return _make_finding(kind.level, reason or kind.what, remedy or kind.format_remedy())
 
+def _against_result(result: Identification) -> Iterator[Finding]:
+    codes = {f.code for f in result.findings}
     yield from _free_runs(result)
     errors, joint = result.standard_errors, result.fit
     unseen = [n for n, e in errors.items() if not math.isfinite(e)]
     if unseen:
-        yield of(_KINDS_BY_NAME["unseen"], f"the runs do not tell {_join_names(unseen)} apart")
-    if "identity" in kinds:
-        yield of(_KINDS_BY_NAME["identity"])
+        yield finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen))
+    yield from (f for f in result.findings if f.code == "equation_says_identity")
+    yield from (f for f in result.findings if f.code == "offset_missing")
     yield from _residuals(result)
-    if joint is not None and not joint.converged:
-        kinds.pop("provisional", None)
-        yield of(_KINDS_BY_NAME["provisional"], "the fit ended before it stood still")
-    vague = [_format_uncertain(result, n) for n in errors if n not in unseen and _is_uncertain(result, n)]
+    if joint is not None and not joint.converged and "not_converged" not in codes:
+        yield finding("not_converged")
+    vague = [n for n in errors if n not in unseen and _is_uncertain(result, n)]
     if vague:
-        yield of(_KINDS_BY_NAME["vague"], f"the runs hardly tell {_join_names(vague)}")
+        shown = join_names([_format_uncertain(result, n) for n in vague])
+        yield finding("number_vague", parameter=", ".join(vague), shown=shown)
     endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
     if endless:
-        yield of(_KINDS_BY_NAME["vague"], f"the runs do not bound {_join_names(endless)}")
+        yield finding("interval_open", parameter=join_names(endless), sides=", ".join(endless))
     runs = zip(result.comparison.offsets, result.comparison.initial, strict=False)
     hidden = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
     if hidden:
-        words = f"the offset of {_join_names(list(hidden))} is not told apart from what a run did before its start"
-        yield of(_KINDS_BY_NAME["history"], words)
-    # A test of whiteness that fails by rounding alone, or numbers that are vague and not very, are no reasons.
-    judged = ("residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
-    for name, concern in kinds.items():
-        if name not in judged and concern.kind.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE):
-            yield of(concern.kind, f"{concern.kind.what}: {_first_clause(concern.warnings[0])}")
+        yield finding("offset_hidden", output=", ".join(hidden), shown=join_names(list(hidden)))
+    for group in group_findings(result.findings):
+        if group.first.kind.topic not in RULED_TOPICS and group.first.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE):
+            yield group.first
     if not errors:
-        yield _make_finding(
-            LEVEL_WITH_CARE,
-            f"{result.method} gives no standard errors, so nothing says how sure its numbers are",
-            f"use {parameter('method', 'output-error')}",
-        )
+        yield finding("no_standard_errors")
 
 
-def _free_runs(result: Identification) -> Iterator[ModelFinding]:
+def _free_runs(result: Identification) -> Iterator[Finding]:
     """Yield findings about simulations: overflow, instability and poor fit."""
-    if not all(math.isfinite(f.nr) for f in result.output_error.values()):
-        yield _make_finding(LEVEL_DO_NOT_USE, _KINDS_BY_NAME["range"].what, _KINDS_BY_NAME["range"].format_remedy())
+    lost = [o for o, f in result.output_error.items() if not math.isfinite(f.nr)]
+    if lost:
+        yield finding("out_of_range", output=", ".join(lost))
     yield from _unstable_poles(result.model)
     yield from _poor_fits("", result.comparison)
 
 
-def _unstable_poles(model: Model) -> Iterator[ModelFinding]:
+def _unstable_poles(model: Model) -> Iterator[Finding]:
     """Yield findings about unstable poles and undamped modes; none with friction.
 
     A pole at the origin is an integrator, which is common in machines and no fault.
@@ -263,32 +226,25 @@ def _unstable_poles(model: Model) -> Iterator[ModelFinding]:
         return
     stable = model.stability(coupling=model.structure.coupling)
     if math.isnan(stable.unstable_poles):
-        yield _make_finding(
-            LEVEL_WITH_CARE, "whether its free run grows cannot be told", _KINDS_BY_NAME["unstable"].format_remedy()
-        )
+        yield finding("growth_untold")
     elif stable.unstable_poles > 0:
-        count = int(stable.unstable_poles)
-        poles = f"{count} pole{'s' if count > 1 else ''} with a positive real part"
-        yield _make_finding(
-            LEVEL_DO_NOT_USE, f"{_KINDS_BY_NAME['unstable'].what} ({poles})", _KINDS_BY_NAME["unstable"].format_remedy()
-        )
+        poles = unstable_poles_text(stable.unstable_poles)
+        yield finding("free_run_grows", stability=str(stable), poles=poles)
     else:
         with contextlib.suppress(FtlmError):
             yield from _undamped_modes(model)
 
 
-def _undamped_modes(model: Model) -> Iterator[ModelFinding]:
+def _undamped_modes(model: Model) -> Iterator[Finding]:
     """Yield findings about oscillatory modes whose damping is not significantly positive."""
     for mode in modes(model, coupling=model.structure.coupling):
         if mode.oscillatory and mode.damping - NORMAL_95 * (mode.damping_error or 0.0) <= 0.0:
             spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
-            words = f"a swing of {mode.frequency:.4g} rad/s may never die away (damping {mode.damping:.2g}{spread})"
-            remedy = "add the term that damps it, or record until it has died away"
-            yield _make_finding(LEVEL_WITH_CARE, words, remedy)
+            yield finding("swing_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=spread)
             return
 
 
-def _poor_fits(where: str, comparison: Comparison) -> Iterator[ModelFinding]:
+def _poor_fits(where: str, comparison: Comparison) -> Iterator[Finding]:
     """Yield outputs that the simulation explains by less than half, over all runs or on one.
 
     Each run is tested too, because a large run hides a small one.
@@ -296,24 +252,24 @@ def _poor_fits(where: str, comparison: Comparison) -> Iterator[ModelFinding]:
     for run, errors in _each(comparison):
         useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL]
         if useless:
-            shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{run})" for o in useless)
-            yield _make_finding(
-                LEVEL_DO_NOT_USE,
-                f"the free run explains little of {where}{shown}",
-                _KINDS_BY_NAME["useless"].format_remedy(),
-            )
+            shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in useless)
+            yield finding("poor_fit", run=run, output=", ".join(useless), where=where, shown=shown)
             return
 
 
 def _each(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]:
-    """Yield the metrics of the simulation error over all runs, and of each run if there are several."""
+    """Yield the metrics of the simulation error over all runs, and of each run by name if there are several."""
     yield "", comparison.output_error
     if len(comparison.per_run) > 1:
         for name, _, errors in comparison.per_run:
-            yield f" on {name}", errors
+            yield name, errors
 
 
-def _validation_losses(before: Mapping[str, float], validation: Comparison) -> Iterator[ModelFinding]:
+def _on(run: str) -> str:
+    return f" on {run}" if run else ""
+
+
+def _validation_losses(before: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
     """Yield outputs whose validation fit is far below the estimation fit."""
     for run, errors in _each(validation):
         for output, figures in errors.items():
@@ -324,46 +280,30 @@ def _validation_losses(before: Mapping[str, float], validation: Comparison) -> I
                 left <= own + MAX_FIT_DROP_POINTS
                 and all(left <= times * own or left <= little for times, little in VALIDATION_LOSS_LIMITS)
             ):
-                words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation{run}"
-                yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["lost"].format_remedy())
+                numbers = {"before": before[output], "after": figures.fit, "where": _on(run)}
+                yield finding("fit_falls", run=run, output=output, **numbers)
                 return
 
 
-def _of_noise(warning: str, fits: Mapping[str, float]) -> bool:
-    """Whether a warning concerns residuals of negligible size."""
-    if warning_kind(warning).name not in ("residuals", "loop"):
-        return False
-    named = [o for o in fits if re.search(rf"(?<!\w){re.escape(o)}(?!\w)", warning)]
-    return bool(named) and all(100.0 - fits[o] <= 100.0 * NEGLIGIBLE_RESIDUAL_RATIO for o in named)
-
-
-def _residuals(result: Identification) -> Iterator[ModelFinding]:
+def _residuals(result: Identification) -> Iterator[Finding]:
     """Yield findings of residual tests: feedback, dependence on an input, color."""
     if result.residuals is None:
-        yield _make_finding(LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run")
+        yield finding("too_short_for_tests")
         return
     looped = "reference" in result.settings
     judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
     # A model that is wrong leaves what a periodic input repeats, which looks like a loop: first what it lacks.
     following = {o: [s for s, t in r.informative_tests.items() if t.failed] for o, r in judged.items()}
-    if any(following.values()):
-        words = ", ".join(f"{o} still follow {_join_names(signals)}" for o, signals in following.items() if signals)
-        yield _make_finding(
-            LEVEL_WITH_CARE,
-            f"residuals of {words}: it leaves something out",
-            _KINDS_BY_NAME["residuals"].format_remedy(),
-        )
-    for output, tests in judged.items():
-        if tests.feedback and not tests.whiteness.passed and not looped:
-            words = (
-                f"{_join_names(tests.feedback)} answers {output}, a closed loop, and what comes back biases the numbers"
-            )
-            yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["loop"].format_remedy())
+    following = {o: signals for o, signals in following.items() if signals}
+    if following:
+        shown = ", ".join(f"{o} still follow {join_names(signals)}" for o, signals in following.items())
+        signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
+        yield finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
+    yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not r.whiteness.passed]
     if coloured:
-        words = f"residuals of {_join_names(coloured)} are not white: it leaves something out"
-        yield _make_finding(LEVEL_WITH_CARE, words, _KINDS_BY_NAME["residuals"].format_remedy())
+        yield finding("residuals_not_white", output=", ".join(coloured), shown=join_names(coloured))
 
 
 def _is_uncertain(result: Identification, name: str) -> bool:
@@ -390,19 +330,3 @@ def _is_of_input(result: Identification, name: str) -> bool:
 def _format_uncertain(result: Identification, name: str) -> str:
     values = {**result.orders, **result.coefficients, **result.parameter_values}
     return f"{name} = {values[name]:.3g} ± {format_bound(result.standard_errors[name], '.2g')}"
-
-
-def _is_other(validation: Comparison) -> bool:
-    """Whether no validation run was used for estimation."""
-    return not any(c.kind.name == "same" for c in group_warnings(validation.warnings))
-
-
-def _first_clause(warning: str) -> str:
-    """Return the first clause of a warning."""
-    return warning.partition(";")[0].partition(" (")[0]
-
-
-def _join_names(names: object) -> str:
-    words = list(names) if isinstance(names, (list, tuple)) else [str(names)]
-    shown = words if len(words) <= 3 else [*words[:3], f"{len(words) - 3} more"]
-    return " and ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import UNSET
 
 from ftlm.analysis.frequency_response import check_no_input_nonlinearity
 from ftlm.analysis.poles import modes, stability
@@ -20,6 +21,7 @@ from ftlm.experiment_design.problem import Bounds, Criterion, Kind, per_signal_v
 from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
 from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
 from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
+from ftlm.findings import NOT_WHITE_CODES, Finding, finding
 from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
@@ -139,7 +141,7 @@ class DesignTask:
     criterion: Criterion
     period: int
     seed: int
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 @check_arguments
@@ -259,7 +261,7 @@ def design_input(
         predicted_extremes=_predicted_extremes(run, bounds),
         spectrum=spectrum,
         efficiency=math.exp(best.score - spectrum.bound),
-        warnings=wanted.warnings,
+        findings=wanted.findings,
     )
 
 
@@ -393,12 +395,12 @@ def _check_arguments(
         raise ModelError(
             f"{setting('period')} {period:g} s is not between two steps and twice the run; give another one"
         )
-    told = () if solved.estimate is None else solved.estimate.warnings
-    colour = next((w for w in told if "not white" in w), None)
+    said = () if solved.estimate is None or solved.estimate.findings is UNSET else solved.estimate.findings
+    colour = next((f for f in said if f.code in NOT_WHITE_CODES), None)
     words = (
         ()
         if colour is None or noise is not None
-        else ("predicted for white noise, and of the model it is said: " + colour,)
+        else (finding("designed_for_white_noise", output=colour.output, text=colour.text),)
     )
     return DesignTask(
         laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words

@@ -13,6 +13,7 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.experiment_design.problem import Kind
 from ftlm.experiment_design.spectrum import Spectrum
+from ftlm.findings import Finding, texts
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
@@ -76,7 +77,7 @@ class DesignedInput:
     efficiency
         Precision of the designed input over the largest one of a periodic input in steady state under the limits.
         The start from rest adds information, so the ratio may exceed 1.
-    warnings
+    findings
         Reasons why predictions may be wrong.
     """
 
@@ -92,7 +93,12 @@ class DesignedInput:
     predicted_extremes: tuple[PredictedExtreme, ...]
     spectrum: Spectrum = field(repr=False)
     efficiency: float
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return texts(self.findings)
 
     @property
     def input(self) -> dict[str, Floats]:
@@ -162,6 +168,7 @@ class DesignedInput:
                 "power": self.spectrum.power.tolist(),
                 "gap": finite(self.spectrum.gap),
             },
+            "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
 

@@ -7,14 +7,15 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import msgspec
-from msgspec import UNSET, Meta, UnsetType
+from msgspec import UNSET, UnsetType
 from numpy.typing import ArrayLike
 
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
+from ftlm.findings import Finding
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Structure, check_offset_resolved
 from ftlm.utils.arguments import check_arguments
@@ -54,24 +55,6 @@ class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refinement: int = 1
 
 
-class ModelFinding(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Finding against a model, with severity and remedy.
-
-    Parameters
-    ----------
-    level
-        Severity: ``"do not use"`` or ``"with care"``.
-    reason
-        The finding as a sentence.
-    remedy
-        Recommended action.
-    """
-
-    level: Literal["do not use", "with care"]
-    reason: Annotated[str, Meta(min_length=1)]
-    remedy: str = ""
-
-
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Details of the estimation of a model, stored with it so that a report needs no other file.
 
@@ -91,15 +74,16 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     information
         Information criteria, where available.
     warnings
-        Warnings about the model, as sentences.
+        Sentences in files of earlier versions, which are shown and not judged.
     intervals
         95 % profile-likelihood intervals of the values that have one; None for an unbounded end. Other values have
         Wald intervals of ± 1.96 standard errors. Unset if no value has one.
     free
         Free parameters of the output-error fit, for the design of the next experiment. Unset for other methods.
+    findings
+        Findings about data, fit and model. Unset if there are none.
     against
-        Findings against the model at identification, used by its verdict. Unset if there are none, and in files of
-        earlier versions, whose verdict uses the warnings.
+        Findings against the model at identification, used by its verdict. Unset if there are none.
     """
 
     method: str
@@ -112,7 +96,14 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     warnings: tuple[str, ...] = ()
     intervals: dict[str, tuple[float | None, float | None]] | UnsetType = UNSET
     free: FitParameters | UnsetType = UNSET
-    against: tuple[ModelFinding, ...] | UnsetType = UNSET
+    findings: tuple[Finding, ...] | UnsetType = UNSET
+    against: tuple[Finding, ...] | UnsetType = UNSET
+
+    @property
+    def known_findings(self) -> tuple[Finding, ...]:
+        """Findings, with the sentences of earlier versions as notes."""
+        old = tuple(Finding("earlier_sentence", numbers={"text": text}) for text in self.warnings)
+        return old if self.findings is UNSET else (*old, *self.findings)
 
 
 @check_arguments

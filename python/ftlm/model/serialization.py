@@ -22,16 +22,9 @@ from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import error_text
 
 #: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are no outputs,
-#: friction, input nonlinearities, Stribeck friction, free parameters and findings of the fit.
-BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FIT_SCHEMA = (
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-)
+#: friction, input nonlinearities, Stribeck friction, free parameters of the fit, findings as records.
+BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
+STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA = 7, 8, 9
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -236,7 +229,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 #: Model files have a few kilobytes; the default size limit suffices.
-MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, FIT_SCHEMA)
+MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, FINDING_SCHEMA)
 
 
 def schema_of(
@@ -248,7 +241,7 @@ def schema_of(
 ) -> int:
     """Smallest schema version that contains all parts of a model, so that older files do not change."""
     profiled = estimate is not None and estimate.intervals is not UNSET
-    doubted = estimate is not None and estimate.against is not UNSET
+    doubted = estimate is not None and not (estimate.findings is UNSET and estimate.against is UNSET)
     named = sensor is not None and not isinstance(sensor.signals, UnsetType)
     known = estimate is not None and estimate.free is not UNSET
     return max(
@@ -256,7 +249,8 @@ def schema_of(
         PROFILE_SCHEMA if profiled or named else BASE_SCHEMA,
         BASE_SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA,
         *(e.friction_schema for e in equations),
-        FIT_SCHEMA if known or doubted else BASE_SCHEMA,
+        FIT_SCHEMA if known else BASE_SCHEMA,
+        FINDING_SCHEMA if doubted else BASE_SCHEMA,
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from ftlm.findings import Finding, finding
 from ftlm.model.model import Model
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
@@ -211,6 +212,11 @@ class SearchResult:
             "at_grid_edge": self.at_grid_edge,
         }
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings on the best orders: those on the edge of their interval."""
+        return tuple(finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items())
+
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)
         what = "error" if self.settings["norm"] == "l1" else "RMSE"
@@ -221,9 +227,7 @@ class SearchResult:
             values = "".join(f"{row.coefficients[n]:>12.5g}" for n in coefficients)
             lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}")
         lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.excluded_summary}")
-        lines += [
-            f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.at_grid_edge.items()
-        ]
+        lines += [f"warning: {f}" for f in self.findings]
         return "\n".join(lines)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from markupsafe import Markup
 
@@ -21,6 +21,16 @@ from ftlm.estimation.model_checks import validate
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import Verdict, saved_verdict, verdict, verdict_html
+from ftlm.findings import (
+    LEVEL_NOTE,
+    MAX_SUMMARY_FINDINGS,
+    VALIDATION_ROLE,
+    Finding,
+    finding,
+    group_findings,
+    texts,
+    unique,
+)
 from ftlm.model.model import Model
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.order_search.result import SearchResult, search_summary, search_top
@@ -40,10 +50,10 @@ from ftlm.validation.comparison import (
     compare,
     errors_table,
     initial_terms_table,
-    validation_fit_warnings,
+    validation_fit_findings,
     warnings_html,
 )
-from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings
+from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_table
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, resid, residual_table
 
@@ -63,20 +73,23 @@ def verdict_box(judged: Verdict, of: str = "") -> Markup:
     )
 
 
-def first_warnings(warnings: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split warnings into the most serious groups, with remedies, and the remaining warnings."""
-    found = group_warnings(warnings)
+def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
+    """Split findings into the most serious groups, with remedies, and the sentences of the others."""
     shown: list[str] = []
     left: list[str] = []
-    for k, concern in enumerate(found):
-        if k >= MAX_SUMMARY_WARNINGS:
-            left += concern.warnings
+    for k, group in enumerate(group_findings(findings)):
+        if k >= MAX_SUMMARY_FINDINGS:
+            left += texts(group.findings)
             continue
-        remedy = concern.remedy if concern.remedy not in concern.warnings[0] else ""
-        todo = Markup(' <span class="todo">→ {}</span>').format(remedy) if remedy else Markup("")
-        shown.append(Markup("{}{}{}").format(concern.warnings[0], concern.count, todo))
-        left += concern.warnings[1:]
+        todo = Markup(' <span class="todo">→ {}</span>').format(group.remedy) if group.remedy else Markup("")
+        shown.append(Markup("{}{}{}").format(group.first.text, group.count, todo))
+        left += texts(group.findings[1:])
     return shown, left
+
+
+def _on_validation(findings: Iterable[Finding], run: Run) -> list[Finding]:
+    """Return findings on a run as those of a run that the model was not identified from."""
+    return [msgspec.structs.replace(f, run=f.run or run.name, role=VALIDATION_ROLE) for f in findings]
 
 
 def title_of(model: Model) -> str:
@@ -203,16 +216,12 @@ def identification_page(
     model = result.model
     others = [] if validation is None else as_runs(validation)
     validated = [validate(result, run) for run in others]
-    warnings = list(result.warnings)
+    findings = list(result.findings)
     undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
     if undefined:
-        warnings.append(
-            f"the standard errors of {', '.join(undefined)} are not defined: the fit's covariance is not finite; "
-            "nothing is known of how sure these numbers are"
-        )
+        findings.append(finding("errors_undefined", parameter=", ".join(undefined)))
     for run, comparison in zip(others, validated, strict=True):
-        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in comparison.warnings]
-        warnings += [f"validation run {run.name}: {w}" for w in run.warnings]
+        findings += _on_validation([*comparison.findings, *data_notes(run)], run)
     compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
     tests += tests_on(model, others)
@@ -220,7 +229,7 @@ def identification_page(
     judged = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
-    sections = first_sections(model, warnings, compared, bool(others), result.fit, runs)
+    sections = first_sections(model, findings, compared, bool(others), result.fit, runs)
     sections.append(residual_section(tests, result.information, compared, model.units))
     sections += correlation_sections(result.fit)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
@@ -237,7 +246,7 @@ def identification_page(
 
 def first_sections(
     model: Model,
-    warnings: Sequence[str],
+    findings: Iterable[Finding],
     compared: Sequence[tuple[str, Comparison]],
     validated: bool,
     joint: JointFit | None,
@@ -252,8 +261,8 @@ def first_sections(
     ]
     if not validated:
         words.append("No validation run was given: how well the model predicts other data is not known.")
-    warned = list(dict.fromkeys(warnings))
-    shown, left = first_warnings(warned)
+    warned = unique(findings)
+    shown, left = first_findings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
@@ -441,17 +450,17 @@ def estimates_table(result: Identification | None, truth: Mapping[str, float] | 
     return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
 
 
-def grouped_warnings(results: Mapping[str, Identification | None]) -> list[str]:
-    """Return warnings of several results by label, merging those that differ only in numbers."""
-    groups: dict[str, tuple[str, list[str]]] = {}
+def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
+    """Return sentences on several results by label, merging findings that differ only in numbers."""
+    groups: dict[tuple[str, ...], tuple[Finding, list[str]]] = {}
     for label, result in results.items():
-        for warning in () if result is None else result.warnings:
-            # Digits of names stay: theta11 is not theta12.
-            key = re.sub(r"(?<![A-Za-z\d.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", warning)
-            groups.setdefault(key, (warning, []))[1].append(label)
+        for item in () if result is None else result.findings:
+            note = item.text if item.level == LEVEL_NOTE else ""
+            key = (item.code, item.run, item.output, item.input, item.parameter, note)
+            groups.setdefault(key, (item, []))[1].append(label)
     return [
-        f"{', '.join(dict.fromkeys(labels))}: {warning}{'' if len(labels) == 1 else ' (numbers of the first)'}"
-        for warning, labels in groups.values()
+        f"{', '.join(dict.fromkeys(labels))}: {item}{'' if len(labels) == 1 else ' (numbers of the first)'}"
+        for item, labels in groups.values()
     ]
 
 
@@ -512,7 +521,7 @@ def identification_html(result: Identification) -> str:
             for o, white in result.residuals.white.items()
         ]
         parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
-    shown, left = first_warnings(result.warnings)
+    shown, left = first_findings(result.findings)
     parts.append(warnings_html(shown))
     if left:
         folded = Markup("<details><summary>{} more warning{}</summary>{}</details>")
@@ -545,16 +554,16 @@ def model_page(
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)
     known = model.estimate
-    warnings = [] if known is None else list(known.warnings)
+    findings = [] if known is None else list(known.known_findings)
     validated = [compare(model, run) for run in others]
     for run, comparison in zip(others, validated, strict=True):
-        words = [*comparison.warnings, *run.warnings]
+        there = [*comparison.findings, *data_notes(run)]
         if known is not None:
-            words += validation_fit_warnings({n: f for n, f in known.fit.items() if f is not None}, comparison)
-            words += ["it has the name of a run that the model was identified from"] * (run.name in known.runs)
-        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in words]
+            there += validation_fit_findings({n: f for n, f in known.fit.items() if f is not None}, comparison)
+            there += [finding("run_of_its_own", run=run.name)] * (run.name in known.runs)
+        findings += _on_validation(there, run)
     compared = [("validation", comparison) for comparison in validated]
-    sections = first_sections(model, warnings, compared, bool(others), None, others)
+    sections = first_sections(model, findings, compared, bool(others), None, others)
     if tests := tests_on(model, others):
         sections.append(residual_section(tests, None, compared, model.units))
     sections.append(frequency_section(model, [(r.step, r.duration) for r in others]))

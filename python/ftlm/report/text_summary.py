@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from ftlm.analysis.poles import Mode, SteadyState, modes, steady_states
 from ftlm.errors import FtlmError
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import verdict
+from ftlm.findings import MAX_SUMMARY_FINDINGS, Finding, group_findings, hidden_findings_text
 from ftlm.model.model import Model
 from ftlm.report.typesetting import ORDER_DECIMALS, units_of
 from ftlm.structure.equation import Equation, format_equation
@@ -22,7 +23,6 @@ from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, with_error,
 from ftlm.utils.parameters import choose_text
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison, describe_offsets
-from ftlm.validation.findings import MAX_SUMMARY_WARNINGS, group_warnings, hidden_warnings_text
 
 #: Most modes that are listed.
 MOST_MODES = 6
@@ -35,7 +35,7 @@ def summary(result: Identification, validation: Comparison | None = None) -> str
     lines += equation_lines(result.model, result.comparison)
     lines += ["", *parameter_lines(result), *behavior_lines(result.model), ""]
     lines += [*fit_lines(result, validation), *_residuals(result), *_starts(result)]
-    lines += finding_lines(result.warnings)
+    lines += finding_lines(result.findings)
     return "\n".join(lines)
 
 
@@ -174,15 +174,15 @@ def _starts(result: Identification) -> list[str]:
     return lines
 
 
-def finding_lines(warnings: Sequence[str], how: str | None = None) -> list[str]:
-    """Return up to three groups of warnings with remedies, most serious first."""
-    found = group_warnings(warnings)
+def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[str]:
+    """Return up to three groups of findings with remedies, most serious first."""
+    found = group_findings(findings)
     lines = []
-    for concern in found[:MAX_SUMMARY_WARNINGS]:
-        lines += wrap_text(f"{concern.warnings[0]}{concern.count}", "! ")
-        if concern.remedy and concern.remedy not in concern.warnings[0]:
-            lines += wrap_text(concern.remedy, "  -> ")
-    more = hidden_warnings_text(found)
+    for group in found[:MAX_SUMMARY_FINDINGS]:
+        lines += wrap_text(f"{group.first}{group.count}", "! ")
+        if group.remedy:
+            lines += wrap_text(group.remedy, "  -> ")
+    more = hidden_findings_text(found)
     return (
         [*lines, f"  ({more}: {how or choose_text('print(result.details())', '--verbose shows all')})"]
         if more

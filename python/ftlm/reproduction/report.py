@@ -17,7 +17,7 @@ from ftlm.model.model import Model
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import comparison_charts, pulse_times
 from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencies
-from ftlm.report.html_report import behavior_tables, estimates_table, first_warnings, grouped_warnings, verdict_box
+from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
 from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 from ftlm.report.typesetting import equation_html
 from ftlm.reproduction import figures, tables
@@ -67,7 +67,7 @@ def stage_section(
     return Section(
         heading,
         [words, *equations, *notes],
-        warnings=grouped_warnings(results),
+        warnings=grouped_findings(results),
         tables=[*shown, search_summary(searches)],
         figures=charts,
     )
@@ -155,7 +155,7 @@ def _stage_section(found: ReproductionData, stage: Stage) -> Section:
     words = "(14)–(15) by joint output error, order law and coefficient law imposed:"
     model = joint.model
     equations = [equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations]
-    warned = grouped_warnings({label: c.result for label, c in stage.candidates.items()})
+    warned = grouped_findings({label: c.result for label, c in stage.candidates.items()})
     return Section(
         f"As it should be, stage {number} (Table {3 + number})",
         [words, *equations],
@@ -524,7 +524,7 @@ def _deflection_section(deflection: Deflection) -> Section:
     return Section(
         symbol(deflection.output),
         [words, *equations],
-        warnings=[*failed, *grouped_warnings(results)],
+        warnings=[*failed, *grouped_findings(results)],
         tables=[estimates_table_unseen_page(d, told) for told, d in parts],
     )
 
@@ -685,7 +685,7 @@ def demo_text(demo: Demo) -> str:
         "",
         "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well.",
     ]
-    said = [w for results in demo.results.values() for w in results["output error"].warnings]
+    said = [w for results in demo.results.values() for w in results["output error"].findings]
     lines += finding_lines(said, how="-v")
     others = sum(
         len(r.warnings) for results in demo.results.values() for n, r in results.items() if n != "output error"
@@ -761,8 +761,8 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
         tables = [*behavior_tables(best.model), estimates_table(best, demo.truth[stage]), table]
         whole = stage_section(f"Stage {stage}", best.model, results, tables, figures, TABLE_NOTE)
         # What is said of the model that is meant to be used comes first; the paper's methods have the rest.
-        shown, left = first_warnings(best.warnings)
-        others = grouped_warnings({n: r for n, r in results.items() if n != "output error"})
+        shown, left = first_findings(best.findings)
+        others = grouped_findings({n: r for n, r in results.items() if n != "output error"})
         sections.append(replace(whole, warnings=shown, more=[*left, *others]))
     sections.append(Section("Validation", tables=[validation_table(demo)]))
     lead = (

@@ -344,7 +344,7 @@ class StageWork:
             simulated={n: [mean] for n, mean in means.items()},
             output_error=errors,
             per_run=[(run.name, exact.equation_error, errors)],
-            warnings=(),
+            findings=(),
         )
 
     def searches(self) -> dict[str, Candidate]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ftlm.estimation.result import Identification
+from ftlm.findings import Finding, texts
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
@@ -40,7 +41,7 @@ class Selection(ReportMixin):
         Reason of the choice.
     fitted
         Total number of fitted candidates. Only the most promising ones of each step are validated.
-    warnings
+    findings
         Findings against the choice.
     """
 
@@ -50,7 +51,12 @@ class Selection(ReportMixin):
     validation: str
     reason: str
     fitted: int
-    warnings: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = field(default=())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return texts(self.findings)
 
     @property
     def winner(self) -> Trial:
@@ -176,6 +182,7 @@ class Selection(ReportMixin):
                 for t in self.trials
             ],
             "identification": self.best.to_dict(),
+            "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
 

@@ -13,6 +13,7 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify
+from ftlm.findings import finding
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
@@ -237,22 +238,16 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
     ]
     best, winner = ranked[0], _winner([ranked[k] for k in near])
     found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
-    warnings = []
+    findings = []
     if winner.joint is not None and found.fit is not None and found.fit.noise:
         lower = [o for o, v in found.fit.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
         if lower:
-            warnings.append(
-                f"from automatic starts the chosen structure fits {', '.join(lower)} better than where it was judged: "
-                "another optimum; .best is that one"
-            )
+            findings.append(finding("other_optimum", output=", ".join(lower)))
     if winner.validation_fit < 50.0:
-        warnings.append(
-            f"the best candidate predicts unseen runs with {format_fit(winner.validation_fit)} %: none of them is "
-            "the machine"
-        )
+        findings.append(finding("none_is_the_machine", fit=format_fit(winner.validation_fit)))
     worse = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
     if worse:
-        warnings.append(f"the chosen structure predicts worse than the mean of what was left out on {', '.join(worse)}")
+        findings.append(finding("worse_than_mean", parts=", ".join(worse)))
     return Selection(
         tuple(ranked),
         ranked.index(winner),
@@ -260,7 +255,7 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
         folds.description,
         _reason(winner, best, ranked),
         work.done_count,
-        tuple(warnings),
+        tuple(findings),
     )
 
 

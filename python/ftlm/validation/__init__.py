@@ -1,5 +1,5 @@
 """Validation: comparison of simulation and measurement, residual tests, information criteria, advice on data."""
 
-from ftlm.validation.data_advice import Advice, Finding, advise
+from ftlm.validation.data_advice import Advice, advise
 
-__all__ = ["Advice", "Finding", "advise"]
+__all__ = ["Advice", "advise"]

@@ -15,6 +15,7 @@ from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError
+from ftlm.findings import Finding, finding, texts
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import (
     Record,
@@ -33,7 +34,6 @@ from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, symbol_html
-from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_floats
 
 
@@ -147,7 +147,7 @@ class Comparison:
     initial
         Coefficients of the initial terms of the simulation, one mapping per run: output -> exponent -> value. They
         apply to that run only.
-    warnings
+    findings
         Reasons to doubt these metrics.
     times
         Time of each value of ``simulated`` and ``measured`` [s since the first sample], one array per run.
@@ -169,11 +169,16 @@ class Comparison:
     step: list[float]
     m: int
     initial: list[dict[str, dict[float, float]]]
-    warnings: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = field(default=())
     times: list[Floats] = field(default_factory=list)
     output_samples: bool = True
     offsets: tuple[dict[str, dict[str, float]], ...] = field(default=())
     without_equation_error: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return texts(self.findings)
 
     @property
     def fit_percent(self) -> dict[str, float]:
@@ -205,6 +210,7 @@ class Comparison:
                 for name, equation, output in self.per_run
             ],
             **({"offsets": list(self.offsets)} if self.offsets else {}),
+            "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
 
@@ -295,19 +301,12 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
         parts.append(_run_errors(model, rec, simulated, measured, sampled.initial, gaps=run.missing_samples))
     times = [compared_times(run, model.structure) for run in runs]
     found = _pooled_comparison(model, runs, parts, m, times, sampled=True)
-    warnings = list(found.warnings)
+    findings = list(found.findings)
     if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
-        warnings.append(
-            f"the free run on {', '.join(restless)} still moves with the step at the finest grid: the model is stiffer "
-            "than these samples can show, and its output error is provisional"
-        )
+        findings.append(finding("sampling_coarse", run=", ".join(restless)))
     if moving := runs_in_motion(model, runs):
-        warnings.append(
-            f"{', '.join(moving)} starts at zero and is simulated from rest, but what that leaves over dies away like "
-            f"motion from before the start; give the model's structure {parameter('initial', 'history')} to have "
-            "that estimated"
-        )
-    return replace(found, warnings=tuple(warnings))
+        findings.append(finding("simulated_from_rest", run=", ".join(moving)))
+    return replace(found, findings=tuple(findings))
 
 
 def _is_unconverged(sampled: OutputSamples) -> bool:
@@ -442,7 +441,7 @@ def _pooled_comparison(
         [p.step for p in parts],
         m,
         [p.initial for p in parts],
-        tuple(near_identity_warnings(model.structure, equation_error, output_error)),
+        tuple(near_identity_findings(model.structure, equation_error, output_error)),
         times,
         sampled,
         tuple(offset_values(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
@@ -466,15 +465,15 @@ def _pooled_errors(parts: Sequence[_RunErrors]) -> tuple[dict[str, Metrics], dic
     return equation, free
 
 
-def near_identity_warnings(
+def near_identity_findings(
     structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
-) -> list[str]:
-    """Warn where the equation error is misleading.
+) -> list[Finding]:
+    """Return findings where the equation error is misleading.
 
     Orders of an output's own terms close to alpha reproduce any smooth output from itself; only the simulation reveals
     it.
     """
-    warnings = []
+    findings = []
     for item in structure.equations:
         name, alpha = item.output, item.order.constant
         equation, output = equation_error[name], output_error[name]
@@ -490,46 +489,35 @@ def near_identity_warnings(
         if close and worse:
             listed = ", ".join(f"{order:g}" for order in close)
             listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
-            warnings.append(
-                f"{name}: {listed} close to alpha = {alpha:g}, so the equation nearly says that {name} "
-                f"equals itself; its free run has NR {output.nr:.3g} against {equation.nr:.3g} for the equation error. "
-                "Do not use these orders"
-            )
+            numbers = {"orders": listed, "alpha": alpha, "nr": output.nr, "equation_nr": equation.nr}
+            findings.append(finding("equation_says_identity", output=name, **numbers))
         elif worse and useless:
-            warnings.append(
-                f"{name}: the free run (NR {output.nr:.3g}) is far worse than the equation error ({equation.nr:.3g}); "
-                "the equation error flatters this model"
-            )
+            findings.append(finding("flattered_by_equation_error", output=name, nr=output.nr, equation_nr=equation.nr))
         elif useless:
-            warnings.append(f"{name}: the free run explains little of the output (NR {output.nr:.3g})")
-    return warnings
+            findings.append(finding("explains_little", output=name, nr=output.nr))
+    return findings
 
 
-def validation_warnings(own: Comparison, validation: Comparison) -> list[str]:
-    """Warn of validation runs that are estimation runs, and of outputs whose fit drops on the others."""
-    warnings = []
+def validation_findings(own: Comparison, validation: Comparison) -> list[Finding]:
+    """Return findings on validation runs that are estimation runs, and on outputs whose fit drops on the others."""
+    findings = []
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
             if all(np.array_equal(own.measured[o][k], validation.measured[o][j], equal_nan=True) for o in own.measured):
-                warnings.append(
-                    f"{other}: its outputs are those of {name}, which the model was identified from; "
-                    "it validates nothing"
-                )
-    return warnings + validation_fit_warnings({n: f.fit for n, f in own.output_error.items()}, validation)
+                findings.append(finding("validates_itself", run=other, other=name))
+    return findings + validation_fit_findings({n: f.fit for n, f in own.output_error.items()}, validation)
 
 
-def validation_fit_warnings(before: Mapping[str, float], validation: Comparison) -> list[str]:
-    """Warn of outputs whose fit on validation runs is far below that on the estimation data."""
-    warnings = []
+def validation_fit_findings(before: Mapping[str, float], validation: Comparison) -> list[Finding]:
+    """Return findings on outputs whose fit on validation runs is far below that on the estimation data."""
+    findings = []
     for other, _, figures in validation.per_run:
         for output, f in figures.items():
             # Negated so that a fit that is not a number counts as lost.
             if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - MAX_FIT_DROP_POINTS:
-                warnings.append(
-                    f"{other}: the fit of {output} falls from {before[output]:.3g} % on the estimation data to "
-                    f"{f.fit:.3g} %; the model describes the data it was identified from better than the machine"
-                )
-    return warnings
+                numbers = {"before": before[output], "after": f.fit, "where": ""}
+                findings.append(finding("fit_falls", run=other, output=output, **numbers))
+    return findings
 
 
 _METRIC_LABELS = ("error (45)", "RMSE", "NR", "fit %")

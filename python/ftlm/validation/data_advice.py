@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
+from ftlm.findings import Finding, finding, unique
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.linalg import minimum_norm_solution, orthonormal
@@ -68,26 +69,6 @@ MIN_INNOVATION_RATIO = 1e-4
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One finding about the data of a run.
-
-    Parameters
-    ----------
-    kind
-        ``excitation``, ``constant``, ``dead``, ``offset``, ``drift``, ``saturation``, ``spikes``, ``wrap``,
-        ``feedback``, ``short`` or ``twin``.
-    signal
-        Name of the signal; empty if the finding concerns the whole run.
-    sentence
-        Finding with numbers, and recommended action, as one sentence.
-    """
-
-    kind: str
-    signal: str
-    sentence: str
-
-
-@dataclass(frozen=True)
 class Advice:
     """Findings about the data of a run before estimation; empty if the checks find nothing.
 
@@ -96,16 +77,16 @@ class Advice:
     run
         Name of the run.
     findings
-        Findings, most severe kinds first.
+        Findings, most severe kinds first; see :class:`ftlm.Finding`.
     """
 
     run: str
     findings: tuple[Finding, ...]
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        """Distinct kinds of the findings."""
-        return tuple(dict.fromkeys(f.kind for f in self.findings))
+    def codes(self) -> tuple[str, ...]:
+        """Distinct codes of the findings."""
+        return tuple(dict.fromkeys(f.code for f in self.findings))
 
     def __iter__(self) -> Iterator[Finding]:
         return iter(self.findings)
@@ -113,9 +94,9 @@ class Advice:
     def __len__(self) -> int:
         return len(self.findings)
 
-    def to_dict(self) -> list[dict[str, str]]:
+    def to_dict(self) -> list[dict[str, Any]]:
         """For JSON."""
-        return [{"kind": f.kind, "signal": f.signal, "sentence": f.sentence} for f in self.findings]
+        return [f.to_dict() for f in self.findings]
 
     def __str__(self) -> str:
         if not self.findings:
@@ -184,25 +165,15 @@ def _true_intervals(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray
 def _duplicate_channels(run: Run, names: list[str]) -> Iterator[Finding]:
     for one, other in itertools.combinations(names, 2):
         if np.array_equal(run[one], run[other]):
-            yield Finding(
-                "twin", other, f"{one} and {other} hold the same number in every row: one of them is the wrong column"
-            )
+            role = {"input" if other in run.inputs else "output": other}
+            yield finding("twin", run=run.name, **role, other=one)
 
 
 def _constant(run: Run, name: str) -> Finding:
     level = _with_unit(run, name, float(run[name][0]))
     if name in run.inputs:
-        return Finding(
-            "constant",
-            name,
-            f"input {name} is {level} in all {run.length} rows: it excites nothing but one transient from the start; "
-            "record its command, or a run in which it moves",
-        )
-    return Finding(
-        "constant",
-        name,
-        f"output {name} is {level} in all {run.length} rows: a dead channel, or the wrong column; check the sensor",
-    )
+        return finding("constant_input", run=run.name, input=name, level=level, rows=run.length)
+    return finding("constant_output", run=run.name, output=name, level=level, rows=run.length)
 
 
 def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
@@ -232,12 +203,8 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
         if first < run.length // 20
         else "check the sensor, or cut it away"
     )
-    yield Finding(
-        "dead",
-        name,
-        f"output {name} is exactly {_with_unit(run, name, float(y[first]))} from {begin:.4g} s to {end:.4g} s "
-        f"({rows} rows) and changes from row to row elsewhere: a channel that was off or was being zeroed; {after}",
-    )
+    level = _with_unit(run, name, float(y[first]))
+    yield finding("channel_off", run=run.name, output=name, level=level, begin=begin, end=end, rows=rows, after=after)
 
 
 def _few_levels(x: Floats) -> bool:
@@ -268,10 +235,7 @@ def _saturation(run: Run, name: str) -> Iterator[Finding]:
     if name in run.inputs and _few_levels(y):
         return  # a signal of a few levels sits at its extremes by design
     noise, quantum = estimate_noise(y), _quantum(y)
-    if name in run.inputs:
-        role, remedy = "input", "harmless if this is what the machine received, else record the measured input"
-    else:
-        role, remedy = "output", "the true value is not known there: lower the amplitude or widen the range"
+    code, role = ("saturation_input", "input") if name in run.inputs else ("saturation", "output")
     for extreme, word in ((levels[0], "lowest"), (levels[-1], "highest")):
         starts, lengths = _true_intervals(y == extreme)
         long = lengths >= MIN_CLIPPED_SAMPLES
@@ -282,12 +246,9 @@ def _saturation(run: Run, name: str) -> Iterator[Finding]:
         else:
             clipped = int(np.sum(lengths[long]))
         if clipped >= max(MIN_CLIPPED_SAMPLES, CLIPPED_SHARE * y.size):
-            yield Finding(
-                "saturation",
-                name,
-                f"{role} {name} stays at its {word} value {_with_unit(run, name, float(extreme))} "
-                f"for {clipped} rows ({100 * clipped / y.size:.2g} %), cut off while moving: saturated; {remedy}",
-            )
+            level = _with_unit(run, name, float(extreme))
+            numbers = {"extreme": word, "level": level, "rows": clipped, "share": 100 * clipped / y.size}
+            yield finding(code, run=run.name, **{role: name}, **numbers)
 
 
 def _spikes(run: Run, name: str) -> Iterator[Finding]:
@@ -311,12 +272,16 @@ def _spikes(run: Run, name: str) -> Iterator[Finding]:
     if not rows.size or rows.size > MAX_SPIKE_SHARE * y.size:
         return
     worst = rows[int(np.argmax(height[rows - 1]))]
-    yield Finding(
+    yield finding(
         "spikes",
-        name,
-        f"output {name} has {rows.size} spike{'s' if rows.size > 1 else ''}, first at row {rows[0]} "
-        f"({rows[0] * run.step:.4g} s), the largest of {_with_unit(run, name, float(height[worst - 1]))} at row "
-        f"{worst}: single wrong samples; replace them by their neighbours' mean",
+        run=run.name,
+        output=name,
+        count=rows.size,
+        plural="s" if rows.size > 1 else "",
+        first=int(rows[0]),
+        time=float(rows[0]) * run.step,
+        height=_with_unit(run, name, float(height[worst - 1])),
+        worst=int(worst),
     )
 
 
@@ -339,12 +304,8 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
         return
     size = float(np.median(np.abs(steps[np.array(rows) - 1])))
     turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
-    yield Finding(
-        "wrap",
-        name,
-        f"output {name} jumps by {_with_unit(run, name, size)}{turn} {_times(len(rows))} while moving the other "
-        f"way, first at row {rows[0]}: an encoder that wraps; unwrap it (numpy.unwrap) before loading",
-    )
+    numbers = {"size": _with_unit(run, name, size), "turn": turn, "times": _times(len(rows)), "first": rows[0]}
+    yield finding("wrap", run=run.name, output=name, **numbers)
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
@@ -365,23 +326,12 @@ def _excitation(run: Run, inputs: list[str]) -> Iterator[Finding]:
         lines, at = spectral_lines(run[name])
         if lines < 2 and at > 2:
             omega = 2 * math.pi * at / (run.length * run.step)
-            yield Finding(
-                "excitation",
-                name,
-                f"input {name} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it fixes two "
-                "numbers of an equation and no more; add frequencies (square, PRBS, multisine, chirp), or use this "
-                "run for validation",
-            )
+            yield finding("one_sine", run=run.name, input=name, omega=omega)
     for i, name in enumerate(inputs):
         for other in inputs[:i]:
             r = float(np.corrcoef(run[name], run[other])[0, 1])
             if abs(r) > MAX_INPUT_CORRELATION:
-                yield Finding(
-                    "excitation",
-                    name,
-                    f"inputs {other} and {name} move together (correlation {r:.4f}): an equation that reads both "
-                    "cannot tell their effects apart; drive them one after the other, or by different signals",
-                )
+                yield finding("inputs_collinear", run=run.name, input=name, other=other, correlation=r)
 
 
 def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
@@ -406,24 +356,14 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
         free = len(item.order_names) + len(item.coefficient_names)
         if free > known:
             listed = ", ".join(inputs) or "no input"
-            yield Finding(
-                "excitation",
-                item.output,
-                f"the equation of {item.output} has {free} free numbers, but {listed} fixes {known} in steady "
-                "state: what the run tells beyond them comes from its start alone; add frequencies to the input, "
-                "or fix orders or coefficients",
+            yield finding(
+                "excitation_short", run=run.name, output=item.output, free=free, listed=listed, known=int(known)
             )
 
 
 def _insufficient_duration(run: Run, outputs: list[str]) -> Iterator[Finding]:
     if run.length < MIN_USEFUL_SAMPLES:
-        yield Finding(
-            "short",
-            "",
-            f"the run has {run.length} rows: too few for orders and coefficients; record at least "
-            f"{MIN_USEFUL_SAMPLES}, "
-            "better thousands",
-        )
+        yield finding("few_rows", run=run.name, rows=run.length, needed=MIN_USEFUL_SAMPLES)
         return
     for name in outputs:
         y = run[name]
@@ -434,22 +374,13 @@ def _insufficient_duration(run: Run, outputs: list[str]) -> Iterator[Finding]:
         crossings = int(np.sum(np.diff(sides) != 0))
         tail = y[-y.size // 5 :]
         if crossings <= 2 and np.ptp(tail) > 0.1 * np.ptp(y):
-            yield Finding(
-                "short",
-                name,
-                f"output {name} passes its mean {_times(crossings)} in {run.duration:.4g} s and is still moving "
-                "at the end: the run is shorter than what dominates it; record several times its slowest period",
-            )
+            yield finding("short", run=run.name, output=name, times=_times(crossings), duration=run.duration)
 
 
 def _offset(run: Run, name: str) -> Iterator[Finding]:
     if not is_rest(run[name]):
-        yield Finding(
-            "offset",
-            name,
-            f"output {name} starts at {_with_unit(run, name, float(run[name][0]))}, not at rest: initial terms will be "
-            "estimated; if this is only the sensor's zero, subtract it, and start the run before the input moves",
-        )
+        level = _with_unit(run, name, float(run[name][0]))
+        yield finding("starts_off_zero", run=run.name, output=name, level=level)
 
 
 def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
@@ -483,13 +414,8 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
         spread = math.sqrt(sum(float(np.sum(b)) ** 2 for b in blocks)) / float(t_left @ t_left)
         size = float(np.std(y))
         if abs(slope) > DRIFT_SHARE * size and abs(slope) > DRIFT_SIGMAS * spread:
-            yield Finding(
-                "drift",
-                name,
-                f"output {name} drifts by about {_with_unit(run, name, slope)} over the run "
-                f"({100 * abs(slope) / size:.0f} % of its deviation) beside what the inputs explain; let the "
-                "sensor settle, or subtract a line if it is known to be the sensor's",
-            )
+            numbers = {"slope": _with_unit(run, name, slope), "share": 100 * abs(slope) / size}
+            yield finding("drift", run=run.name, output=name, **numbers)
 
 
 def _lag_matrix(x: Floats, order: int) -> Floats:
@@ -529,18 +455,13 @@ def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterable[Findi
         parts = [np.sum(p) for p in np.array_split(a[:-k] * b[k:], FEEDBACK_SEGMENTS)]
         if len({np.sign(p) for p in parts}) > 1:
             continue
-        finding = Finding(
-            "feedback",
-            u_name,
-            f"input {u_name} answers what is new in output {y_name} {k} row{'s' if k > 1 else ''} later "
-            f"(correlation {r[k - 1]:.2g}): a closed loop, in which equation-error estimates are biased; use the "
-            "output error, and if you can a reference that moves the machine well",
-        )
-        pairs.append((abs(r[k - 1]), finding))
+        numbers = {"lag": k, "plural": "s" if k > 1 else "", "correlation": float(r[k - 1])}
+        item = finding("loop_in_data", run=run.name, input=u_name, output=y_name, **numbers)
+        pairs.append((abs(r[k - 1]), item))
     # Report one finding per input: the pair with the strongest correlation.
     strongest: dict[str, Finding] = {}
-    for _, finding in sorted(pairs, key=lambda pair: -pair[0]):
-        strongest.setdefault(finding.signal, finding)
+    for _, item in sorted(pairs, key=lambda pair: -pair[0]):
+        strongest.setdefault(item.input, item)
     return strongest.values()
 
 
@@ -604,8 +525,8 @@ class Inspection:
         Number of samples, step [s] and duration [s].
     signals
         Statistics of each signal, inputs first.
-    warnings
-        Warnings about the data, as sentences.
+    findings
+        Findings about the data.
     """
 
     run: str
@@ -613,11 +534,19 @@ class Inspection:
     step: float
     duration: float
     signals: list[SignalFigures]
-    warnings: list[str]
+    findings: tuple[Finding, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings, without the name of the run."""
+        return tuple(f.sentence for f in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return asdict(self)
+        parts = {n: getattr(self, n) for n in ("run", "rows", "step", "duration")}
+        signals = [asdict(s) for s in self.signals]
+        findings = [f.to_dict() for f in self.findings]
+        return {**parts, "signals": signals, "findings": findings, "warnings": list(self.warnings)}
 
     def __str__(self) -> str:
         width = max(len(name) for name in ("signal", *(s.name for s in self.signals))) + 2
@@ -647,13 +576,22 @@ def inspect_run(run: Run) -> Inspection:
         Prints as a table.
     """
     signals = [_figures(run, name) for name in run.signals]
-    warnings = list(run.warnings)
+    findings = data_notes(run)
     for s in signals:
         if s.constant:
-            warnings.append(f"{s.name} is constant ({s.first:g}): a dead channel, or nothing happened")
+            findings.append(finding("signal_constant", run=run.name, **{s.role: s.name}, level=s.first))
         elif s.role == "output" and not s.at_rest:
-            warnings.append(f"{s.name} does not start at rest (first value {s.first:.4g}): initial terms will be used")
-    return Inspection(run.name, run.length, run.step, run.duration, signals, list(dict.fromkeys(warnings)))
+            findings.append(finding("signal_in_motion", run=run.name, output=s.name, level=s.first))
+    return Inspection(run.name, run.length, run.step, run.duration, signals, unique(findings))
+
+
+def data_notes(run: Run) -> list[Finding]:
+    """Return how a run was read and processed as findings, and whether its rig stopped it."""
+    notes = [finding("data_note", run=run.name, text=text) for text in run.warnings]
+    faults = run.metadata.get("faults")
+    if not (isinstance(faults, list) and faults):
+        return notes
+    return [finding("rig_stopped", run=run.name, cause="; ".join(map(str, faults))), *notes]
 
 
 def _figures(run: Run, name: str) -> SignalFigures:

@@ -1,4 +1,4 @@
-"""Sims's test of feedback from an output to an input, by regression of residuals on past and future inputs."""
+"""Residual tests: whiteness, independence of the inputs, feedback."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import DataError, ModelError
+from ftlm.findings import Finding, finding, texts
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, symbol_html
-from ftlm.utils.linalg import blockwise_triangular_factor, dot, orthonormal, projections, triangular_factor
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
     NORMAL_99,
     SIGNIFICANCE_LEVEL,
     autocorrelations,
     autoregression,
-    chi_squared,
     chi_squared_99,
     is_constant,
     ljung_box,
@@ -37,186 +36,7 @@ from ftlm.utils.statistics import (
 )
 from ftlm.utils.validation import Floats, whole_number
 from ftlm.validation.comparison import finite, simulate_runs
-
-#: Horizons of future input samples. Fast feedback is diluted in a long horizon, so both are tested.
-FUTURE_HORIZONS_SAMPLES = (5, 25)
-#: Significance level: probability that a test reports feedback in an open loop.
-FEEDBACK_TEST_LEVEL = 0.01
-#: Number of single past samples among the regressors. Older samples are averaged over blocks that grow by this factor.
-DENSE_PAST_SAMPLES = 25
-BLOCK_GROWTH_FACTOR = 1.5
-#: Maximum number of samples in the regression.
-MAX_REGRESSION_SAMPLES = 50_000
-#: Relative norm of the residual of a column on the columns before it, below which it is collinear.
-COLLINEARITY_TOLERANCE = 1e-6
-
-
-@dataclass(frozen=True)
-class FeedbackTest:
-    """Test whether later inputs explain a part of a residual that earlier inputs do not.
-
-    Parameters
-    ----------
-    statistic, limit
-        Sum of squares explained by later inputs, in units of the residual's variance, and its 99 % quantile in an
-        open loop.
-    instant
-        Whether only the input of the same sample does: feedback without delay, or direct feedthrough.
-    conclusive
-        Whether there were enough samples and a varying input.
-    """
-
-    statistic: float
-    limit: float
-    instant: bool
-    conclusive: bool = True
-
-    @property
-    def has_feedback(self) -> bool:
-        """Whether the input depends on the output."""
-        return self.conclusive and self.statistic > self.limit
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        shown = {"statistic": finite(self.statistic), "limit": finite(self.limit)}
-        return {**shown, "has_feedback": self.has_feedback, "instant": self.instant, "conclusive": self.conclusive}
-
-
-def past_regressors(
-    signal: Floats, first: int, reach: int, *, dense: int = DENSE_PAST_SAMPLES, wider: float = BLOCK_GROWTH_FACTOR
-) -> list[Floats]:
-    """Return samples of a signal ``first`` to ``dense`` samples back, then means of growing blocks up to ``reach``.
-
-    Samples before the first one are taken as equal to it, so ``reach`` may be at most the length of the signal.
-    """
-    count = signal.size
-    padded = np.concatenate([np.full(count, signal[0]), signal])
-    moved = padded - signal[0]
-    sums = np.concatenate([[0.0], np.cumsum(moved)])
-    columns = [moved[count - lag : 2 * count - lag] for lag in range(first, min(dense, reach) + 1)]
-    start, width = dense + 1, max(2, dense // 4)
-    while start + width <= reach:
-        end = count - start + 1
-        columns.append((sums[end : end + count] - sums[end - width : end - width + count]) / width)
-        start, width = start + width, int(width * wider) + 1
-    return columns
-
-
-def feedback_test(
-    white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]], *, direct: bool
-) -> FeedbackTest:
-    """Regress residuals on past and future of an input: without feedback the future adds nothing (Sims, 1972).
-
-    An input designed in advance is independent of the noise, however wrong the model is. Unmodeled dynamics depend on
-    the past of the input, of which a long history is included.
-
-    Parameters
-    ----------
-    white
-        Residuals through the whitening filter, one array per run.
-    signal
-        The input, through the same filter.
-    others
-        Other inputs, whose past may explain the residuals. Their values of the same sample are excluded: with feedback
-        without delay in one of them, its own inputs would look like feedback.
-    direct
-        Whether the model has direct feedthrough from this input, so that its value of the same sample is no feedback.
-    """
-    table = FeedbackRegression.of(white, signal, others)
-    at_once = None if table is None else table.statistic(1 if direct else 0)
-    if table is None or at_once is None:
-        return FeedbackTest(0.0, np.inf, instant=False, conclusive=False)
-    later = at_once if direct else table.statistic(1)
-    if later is not None and later[0] > later[1]:
-        return FeedbackTest(*later, instant=False)
-    return FeedbackTest(*at_once, instant=at_once[0] > at_once[1])
-
-
-@dataclass(frozen=True)
-class FeedbackRegression:
-    """Residuals and their regressors after an orthogonal transformation to as many rows as columns.
-
-    The transformation preserves inner products, and with them every least-squares fit.
-
-    Parameters
-    ----------
-    past
-        Earlier samples of the input and of the other inputs, and a constant.
-    current_input
-        Input at the same sample, minus its first value in the run.
-    future
-        Input at the same sample and at later samples.
-    residuals
-        Residuals, the dependent variable.
-    rows
-        Number of samples before the transformation.
-    """
-
-    past: Floats
-    current_input: Floats
-    future: Floats
-    residuals: Floats
-    rows: int
-
-    @classmethod
-    def of(
-        cls, white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]]
-    ) -> FeedbackRegression | None:
-        """Build from residuals and inputs, one array per run; None if every run is too short."""
-        parts, rows, width = [], 0, 0
-        sizes = [e.size for e in white if e.size > DENSE_PAST_SAMPLES + FUTURE_HORIZONS_SAMPLES[-1]]
-        reach = min(sizes, default=0) // 2
-        for run, (every, driving) in enumerate(zip(white, signal, strict=True)):
-            e, u = every[: MAX_REGRESSION_SAMPLES - rows], driving[: MAX_REGRESSION_SAMPLES - rows]
-            inner = slice(DENSE_PAST_SAMPLES, e.size - FUTURE_HORIZONS_SAMPLES[-1])
-            if e.size <= max(DENSE_PAST_SAMPLES + FUTURE_HORIZONS_SAMPLES[-1], reach):
-                continue
-            now, *columns = past_regressors(u, 0, reach)
-            for other in others:
-                columns += past_regressors(other[run][: e.size], 1, reach, dense=10, wider=2.0)
-            columns += [np.ones(e.size), now]
-            width = len(columns) - 1
-            later = [
-                u[DENSE_PAST_SAMPLES + k : e.size - FUTURE_HORIZONS_SAMPLES[-1] + k]
-                for k in range(FUTURE_HORIZONS_SAMPLES[-1] + 1)
-            ]
-            parts.append([*(c[inner] for c in columns), *later, e[inner]])
-            rows += e.size
-            if rows >= MAX_REGRESSION_SAMPLES:
-                break
-        if not parts:
-            return None
-        turned = triangular_factor(np.concatenate([blockwise_triangular_factor(part) for part in parts]))
-        count = sum(part[-1].size for part in parts)
-        return cls(turned[:, :width], turned[:, width], turned[:, width + 1 : -1], turned[:, -1], count)
-
-    def statistic(self, first: int) -> tuple[float, float] | None:
-        """Statistic and limit of the inputs from ``first`` (0 or 1) samples ahead, at the more significant horizon."""
-        past = np.column_stack([self.past, self.current_input]) if first else self.past
-        future = self.future[:, first:]
-        if self.rows < 2 * (past.shape[1] + future.shape[1]):
-            return None
-        basis = orthonormal(past, COLLINEARITY_TOLERANCE)
-        left = self.residuals - basis @ projections(basis, self.residuals)
-        own = np.linalg.norm(future, axis=0)
-        future = future - basis @ (basis.T @ future)
-        future = future - basis @ (basis.T @ future)
-        new = np.linalg.norm(future, axis=0) > COLLINEARITY_TOLERANCE * np.where(own > 0, own, 1.0)
-        worst: tuple[float, float] | None = None
-        for horizon in FUTURE_HORIZONS_SAMPLES:
-            kept = future[:, : horizon + 1 - first][:, new[: horizon + 1 - first]]
-            if not kept.size:
-                continue
-            seen = orthonormal(kept, COLLINEARITY_TOLERANCE)
-            explained, total = float(np.sum((seen.T @ left) ** 2)), dot(left, left)
-            rest = (total - explained) / (self.rows - basis.shape[1] - seen.shape[1])
-            if not rest > 0:
-                continue
-            found = explained / rest, chi_squared(seen.shape[1], FEEDBACK_TEST_LEVEL / len(FUTURE_HORIZONS_SAMPLES))
-            if worst is None or found[0] / found[1] > worst[0] / worst[1]:
-                worst = found
-        return worst
-
+from ftlm.validation.feedback import FeedbackTest, feedback_test
 
 #: Difference below which two orders count as equal.
 ORDER_TOLERANCE = 1e-9
@@ -245,7 +65,7 @@ class CorrelationTest:
         Whether the test could fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant;
         then the test has neither passed nor failed.
     first
-        Smallest lag tested: 1 for an input with feedback within the sample, otherwise 0.
+        Smallest lag tested: 1 for an input that is correlated within the sample alone, otherwise 0.
     """
 
     lags: NDArray[np.int64]
@@ -308,8 +128,7 @@ class OutputResiduals:
     inputs
         Cross-correlations with each input, both signals through the whitening filter of the residuals.
     feedback_tests
-        By input of its equation, whether LATER inputs explain a part of a residual that earlier ones do not: a closed
-        loop, not a missing term.
+        By input of its equation, whether it answers what the output did before.
     """
 
     residuals: list[Floats]
@@ -436,7 +255,7 @@ class Residuals:
                 f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
                 f"   {test.verdict}"
             )
-        lines += describe_failed_tests(self)
+        lines += texts(failed_tests(self))
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -484,10 +303,9 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     chapter 11). The filter is causal, so an input that follows the residuals stays later than they are. The variance of
     one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), taken no smaller than for
     white residuals; the verdict is the largest correlation at lags >= 0 against the band that holds for all of them
-    together with 99 % (Šidák). Loops: residuals regressed on past and future of each input, both through the
-    same filter; an input that was made beforehand cannot know the noise, however wrong the model (Sims, Money, income,
-    and causality, American Economic Review 62, 1972, 540-552). Where an input answers within a sample, lag 0 is not
-    judged. A test with a limit above 1, or with a constant input, is inconclusive. Both tests use the
+    together with 99 % (Šidák). Where the model has no feedthrough and lag 0 alone is outside, the input answers within
+    a sample or feeds through, and the verdict is that of the other lags. Loops: see :class:`ftlm.FeedbackTest`.
+    A test with a limit above 1, or with a constant input, is inconclusive. Both tests use the
     simulation: white equation errors prove nothing.
     """
     check_model(model)
@@ -534,7 +352,7 @@ def run_residual_tests(model: Model, runs: Runs, free: Sequence[OutputSamples], 
         gaps = [np.isnan(y[1:-1]) for y in measured]
         direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
-        outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands)
+        outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
@@ -546,10 +364,11 @@ def _test_output(
     lags: int,
     deviation: float,
     commands: Mapping[str, bool],
+    run_inputs: Sequence[str],
 ) -> OutputResiduals:
     """Run all tests of one output without its missing samples; they fail if residuals are not finite.
 
-    ``commands`` maps each input of the runs to whether the model has direct feedthrough from it.
+    ``commands`` maps each input of its equation to whether the model has direct feedthrough from it.
     """
     everything = np.concatenate([e[~gone] for e, gone in zip(series, gaps, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -563,17 +382,19 @@ def _test_output(
     # Through this filter the residuals are white, and the inputs lose what they share with them by chance alone.
     colour = autoregression(series, lags)
     white = whiten_series(series, colour)
-    through = {n: whiten_series(v, colour) for n, v in signals.items() if not is_constant(v)}
+    moving = {n: signals[n] for n in run_inputs if not is_constant(signals[n])}
     loops = {
-        name: feedback_test(white, through[name], [v for n, v in through.items() if n != name], direct=direct)
-        for name, direct in commands.items()
-        if name in through
+        name: feedback_test(series, moving[name], [v for n, v in moving.items() if n != name])
+        for name in commands
+        if name in moving
     }
     inputs = {}
     for name, values in signals.items():
-        # What answers within the sample is no sign of what the model lacks.
-        at_once = name in loops and loops[name].has_feedback and not commands[name]
-        inputs[name] = _independence(white, values, colour, lags, first=int(at_once))
+        inputs[name] = _independence(white, values, colour, lags, first=0)
+        if inputs[name].failed and not commands.get(name, True):
+            # What answers within the sample is no sign of what the model lacks.
+            later = _independence(white, values, colour, lags, first=1)
+            inputs[name] = later if later.passed else inputs[name]
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
 
@@ -606,60 +427,50 @@ def _independence(
     return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
 
 
-def describe_failed_tests(tests: Residuals) -> list[str]:
-    """Describe every failed test, and detected feedback."""
-    words = []
+def failed_tests(tests: Residuals) -> list[Finding]:
+    """Return every failed test, and detected feedback, as findings."""
+    found = []
     for name, output in tests.outputs.items():
         if not math.isfinite(output.rms):
-            words.append(f"{name}: the free run leaves the range of numbers, so its residuals cannot be tested")
+            found.append(finding("out_of_range", output=name))
             continue
         white = output.whiteness
         if not white.passed:
-            words.append(
-                f"{name}: residuals are not white (Ljung-Box {white.statistic:.3g} over {white.lags[-1]} lags, 99 % "
-                f"limit {white.limit:.3g}): the model leaves something out"
-            )
+            numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
+            found.append(finding("output_not_white", output=name, **numbers))
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
-                why = f"its limit is {test.limit:.3g}: too few samples for residuals of this colour; give a longer run"
-                if math.isnan(test.limit):
-                    why = f"{signal} does not move; give a run in which it does"
-                words.append(f"{name}: whether residuals follow {signal} is undecided: {why}")
+                code = "follow_undecided_still" if math.isnan(test.limit) else "follow_undecided"
+                found.append(finding(code, output=name, input=signal, limit=test.limit))
             elif not test.passed:
-                words.append(
-                    f"{name}: residuals still follow {signal} (correlation {value:.2g} at lag {lag}, 99 % limit "
-                    f"{test.limit:.2g}): not all of what {signal} does is in the model"
-                )
-        words += [describe_feedback(name, signal, output) for signal in output.feedback]
-    return words
+                numbers = {"value": value, "lag": lag, "limit": test.limit}
+                found.append(finding("residuals_follow_input", output=name, input=signal, **numbers))
+            elif test.first:
+                at_once = test.values[test.lags == 0]
+                found.append(finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
+        found += [feedback_finding(name, signal, output) for signal in output.feedback]
+    return found
 
 
-def describe_feedback(name: str, signal: str, output: OutputResiduals) -> str:
-    """Describe feedback found in residuals and its consequence for the estimates."""
+def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding:
+    """Return feedback found in residuals, with its consequence for the estimates."""
     test = output.feedback_tests[signal]
-    how = f"{signal} answers what {name} did before" if not test.instant else f"{signal} answers {name} within a sample"
-    or_else = "" if not test.instant else f" (or {signal} feeds through to {name} directly: then add that term)"
-    found = f"{name}: {how} (statistic {test.statistic:.3g}, 99 % limit {test.limit:.3g}): a closed loop{or_else}"
-    if output.whiteness.passed:
-        return f"{found}; with white residuals output error has no bias from it, equation-error methods have"
-    return (
-        f"{found}, and residuals are not white: the noise that comes back with {signal} biases estimates, which their "
-        f"intervals do not know; record what drives the loop and name it with {parameter('reference')}, or open the "
-        "loop"
+    numbers = {"ratio": test.ratio, "share": 100 * test.share}
+    if test.bias is None:
+        # Without a joint fit the color decides: white noise does not come back into an output error.
+        code = "loop_harmless" if output.whiteness.passed else "loop_found"
+        effect = " little" if output.whiteness.passed else ""
+        return finding(code, output=name, input=signal, effect=effect, **numbers)
+    effect = f" by up to {test.bias:.2g} of their standard errors"
+    return finding(
+        "loop_found" if test.bias > 1 else "loop_harmless", output=name, input=signal, effect=effect, **numbers
     )
 
 
-def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RATIO) -> list[str]:
-    """Describe failed residual tests, except for outputs with a normalized residual of at most ``floor``.
-
-    Feedback is reported only if residuals are not white: only then does it bias the output-error estimate.
-    """
-    kept = {name: output for name, output in tests.outputs.items() if not output.nr <= floor}
-    harmless = {
-        n: replace(output, feedback_tests={}) if output.whiteness.passed else output for n, output in kept.items()
-    }
-    return describe_failed_tests(replace(tests, outputs=harmless))
+def residual_findings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RATIO) -> list[Finding]:
+    """Return failed residual tests, except for outputs with a normalized residual of at most ``floor``."""
+    return failed_tests(replace(tests, outputs={n: o for n, o in tests.outputs.items() if not o.nr <= floor}))
 
 
 def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:

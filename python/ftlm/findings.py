@@ -1,0 +1,903 @@
+"""Findings: records of what is said about data, fits and models, and the catalogue that renders their sentences."""
+
+from __future__ import annotations
+
+import math
+import string
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from ftlm.utils.parameters import choose_text, parameter
+
+#: Severity levels: the model must not be used, must be used with care, has a property worth knowing, or its data have a
+#: note on how they were read.
+LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT, LEVEL_NOTE = "do not use", "with care", "fact", "note"
+FINDING_LEVELS = (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT, LEVEL_NOTE)
+#: Maximum number of groups of findings in a summary.
+MAX_SUMMARY_FINDINGS = 3
+#: Codes of residuals that are not white.
+NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "response_not_white")
+#: Fields of the subject of a finding.
+SUBJECT_FIELDS = ("run", "output", "input", "parameter", "method")
+#: Role of findings on runs that a model was not identified from.
+VALIDATION_ROLE = "validation"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Topic of findings that share a remedy and stand together in a summary.
+
+    Parameters
+    ----------
+    what
+        Summary of such findings.
+    remedy
+        Template of the recommended action.
+    alternative, method
+        Template of an action that uses another method, and the method that it recommends. Left out of the remedy of a
+        finding on that method.
+    """
+
+    what: str
+    remedy: str = ""
+    alternative: str = ""
+    method: str = ""
+
+
+#: Topics by name, most serious first within a level.
+FINDING_TOPICS: dict[str, Topic] = {
+    "unstable": Topic(
+        "the free run grows without bound",
+        "leave out the term that pushes, bound its coefficient, or, in a closed loop, name what drives it with "
+        "{ask[reference]}",
+    ),
+    "range": Topic("the free run leaves the range of numbers", "take other orders, or fewer terms"),
+    "unseen": Topic(
+        "the runs do not tell some numbers apart", "leave a term out, fix one of them, or record a richer input"
+    ),
+    "identity": Topic(
+        "its equation nearly says that an output equals itself", "keep own orders well below the highest one"
+    ),
+    "useless": Topic(
+        "the free run explains little of an output",
+        "add what drives it, a delay or a term",
+        "or use {ask[method is output-error]}",
+        "output-error",
+    ),
+    "lost": Topic("it predicts other runs worse than its own", "fewer free numbers, or more runs in one fit"),
+    "offset": Topic("a constant is missing, or hidden", "{ask[offset is constant]} or {ask[offset is auto]}"),
+    "loop": Topic("the runs were made in a closed loop", "name what drives the loop with {ask[reference]}, or open it"),
+    "instrument": Topic("what drives the loop tells little of its input", "record a stronger reference"),
+    "untold": Topic("the runs do not tell a number at all", "fix it, leave it out, or record a richer input"),
+    "residuals": Topic("the model leaves something out", "add a term, a delay or a free order; ftlm select compares"),
+    "provisional": Topic("the fit is provisional", "give {ask[start]} another result, or fewer free numbers"),
+    "vague": Topic("the runs hardly tell some numbers", "fix a number, leave a term out, or record a richer input"),
+    "rough": Topic("some intervals are rough", "{ask[intervals is profile]} finds them"),
+    "step": Topic("the sampling is coarse for this model", "sample faster, raise m, or trust its fast poles less"),
+    "prior": Topic(
+        "the prior pulls its coefficients",
+        "raise {ask[prior_covariance]}, or use {ask[method is least-squares]}",
+    ),
+    "law": Topic("it breaks the law of its coefficients", "", "use {ask[method is output-error]}", "output-error"),
+    "edge": Topic("an order or a number is on its bound", "widen the bound"),
+    "history": Topic("what the run did before its start counts", "begin the run at rest"),
+    "samples": Topic("the samples harm the figures", "see the warning"),
+    "same": Topic("a validation run is one of its own", "give another run"),
+    "errors": Topic("nothing says how sure its numbers are", "", "use {ask[method is output-error]}", "output-error"),
+    "validation": Topic("how well it predicts other data is not known"),
+    "other": Topic("to know"),
+}
+#: Texts of Python and of the command line by name, for templates.
+INTERFACE_TEXTS = {
+    "validate": ("validate(run)", "--validation FILE"),
+    "validate response": ("validate(load_frequency(file))", "--validation FILE"),
+}
+#: Remedies that say no more than the finding itself.
+_PLAIN_REMEDY = "see the warning"
+
+
+@dataclass(frozen=True)
+class FindingKind:
+    """Entry of the catalogue: topic, level and templates of one code.
+
+    Parameters
+    ----------
+    topic
+        Name of its topic.
+    level
+        ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``.
+    template
+        Template of the sentence behind the prefix. A bar ends its first clause. ``{remedy}`` stands for
+        the remedy.
+    reason
+        Template of the reason in a verdict; empty for the topic and the first clause of the text.
+    remedy
+        Template of the remedy; empty for that of the topic.
+    prefix
+        Template of what the sentence begins with outside of a page of that run.
+    """
+
+    topic: str
+    level: str
+    template: str
+    reason: str = ""
+    remedy: str = ""
+    prefix: str = ""
+
+    @property
+    def states_remedy(self) -> bool:
+        """Whether the sentence itself states the remedy."""
+        return "remedy" in {name for _, name, _, _ in string.Formatter().parse(self.template)}
+
+
+def _rule(topic: str, level: str, text: str, remedy: str = "") -> FindingKind:
+    """Return an entry whose sentence is the reason of a verdict."""
+    return FindingKind(topic, level, text, text, remedy)
+
+
+_LEFT_OUT = "it leaves something out"
+#: The catalogue by code.
+FINDING_CATALOGUE: dict[str, FindingKind] = {
+    # Simulation
+    "free_run_grows": FindingKind(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "the model is {stability}: its free run grows without bound, however well it fits a run of this length",
+        "the free run grows without bound ({poles})",
+    ),
+    "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether its free run grows cannot be told"),
+    "unstable_optimum_kept": FindingKind(
+        "unstable",
+        LEVEL_WITH_CARE,
+        "the free run of this optimum grows; the best stable one found has residuals {excess:.2g} % larger, which the "
+        "runs refuse at 99 %: an unstable machine in a closed loop, or a term that is missing",
+    ),
+    "no_stable_optimum": FindingKind(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "no stable optimum was found beside this one, whose free run grows",
+    ),
+    "unstable_optimum_discarded": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the run did "
+        "before its start takes a growing mode away until its end; the stable one was kept",
+    ),
+    "damping_not_told": FindingKind(
+        "untold",
+        LEVEL_WITH_CARE,
+        "an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the run did "
+        "before its start takes a growing mode away until its end|; the stable one was kept, which stands where free "
+        "runs begin to grow: the runs do not tell its damping",
+    ),
+    "instruments_unstable": FindingKind(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "{output}: the free run of these coefficients is unstable|; do not trust them",
+    ),
+    "swing_may_not_decay": _rule(
+        "untold",
+        LEVEL_WITH_CARE,
+        "a swing of {frequency:.4g} rad/s may never die away (damping {damping:.2g}{spread})",
+        "add the term that damps it, or record until it has died away",
+    ),
+    "out_of_range": FindingKind(
+        "range",
+        LEVEL_DO_NOT_USE,
+        "{output}: the free run leaves the range of numbers, so its residuals cannot be tested",
+        "the free run leaves the range of numbers",
+    ),
+    "equation_says_identity": FindingKind(
+        "identity",
+        LEVEL_DO_NOT_USE,
+        "{output}: {orders} close to alpha = {alpha:g}, so the equation nearly says that {output} equals itself|; its "
+        "free run has NR {nr:.3g} against {equation_nr:.3g} for the equation error. Do not use these orders",
+        "its equation nearly says that an output equals itself",
+    ),
+    "flattered_by_equation_error": FindingKind(
+        "useless",
+        LEVEL_DO_NOT_USE,
+        "{output}: the free run| (NR {nr:.3g}) is far worse than the equation error ({equation_nr:.3g}); the equation "
+        "error flatters this model",
+    ),
+    "explains_little": FindingKind(
+        "useless", LEVEL_DO_NOT_USE, "{output}: the free run explains little of the output| (NR {nr:.3g})"
+    ),
+    "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the free run explains little of {where}{shown}"),
+    "fit_falls": FindingKind(
+        "lost",
+        LEVEL_WITH_CARE,
+        "the fit of {output} falls from {before:.3g} % on the estimation data to {after:.3g} %|; the model describes "
+        "the data it was identified from better than the machine",
+        "the fit of {output} falls from {before:.3g} to {after:.3g} % on validation{where}",
+        prefix="{run}: ",
+    ),
+    "sampling_coarse": FindingKind(
+        "step",
+        LEVEL_WITH_CARE,
+        "the free run on {run} still moves with the step at the finest grid: the model is stiffer than these samples "
+        "can show, and its output error is provisional",
+    ),
+    "scheme_unstable": FindingKind(
+        "step",
+        LEVEL_WITH_CARE,
+        "{output}: at {m} pulses the discretisation itself is unstable| (margin {margin:.2g}), whether or not the "
+        "model is; raise m",
+    ),
+    # Parameters
+    "not_told_apart": FindingKind(
+        "unseen",
+        LEVEL_DO_NOT_USE,
+        "these runs do not tell {parameter} apart: moved together they change nothing that was measured, so their "
+        "intervals are infinite; {remedy}",
+        "the runs do not tell {shown} apart",
+    ),
+    "errors_undefined": FindingKind(
+        "unseen",
+        LEVEL_DO_NOT_USE,
+        "the standard errors of {parameter} are not defined: the fit's covariance is not finite|; nothing is known of "
+        "how sure these numbers are",
+    ),
+    "numbers_correlated": FindingKind("vague", LEVEL_FACT, "{parameter} cannot be told apart in these runs| ({why})"),
+    "order_not_told": FindingKind(
+        "untold",
+        LEVEL_WITH_CARE,
+        "order {parameter} cannot be told from these runs: its standard error exceeds its bounds",
+    ),
+    "input_number_not_told": FindingKind(
+        "untold",
+        LEVEL_WITH_CARE,
+        "the {words} cannot be told from these runs: its standard error exceeds its bounds",
+    ),
+    "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
+    "genetic_on_bound": FindingKind(
+        "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
+    ),
+    "on_edge": FindingKind(
+        "edge", LEVEL_WITH_CARE, "order {parameter} = {value:g} is on the edge of its interval|; widen it"
+    ),
+    "not_different_from_0": FindingKind(
+        "vague",
+        LEVEL_FACT,
+        "coefficient {parameter} = {value:.4g} is not different from 0 in these runs| (standard error {error:.3g})",
+    ),
+    "interval_open": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "these runs do not bound {sides}: with all other numbers fitted anew the cost never rises by what noise "
+        "explains; {remedy}",
+        "the runs do not bound {parameter}",
+    ),
+    "number_vague": _rule("vague", LEVEL_WITH_CARE, "the runs hardly tell {shown}"),
+    "coefficient_law_broken": FindingKind(
+        "law",
+        LEVEL_WITH_CARE,
+        "coefficient law: {parameter} = {value:.4g}, but the other equation gives {wanted:.4g}|; the equation-error "
+        "estimators do not impose the law",
+    ),
+    "inertia_ratio_broken": FindingKind(
+        "law", LEVEL_WITH_CARE, "coefficient law: the inertia ratio {parameter} must exceed 1, but is {listed}"
+    ),
+    "prior_pulls": FindingKind(
+        "prior",
+        LEVEL_WITH_CARE,
+        "{output}: the prior| (K0 = {prior:g}, coefficients near 0) moves a coefficient by {share:.0f} % from what the "
+        "data alone say; p = {length} only weighs the data against it. Raise prior_covariance or use "
+        "{ask[method is least-squares]}",
+    ),
+    "no_standard_errors": _rule(
+        "errors",
+        LEVEL_WITH_CARE,
+        "{method} gives no standard errors, so nothing says how sure its numbers are",
+    ),
+    "intervals_rough": FindingKind(
+        "rough",
+        LEVEL_FACT,
+        "the cost is no parabola along {parameter}, and its profile there would take long: these intervals are rough|; "
+        "{remedy}",
+    ),
+    # Fit
+    "not_converged": FindingKind(
+        "provisional",
+        LEVEL_WITH_CARE,
+        "the fit ended before it stood still|; its figures are provisional",
+        "the fit ended before it stood still",
+    ),
+    "instruments_not_converged": FindingKind(
+        "provisional",
+        LEVEL_WITH_CARE,
+        "{output}: instrumental variables did not stand still in {iterations} steps|; the coefficients are those of "
+        "the least output error met. Too much noise for these terms: {remedy}",
+        remedy="use {ask[method is output-error]}",
+    ),
+    "lower_optimum_found": FindingKind(
+        "provisional",
+        LEVEL_WITH_CARE,
+        "none of {starts} starts led to this optimum, but the search for intervals did| (residuals {before} before, "
+        "{after} now): there may be others",
+    ),
+    "seeds_disagree": FindingKind(
+        "provisional",
+        LEVEL_WITH_CARE,
+        "{output}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}|; it has not found "
+        "the optimum of each",
+    ),
+    "step_moves_estimate": FindingKind(
+        "step",
+        LEVEL_WITH_CARE,
+        "at {pulses} pulses a sample the step still moves estimates by over a tenth of their standard errors: the "
+        "model is stiffer than the sampling|; sample faster or trust its fast poles less",
+    ),
+    "step_bias": FindingKind(
+        "step",
+        LEVEL_WITH_CARE,
+        "at {m} pulses the step alone moves coefficient {parameter} by {amount} standard errors, which do not count "
+        "it|; {finer}use {ask[method is output-error]}, which refines the step",
+    ),
+    # Residuals
+    "residuals_not_white": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "residuals of {output} are not white: the model leaves something out|; standard errors allow for the colour, "
+        "not for the bias of what is left out",
+        f"residuals of {{shown}} are not white: {_LEFT_OUT}",
+    ),
+    "output_not_white": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output}: residuals are not white| (Ljung-Box {statistic:.3g} over {lags} lags, 99 % limit {limit:.3g}): the "
+        "model leaves something out",
+    ),
+    "residuals_follow_input": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output}: residuals still follow {input}| (correlation {value:.2g} at lag {lag}, 99 % limit {limit:.2g}): not "
+        "all of what {input} does is in the model",
+        f"residuals of {{shown}}: {_LEFT_OUT}",
+    ),
+    "follow_undecided": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "{output}: whether residuals follow {input} is undecided: its limit is {limit:.3g}: too few samples for "
+        "residuals of this colour; give a longer run",
+    ),
+    "follow_undecided_still": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "{output}: whether residuals follow {input} is undecided: {input} does not move; give a run in which it does",
+    ),
+    "loop_found": FindingKind(
+        "loop",
+        LEVEL_WITH_CARE,
+        "{output}: {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
+        "noise: a closed loop, and the noise that comes back with {input} biases estimates{effect}, which their "
+        "intervals do not know; record what drives the loop and name it with {ask[reference]}, or open the loop",
+        "{input} answers {output}, a closed loop, and what comes back biases the numbers",
+    ),
+    "loop_harmless": FindingKind(
+        "loop",
+        LEVEL_FACT,
+        "{output}: {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
+        "noise: a closed loop, which moves estimates of output error{effect} alone; those of equation-error methods "
+        "are biased",
+    ),
+    "moves_within_row": FindingKind(
+        "loop",
+        LEVEL_FACT,
+        "{output}: residuals follow {input} of the same row alone (correlation {value:.2g}): {input} answers {output} "
+        "within a row, or feeds through to it directly: then add that term",
+    ),
+    "too_short_for_tests": _rule(
+        "residuals", LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run"
+    ),
+    "reference_weak": FindingKind(
+        "instrument",
+        LEVEL_WITH_CARE,
+        "{reference} says little of {input} beside the noise in it| (F = {f:.2g}, {needed:g} are needed): a weak "
+        "instrument, with which estimates are biased and their intervals too narrow; move the reference more, or "
+        "longer",
+    ),
+    # Offset and start
+    "offset_missing": FindingKind(
+        "offset",
+        LEVEL_WITH_CARE,
+        "an unknown constant in the equation of {output} explains {share:.2g} % of what the model misses| ({test}): a "
+        "sensor's zero, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
+    ),
+    "constant_instead_of_past": FindingKind(
+        "offset",
+        LEVEL_FACT,
+        "what {output} did before the runs is estimated with {terms} powers of time|; an unknown constant in the "
+        "equation explains as much with {fewer} numbers fewer: if a sensor's zero, a load or a mean may be there, "
+        "{ask[offset is auto]} estimates it",
+    ),
+    "offset_hidden": _rule(
+        "history",
+        LEVEL_WITH_CARE,
+        "the offset of {shown} is not told apart from what a run did before its start",
+    ),
+    "looked_like_rest": FindingKind(
+        "history",
+        LEVEL_FACT,
+        "{run}: the first values look like rest, but the residuals of a fit from rest ask for what was before|; "
+        "{ask[initial is history]} was used",
+    ),
+    "simulated_from_rest": FindingKind(
+        "history",
+        LEVEL_WITH_CARE,
+        "{run} starts at zero and is simulated from rest, but what that leaves over dies away like motion from before "
+        "the start|; give the model's structure {ask[initial is history]} to have that estimated",
+    ),
+    # Data
+    "outliers": FindingKind(
+        "samples",
+        LEVEL_FACT,
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one, {first}: {noun}, "
+        "or moments that the model does not explain|; squares let them cost precision: {ask[loss is huber]} weighs "
+        "them down",
+    ),
+    "outliers_dominate": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one and {holds} "
+        "{power:.0f} % of their squares, {first}: {noun}, or moments that the model does not explain|; squares let "
+        "them cost precision: {ask[loss is huber]} weighs them down",
+    ),
+    "quantised": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "{output} is quantised in steps of {step:.3g} in {run}, and its residuals are {noise:.3g}: rounding, which "
+        "repeats where the signal does and is no noise|; intervals do not allow for it; use a finer converter or scale",
+    ),
+    "times_not_honoured": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "{run}: outputs were read at times of their own, but a free delay, or signals taken behind a sensor filter, "
+        "need them on a grid: straight lines were drawn between them, and the intervals do not know what that costs",
+    ),
+    "friction_unsigned": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "the velocity of {output} never changes its sign in a run: while it slides, friction is a constant like the "
+        "offset, and only the rests tell them apart|; add a run that moves both ways, or use {ask[offset is none]}",
+    ),
+    "stribeck_slow_untold": FindingKind(
+        "untold",
+        LEVEL_WITH_CARE,
+        "{output} moves at less than {ratio:g} vs = {speed:.3g} per s in {slow} of {total} intervals: nothing tells "
+        "fs and vs, what is seen of friction is fc alone|; add a run that creeps, or leave the Stribeck term out",
+    ),
+    "stribeck_fast_untold": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "{output} never moves faster than vs = {speed:.3g} per s: what is seen of friction is fc and fs together|; add "
+        "a run that slides faster, or leave the Stribeck term out",
+    ),
+    "rig_stopped": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "the rig stopped the run before its end|: {cause}",
+        remedy="record it again without the fault",
+        prefix="run {run}: ",
+    ),
+    "data_note": FindingKind("other", LEVEL_NOTE, "{text}", prefix="run {run}: "),
+    # Advice on a run
+    "twin": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "{other} and {signal} hold the same number in every row: one of them is the wrong column",
+    ),
+    "constant_input": FindingKind(
+        "samples",
+        LEVEL_FACT,
+        "input {input} is {level} in all {rows} rows: it excites nothing but one transient from the start; record its "
+        "command, or a run in which it moves",
+    ),
+    "constant_output": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "output {output} is {level} in all {rows} rows: a dead channel, or the wrong column; check the sensor",
+    ),
+    "channel_off": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "output {output} is exactly {level} from {begin:.4g} s to {end:.4g} s ({rows} rows) and changes from row to "
+        "row elsewhere: a channel that was off or was being zeroed|; {after}",
+        prefix="run {run}: ",
+    ),
+    "saturation": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "output {output} stays at its {extreme} value {level} for {rows} rows ({share:.2g} %), cut off while moving: "
+        "saturated; the true value is not known there: lower the amplitude or widen the range",
+    ),
+    "saturation_input": FindingKind(
+        "samples",
+        LEVEL_FACT,
+        "input {input} stays at its {extreme} value {level} for {rows} rows ({share:.2g} %), cut off while moving: "
+        "saturated; harmless if this is what the machine received, else record the measured input",
+    ),
+    "spikes": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "output {output} has {count} spike{plural}, first at row {first} ({time:.4g} s), the largest of {height} at "
+        "row {worst}: single wrong samples; replace them by their neighbours' mean",
+    ),
+    "wrap": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "output {output} jumps by {size}{turn} {times} while moving the other way, first at row {first}: an encoder "
+        "that wraps; unwrap it (numpy.unwrap) before loading",
+    ),
+    "one_sine": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "input {input} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it fixes two numbers of "
+        "an equation and no more; add frequencies (square, PRBS, multisine, chirp), or use this run for validation",
+    ),
+    "inputs_collinear": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "inputs {other} and {input} move together (correlation {correlation:.4f}): an equation that reads both cannot "
+        "tell their effects apart; drive them one after the other, or by different signals",
+    ),
+    "excitation_short": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "the equation of {output} has {free} free numbers, but {listed} fixes {known} in steady state: what the run "
+        "tells beyond them comes from its start alone|; add frequencies to the input, or fix orders or coefficients",
+    ),
+    "few_rows": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "the run has {rows} rows: too few for orders and coefficients; record at least {needed}, better thousands",
+    ),
+    "short": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "output {output} passes its mean {times} in {duration:.4g} s and is still moving at the end: the run is "
+        "shorter than what dominates it; record several times its slowest period",
+    ),
+    "loop_in_data": FindingKind(
+        "loop",
+        LEVEL_FACT,
+        "input {input} answers what is new in output {output} {lag} row{plural} later (correlation {correlation:.2g}): "
+        "a closed loop, in which equation-error estimates are biased; use the output error, and if you can a reference "
+        "that moves the machine well",
+    ),
+    "drift": FindingKind(
+        "samples",
+        LEVEL_WITH_CARE,
+        "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation) beside what the inputs "
+        "explain; let the sensor settle, or subtract a line if it is known to be the sensor's",
+    ),
+    "starts_off_zero": FindingKind(
+        "history",
+        LEVEL_FACT,
+        "output {output} starts at {level}, not at rest: initial terms will be estimated; if this is only the sensor's "
+        "zero, subtract it, and start the run before the input moves",
+    ),
+    "signal_constant": FindingKind(
+        "samples", LEVEL_FACT, "{signal} is constant ({level:g}): a dead channel, or nothing happened"
+    ),
+    "signal_in_motion": FindingKind(
+        "history",
+        LEVEL_FACT,
+        "{output} does not start at rest (first value {level:.4g}): initial terms will be used",
+    ),
+    # Validation
+    "validates_itself": FindingKind(
+        "same",
+        LEVEL_FACT,
+        "its outputs are those of {other}, which the model was identified from; it validates nothing",
+        prefix="{run}: ",
+    ),
+    "run_of_its_own": FindingKind(
+        "same",
+        LEVEL_FACT,
+        "it has the name of a run that the model was identified from",
+        prefix="{run}: ",
+    ),
+    "not_validated": _rule(
+        "validation",
+        LEVEL_WITH_CARE,
+        "no run that it was not fitted to has been tried",
+        "{choose[validate]}",
+    ),
+    "origin_unknown": _rule(
+        "validation",
+        LEVEL_WITH_CARE,
+        "its file says nothing of how it was identified",
+        "compare it with measured runs",
+    ),
+    "sentences_alone": _rule(
+        "validation",
+        LEVEL_WITH_CARE,
+        "its file is of an earlier version, whose warnings are sentences that are not judged",
+        "identify it again",
+    ),
+    "earlier_sentence": FindingKind("other", LEVEL_NOTE, "{text}"),
+    # Frequency responses
+    "response_missed": _rule(
+        "useless",
+        LEVEL_DO_NOT_USE,
+        "it misses {rms:.3g} % of {output} from {input} ({run})",
+        "add a term, a delay or a free order",
+    ),
+    "response_grows": _rule(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "its free run grows without bound ({poles})",
+        "measure a wider band, bound the coefficient that pushes, or take fewer terms",
+    ),
+    "response_lost": _rule(
+        "lost",
+        LEVEL_WITH_CARE,
+        "it misses {own:.3g} % of its own data and {rms:.3g} % of {run}",
+        "fewer free numbers, or both records in one fit",
+    ),
+    "response_not_validated": _rule(
+        "validation",
+        LEVEL_WITH_CARE,
+        "no response that it was not fitted to has been tried",
+        "{choose[validate response]}",
+    ),
+    "deviations_exceeded": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "residuals are {ratio:.3g} times the standard deviations that the data state (99 %): the model leaves "
+        "something out, or they are too small|; intervals are widened to what is left over",
+        "residuals are {ratio:.3g} times the standard deviations that the data state (99 %): the model leaves "
+        "something out, or they are too small",
+    ),
+    "response_not_white": _rule(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "residuals are not white: from one frequency to the next they follow each other, so the model leaves something "
+        "out",
+    ),
+    "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit ended before it stood still"),
+    "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "an order or a delay is on its bound: {bound}"),
+    "response_not_told_apart": FindingKind(
+        "unseen",
+        LEVEL_DO_NOT_USE,
+        "moved together they change nothing: {parameter}; leave a term out, or fix one of them",
+        "moved together they change nothing: {parameter}",
+    ),
+    "response_number_vague": FindingKind(
+        "vague",
+        LEVEL_WITH_CARE,
+        "{parameter} = {value:.4g} ± {error:.2g} cannot be told from other values; fix it, or leave it out",
+        "{parameter} = {value:.4g} ± {error:.2g} cannot be told from other values",
+    ),
+    # Selection, consistency, design
+    "other_optimum": FindingKind(
+        "provisional",
+        LEVEL_WITH_CARE,
+        "from automatic starts the chosen structure fits {output} better than where it was judged: another optimum; "
+        ".best is that one",
+    ),
+    "none_is_the_machine": FindingKind(
+        "useless",
+        LEVEL_DO_NOT_USE,
+        "the best candidate predicts unseen runs with {fit} %: none of them is the machine",
+    ),
+    "worse_than_mean": FindingKind(
+        "lost",
+        LEVEL_WITH_CARE,
+        "the chosen structure predicts worse than the mean of what was left out on {parts}",
+    ),
+    "not_told_by_part": FindingKind(
+        "untold", LEVEL_FACT, "{parameter}: not told by some part, so any other agrees with it"
+    ),
+    "part_not_converged": FindingKind(
+        "provisional", LEVEL_WITH_CARE, "the fit ended before it stood still", prefix="{run}: "
+    ),
+    "parts_not_white": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "residuals are not white: the structure leaves something out, which parts that are excited in other ways may "
+        "answer with other numbers; then it is the structure and not the machine that changes",
+    ),
+    "designed_for_white_noise": FindingKind(
+        "residuals", LEVEL_FACT, "predicted for white noise, and of the model it is said: {text}"
+    ),
+}
+
+
+class _Reference:
+    """References to parameters in templates: ``{ask[offset]}``, ``{ask[offset is none]}``."""
+
+    def __getitem__(self, key: str) -> str:
+        name, _, value = key.partition(" is ")
+        return parameter(name, value or None)
+
+
+class _Choice:
+    """Texts of the interface in use in templates: ``{choose[validate]}``."""
+
+    def __getitem__(self, key: str) -> str:
+        return choose_text(*INTERFACE_TEXTS[key])
+
+
+class _Sentence(string.Formatter):
+    """Formatter of templates. A number that a file keeps as text, such as inf, is shown as it is."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        return value if isinstance(value, str) else str(format(value, format_spec))
+
+
+class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Record of one finding about data, a fit or a model.
+
+    Parameters
+    ----------
+    code
+        Code in the catalogue.
+    run, output, input, parameter, method
+        What it is about, where it applies; several names are joined by commas.
+    role
+        ``"validation"`` for a run that the model was not identified from.
+    numbers
+        Figures and words of its sentence, by name.
+    written
+        Sentence as the file of a model keeps it, for versions that do not know the code.
+    """
+
+    code: str
+    run: str = ""
+    output: str = ""
+    input: str = ""
+    parameter: str = ""
+    method: str = ""
+    role: str = ""
+    numbers: dict[str, float | int | str] = {}
+    written: str = ""
+
+    @property
+    def kind(self) -> FindingKind:
+        """Entry in the catalogue. A code that this version does not know is to be read with care."""
+        return FINDING_CATALOGUE.get(self.code) or FindingKind("other", LEVEL_WITH_CARE, "{written}", "{written}")
+
+    @property
+    def topic(self) -> Topic:
+        """Topic in the catalogue."""
+        return FINDING_TOPICS[self.kind.topic]
+
+    @property
+    def level(self) -> str:
+        """``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``."""
+        return self.kind.level
+
+    @property
+    def signal(self) -> str:
+        """Output or input that it is about; empty if it concerns the whole run."""
+        return self.output or self.input
+
+    @property
+    def sentence(self) -> str:
+        """Sentence without the name of the run."""
+        return self._render(self.kind.template.replace("|", ""))
+
+    @property
+    def text(self) -> str:
+        """Sentence with the name of the run, where it is about one."""
+        prefix = "validation run {run}: " if self.role == VALIDATION_ROLE else self.kind.prefix if self.run else ""
+        return self._render(prefix) + self.sentence
+
+    @property
+    def reason(self) -> str:
+        """Sentence in a verdict."""
+        kind = self.kind
+        return self._render(kind.reason or f"{self.topic.what}: {kind.template.partition('|')[0]}")
+
+    @property
+    def remedy(self) -> str:
+        """Remedy for the method that was used; empty if there is none beyond the sentence."""
+        if self.kind.remedy:
+            return self._render(self.kind.remedy)
+        topic = self.topic
+        if not topic.alternative or self.method == topic.method:
+            return self._render(topic.remedy)
+        return self._render("; ".join(part for part in (topic.remedy, topic.alternative) if part))
+
+    def _render(self, template: str) -> str:
+        words: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "written", "signal")}
+        words |= {**self.numbers, "ask": _Reference(), "choose": _Choice()}
+        try:
+            if "{remedy}" in template:
+                words["remedy"] = self.remedy
+            return _Sentence().vformat(template, (), words)
+        except (KeyError, ValueError, TypeError):
+            # A file may lack a number of its sentence.
+            return self.written or self.code
+
+    def to_file(self) -> Finding:
+        """Return the record for a file: with its sentence, and numbers that are not finite as text."""
+        numbers = {n: _storable(v) for n, v in self.numbers.items()}
+        return msgspec.structs.replace(self, numbers=numbers, written=self.text)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as a dictionary for JSON."""
+        subject = {n: v for n in (*SUBJECT_FIELDS, "role") if (v := getattr(self, n))}
+        numbers = {n: _storable(v) for n, v in self.numbers.items()}
+        head = {"code": self.code, "level": self.level}
+        return {**head, **subject, "numbers": numbers, "text": self.text, "remedy": self.remedy}
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def _storable(value: float | str) -> float | int | str:
+    """Return a value for JSON; a number that is not finite as text."""
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else str(float(value))
+    return value if isinstance(value, str) else int(value)
+
+
+def finding(code: str, **words: Any) -> Finding:
+    """Return a finding of the catalogue with its subject and numbers, by name."""
+    subject = {n: words.pop(n) for n in SUBJECT_FIELDS if n in words}
+    return Finding(code, **subject, numbers=words)
+
+
+def texts(findings: Iterable[Finding]) -> tuple[str, ...]:
+    """Return the sentences of findings."""
+    return tuple(f.text for f in findings)
+
+
+def unique(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings without repetitions."""
+    kept: list[Finding] = []
+    for item in findings:
+        if item not in kept:
+            kept.append(item)
+    return tuple(kept)
+
+
+@dataclass(frozen=True)
+class FindingGroup:
+    """Findings of one topic and level.
+
+    Parameters
+    ----------
+    findings
+        The findings, at least one.
+    """
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def first(self) -> Finding:
+        """First finding."""
+        return self.findings[0]
+
+    @property
+    def count(self) -> str:
+        """Number of findings beyond the first, as text; empty for a single finding."""
+        more = len(self.findings) - 1
+        return f" (and {more} more alike)" if more else ""
+
+    @property
+    def remedy(self) -> str:
+        """Remedy; empty if the sentence states it."""
+        return "" if self.first.kind.states_remedy or self.first.topic.remedy == _PLAIN_REMEDY else self.first.remedy
+
+
+def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
+    """Group findings by topic, most serious first; one of no topic is a group of its own."""
+    order = list(FINDING_TOPICS)
+    by: dict[tuple[int, int, int], list[Finding]] = {}
+    for place, item in enumerate(unique(findings)):
+        alone = place if item.kind.topic == "other" else 0
+        by.setdefault((FINDING_LEVELS.index(item.level), order.index(item.kind.topic), alone), []).append(item)
+    return tuple(FindingGroup(tuple(by[key])) for key in sorted(by))
+
+
+def hidden_findings_text(found: Sequence[FindingGroup]) -> str:
+    """Text on the number of findings that a summary omits; empty if it omits none."""
+    count = sum(len(g.findings) for g in found) - len(found[:MAX_SUMMARY_FINDINGS])
+    return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

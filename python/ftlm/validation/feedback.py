@@ -1,0 +1,473 @@
+"""Feedback test: whether an input answers what an output did before, by Granger's direction of causality."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from ftlm import _core
+from ftlm.utils.linalg import minimum_norm_solution
+from ftlm.utils.statistics import chi_squared, robust_deviation
+from ftlm.utils.validation import Floats
+
+FeedbackState = Literal["command", "none", "found", "cannot be told"]
+#: Significance level over all sets of regressors, and their numbers of past innovations of the output.
+FEEDBACK_LEVEL = 0.005
+INNOVATION_COUNTS = (3, 12)
+#: Shortest run, and most rows that are tested.
+MIN_FEEDBACK_ROWS, MAX_FEEDBACK_ROWS = 150, 8_000
+#: Most lags of the input's own past, of other inputs and of the output, each also limited by a share of the run.
+MAX_INPUT_LAGS, MAX_OTHER_LAGS, MAX_OUTPUT_LAGS = 60, 20, 40
+#: An input of so few levels, or of so few levels a row, has no innovation that a linear past leaves.
+MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE = 6, 0.01
+#: Fewest changes of an input that is held between them.
+MIN_CHANGES = 80
+#: One-step prediction error of an input, relative to its deviation, below which its past determines it.
+PREDICTED_SHARE = 3e-4
+#: Innovations of an output below this share of its deviation are rounding.
+QUIET_SHARE = 1e-6
+#: Clip levels of innovations in standard deviations: of the input, of the output, of the residuals themselves.
+INPUT_CLIP, OUTPUT_CLIP, RESIDUAL_CLIP = 3.0, 5.0, 12.0
+#: Threshold and iterations of the robust prediction of the input.
+ROBUST_SIGMAS, ROBUST_ITERATIONS = 2.0, 4
+#: Share of an innovation that outputs explain, prediction error and ratio from which no coincidence explains as much.
+CERTAIN_SHARE, ROUGH_SHARE, CERTAIN_RATIO = 0.5, 2e-3, 5.0
+#: Smallest rows x share x (prediction error)^2 that could move an estimate by a part of its standard error.
+MIN_FEEDBACK_POWER = 0.01
+#: Shares of the largest noise in the measured input that are tried, and how far shifts in time are taken as placebos.
+INPUT_NOISE_SHARES = (0.2, 0.4, 0.6, 0.75, 0.87, 0.94)
+PLACEBO_COUNT, PLACEBO_RATIO = 19, 1.2
+#: The same where what is new in the input is no innovation everywhere: outputs far back measure what that does.
+PLACEBO_RATIO_IN_DOUBT = 10.0
+#: Parts of the run over which the agreement must be steady, and the least share of the median one.
+STEADY_PARTS, STEADY_SHARE = 8, 0.05
+#: Rows of the short blocks whose color and past are tested.
+LOCAL_ROWS = 50
+#: Spectral lines: most of an input, and how far they stand above their neighborhood.
+MAX_LINES, LINE_RATIO, LINE_NEIGHBORS = 16, 40.0, 400
+#: Forgetting of the slow part of the residuals, as an integral action reads it, and the rows of its memory.
+SLOW_FORGETTING, SLOW_MEMORY_ROWS = 0.1, 100
+RIDGE_SHARE = 1e-10
+
+
+@dataclass(frozen=True)
+class FeedbackTest:
+    """Test whether an input answers what an output did before.
+
+    Parameters
+    ----------
+    state
+        ``"command"``: the input was made beforehand, or its own past determines it. ``"none"``: nothing comes back.
+        ``"found"``: past outputs determine what is new in the input. An input that was read with noise looks alike.
+        ``"cannot be told"``: the reason is in ``reason``.
+    reason
+        Reason in words; empty if there is none.
+    ratio
+        Statistic over its limit in an open loop (99.5 % over all sets of regressors).
+    share
+        Share of the variance of the input's innovation that past outputs explain.
+    rows
+        Rows that were tested.
+    bias
+        Largest bias that the answer can make of a parameter, in its standard errors; None if it is not known.
+    response
+        Part of the input that answers the residuals, one array per run in the unit of the input; empty unless found.
+    """
+
+    state: FeedbackState
+    reason: str = ""
+    ratio: float = 0.0
+    share: float = 0.0
+    rows: int = 0
+    bias: float | None = None
+    response: tuple[Floats, ...] = field(default=(), repr=False, compare=False)
+
+    @property
+    def has_feedback(self) -> bool:
+        """Whether the input answers the output."""
+        return self.state == "found"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        figures = {"ratio": self.ratio, "share": self.share, "rows": self.rows, "bias": self.bias}
+        return {"state": self.state, "reason": self.reason, "has_feedback": self.has_feedback, **figures}
+
+
+def feedback_test(
+    residuals: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]] = ()
+) -> FeedbackTest:
+    """Test whether an input answers past outputs (Granger, doi:10.2307/1912791).
+
+    The innovation of the input is what its own past and the other inputs leave of it. If the input was made beforehand,
+    this innovation is independent of all that the output did before, whatever the model lacks. A score test that
+    normalizes itself (White, doi:10.2307/1912934) asks whether past residuals, their difference, their slow part and
+    past innovations of the output predict it. The present residual is not used, because an answer within a row and a
+    direct feedthrough have the same distribution.
+
+    Parameters
+    ----------
+    residuals
+        Residuals of the output, or the output itself, one array per run; NaN marks a missing sample.
+    signal
+        The input.
+    others
+        Other inputs, whose past and present may explain the input.
+    """
+    runs = [k for k, u in enumerate(signal) if u.size >= MIN_FEEDBACK_ROWS]
+    longest = sum(signal[k].size for k in runs)
+    if not runs:
+        least = max((u.size for u in signal), default=0)
+        return FeedbackTest("cannot be told", f"runs of {least} rows; {MIN_FEEDBACK_ROWS} are needed")
+    inputs = [signal[k] for k in runs]
+    if all(np.ptp(u) == 0 for u in inputs):
+        return FeedbackTest("cannot be told", "the input does not move")
+    changes = [np.flatnonzero(np.diff(u)) + 1 for u in inputs]
+    levels = np.unique(np.concatenate(inputs)).size
+    if all(_repeats(u) for u in inputs):
+        return FeedbackTest("command", "it repeats itself exactly", rows=longest)
+    if levels <= max(MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE * longest):
+        if _has_clock(changes):
+            return FeedbackTest("command", f"{levels} levels on a clock", rows=longest)
+        return FeedbackTest("cannot be told", f"{levels} levels: a relay switches as a command does", rows=longest)
+    count = sum(c.size for c in changes)
+    dense = 2 * count >= longest
+    if not dense and count < MIN_CHANGES:
+        return FeedbackTest("cannot be told", f"{count} changes; {MIN_CHANGES} are needed", rows=longest)
+    if not dense:
+        # Between its changes a held input has no innovation. The residual before a change is known at the change.
+        kept = [k for k, c in enumerate(changes) if c.size >= MIN_CHANGES // 2]
+        if not kept:
+            return FeedbackTest("cannot be told", f"{count} changes over {len(runs)} short runs", rows=longest)
+        runs, inputs, changes = [runs[k] for k in kept], [inputs[k] for k in kept], [changes[k] for k in kept]
+        missed = [_filled(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
+        moves = [u[c] for u, c in zip(inputs, changes, strict=True)]
+        beside = [[other[k][c] for k, c in zip(runs, changes, strict=True)] for other in others]
+    else:
+        missed, moves = [_filled(residuals[k]) for k in runs], inputs
+        beside = [[other[k] for k in runs] for other in others]
+    room = MAX_FEEDBACK_ROWS
+    taken = []
+    for u in moves:
+        taken.append(min(u.size, room))
+        room -= taken[-1]
+    used = [k for k, rows in enumerate(taken) if rows >= (MIN_FEEDBACK_ROWS if dense else MIN_CHANGES // 2)]
+    test = _Innovations(
+        [missed[k][: taken[k]] for k in used],
+        [moves[k][: taken[k]] for k in used],
+        [[other[k][: taken[k]] for k in used] for other in beside],
+        shift=int(dense),
+    ).test()
+    if not test.has_feedback:
+        return test
+    responses: list[Floats] = [np.zeros(u.size) for u in signal]
+    for k, response in zip(used, test.response, strict=True):
+        there, size = responses[runs[k]], inputs[k].size
+        if dense:
+            there[: response.size] = response
+        else:
+            ends = [*changes[k][1 : response.size], size][: response.size]
+            for_rows = np.diff([changes[k][0], *ends])
+            held = np.repeat(response, for_rows)
+            there[changes[k][0] : changes[k][0] + held.size] = held
+    return replace(test, response=tuple(responses))
+
+
+def _filled(residuals: Floats) -> Floats:
+    """Residuals with their mean at missing samples, which costs power alone."""
+    gone = np.isnan(residuals)
+    return np.where(gone, np.mean(residuals[~gone]), residuals) if gone.any() and not gone.all() else residuals
+
+
+def _has_clock(changes: Sequence[NDArray[np.intp]]) -> bool:
+    """Whether changes fall on a grid of at least two rows, as those of a generated signal do."""
+    gaps = np.concatenate([np.diff(c) for c in changes])
+    return bool(gaps.size >= MAX_COMMAND_LEVELS and np.gcd.reduce(gaps) > 1)
+
+
+def _repeats(u: Floats) -> bool:
+    """Whether an input repeats itself exactly after at most half of the run."""
+    x = u - u.mean()
+    count = x.size
+    power = np.abs(np.fft.rfft(x, 2 * count)) ** 2
+    correlation = np.fft.irfft(power)[:count] / np.arange(count, 0, -1)
+    first = 8
+    periods = np.argsort(-correlation[first : count // 2 + 1])[:3] + first
+    return any(np.max(np.abs(u[p:] - u[:-p])) <= 1e-6 * np.ptp(u) for p in periods.tolist())
+
+
+def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
+    """Columns of values ``first`` to ``last`` rows back, for rows from ``start`` on."""
+    windows = sliding_window_view(x, last - first + 1)
+    return windows[start - last : x.size - last][:, ::-1]
+
+
+def _line_columns(u: Floats) -> list[Floats]:
+    """Cosines and sines of the spectral lines of an input, whose memory exceeds any number of lags."""
+    count = u.size
+    size = 1 << math.ceil(math.log2(8 * count))
+    window, time, x = np.hanning(count), np.arange(count), u - u.mean()
+    columns: list[Floats] = []
+    for _ in range(min(MAX_LINES, count // 60)):
+        power = np.abs(np.fft.rfft(x * window, size)) ** 2
+        power[:16] = 0
+        at = int(np.argmax(power))
+        near = power[max(0, at - LINE_NEIGHBORS) : at + LINE_NEIGHBORS + 1]
+        if power[at] <= 0 or power[at] < LINE_RATIO * np.median(near):
+            break
+        place = float(at)
+        if 0 < at < power.size - 1:
+            low, middle, high = np.log(power[at - 1 : at + 2] + 1e-300).tolist()
+            bend = low - 2 * middle + high
+            place += 0.5 * (low - high) / bend if bend else 0.0
+        omega = 2 * math.pi * place / size
+        columns += [np.cos(omega * time), np.sin(omega * time)]
+        basis = np.column_stack([np.ones(count), *columns])
+        x = _project_out(basis, u)
+    return columns
+
+
+def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
+    """Targets less their weighted projection onto the past, by its Gram matrix with a small ridge, refined once."""
+    weighted = past if weights is None else past * weights[:, None]
+    gram = weighted.T @ past
+    gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
+    factor = np.linalg.cholesky(gram)
+    for _ in range(2):
+        targets = targets - past @ np.linalg.solve(factor.T, np.linalg.solve(factor, weighted.T @ targets))
+    return targets
+
+
+def _score_ratio(innovation: Floats, columns: Floats) -> float:
+    """Self-normalized score statistic over its limit."""
+    score = columns.T @ innovation
+    products = columns * innovation[:, None]
+    spread = products.T @ products
+    spread[np.diag_indices_from(spread)] += 1e-9 * np.trace(spread) / len(spread)
+    limit = chi_squared(columns.shape[1], FEEDBACK_LEVEL / (2 + len(INNOVATION_COUNTS)))
+    return float(score @ np.linalg.solve(spread, score)) / limit
+
+
+def _local_color(w: Floats, lags: int = 4) -> float:
+    """Mean squared correlation over short blocks, over its limit for white noise."""
+    count = w.size // LOCAL_ROWS
+    if count < 4:
+        return 0.0
+    x = w[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS)
+    power = np.sum(x * x, axis=1)
+    power = np.where(power > 0, power, np.inf)
+    r = np.array([np.sum(x[:, k:] * x[:, :-k], axis=1) / power for k in range(1, lags + 1)])
+    return float(np.mean(LOCAL_ROWS * r * r)) / (1 + max(0.5, 4 * math.sqrt(2 / (lags * count))))
+
+
+def _local_past(w: Floats, past: Floats) -> float:
+    """Mean share of an innovation that the two last inputs explain over short blocks, over its limit."""
+    count = w.size // LOCAL_ROWS
+    if count < 1:
+        return 0.0
+    x = past[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS, -1)
+    x = x - x.mean(axis=1, keepdims=True)
+    y = w[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS, 1)
+    y = y - y.mean(axis=1, keepdims=True)
+    left, sizes, _ = np.linalg.svd(x, full_matrices=False)
+    told = np.where(sizes[:, :, None] > 1e-9 * sizes[:, :1, None], left.transpose(0, 2, 1) @ y, 0.0)
+    total = np.sum(y * y, axis=(1, 2))
+    shares = np.sum(told * told, axis=(1, 2)) / np.where(total > 0, total, np.inf)
+    return float(np.mean(LOCAL_ROWS * shares / x.shape[2])) / (1 + 3.5 / math.sqrt(count))
+
+
+class _Innovations:
+    """Innovations of an input and of an output over several runs, and the tests on them."""
+
+    def __init__(self, missed: list[Floats], moves: list[Floats], others: list[list[Floats]], *, shift: int) -> None:
+        shortest = min(u.size for u in moves)
+        self.shift = shift
+        self.input_lags = min(MAX_INPUT_LAGS, shortest // 10)
+        output_lags = min(MAX_OUTPUT_LAGS, shortest // 14)
+        self.start = max(self.input_lags, output_lags)
+        deviation = math.sqrt(float(np.mean(np.concatenate([(u - u.mean()) ** 2 for u in moves]))))
+        self.deviation = deviation
+        inputs = [(u - u.mean()) / deviation for u in moves]
+        outputs = self._clipped(missed)
+        sizes = [u.size - self.start for u in moves]
+        ends = np.cumsum(sizes).tolist()
+        #: First and last row of every run among the stacked ones.
+        self.places = [(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+        past = [np.concatenate([_lags(u, 1, self.input_lags, self.start) for u in inputs])]
+        beside = []
+        for other in others:
+            size = math.sqrt(float(np.mean(np.concatenate([(v - v.mean()) ** 2 for v in other]))))
+            if size > 0:
+                reach = min(self.input_lags, MAX_OTHER_LAGS)
+                beside.append(np.concatenate([_lags((v - v.mean()) / size, 0, reach, self.start) for v in other]))
+        lines = [[np.ones(u.size), *_line_columns(u)] for u in inputs]
+        self.past = np.column_stack([*past, *beside, *self._block_diagonal(lines)])
+        self.inputs = self._stacked(inputs)
+        self.weights = np.ones(self.inputs.size)
+        w = _project_out(self.past, self.inputs)
+        for _ in range(ROBUST_ITERATIONS):
+            limit = ROBUST_SIGMAS * max(robust_deviation(w), 1e-14)
+            self.weights = np.minimum(1.0, limit / np.maximum(np.abs(w), 1e-300))
+            w = _project_out(self.past, self.inputs, self.weights)
+        self.innovation, self.scale = w, robust_deviation(w)
+        levels = self._block_diagonal([[np.ones(u.size)] for u in inputs])
+        own = [np.concatenate([_lags(e, 1, output_lags, self.start) for e in outputs])]
+        driven = [np.concatenate([_lags(u, 0, output_lags, self.start) for u in inputs])]
+        self.residuals = self._stacked(outputs)
+        answer = _project_out(np.column_stack([*own, *driven, *beside, *levels]), self.residuals)
+        self.noise = robust_deviation(answer)
+        self.output_innovation = np.clip(answer / max(self.noise, 1e-300), -OUTPUT_CLIP, OUTPUT_CLIP)
+        memory = SLOW_FORGETTING * (1 - SLOW_FORGETTING) ** np.arange(SLOW_MEMORY_ROWS)
+        self.slow = self._stacked([np.convolve(e, memory)[: e.size] for e in outputs])
+
+    def _clipped(self, missed: list[Floats]) -> list[Floats]:
+        """Centered residuals in units of their deviation, without far outliers, which cost power alone."""
+        every = np.concatenate([e - e.mean() for e in missed])
+        size = float(np.std(every)) or 1.0
+        middle = float(np.median(every)) / size
+        reach = RESIDUAL_CLIP * max(robust_deviation(every / size - middle), 1e-12)
+        return [np.clip((e - e.mean()) / size, middle - reach, middle + reach) for e in missed]
+
+    def _stacked(self, series: Sequence[Floats]) -> Floats:
+        return np.concatenate([x[self.start :] for x in series])
+
+    def _block_diagonal(self, columns: Sequence[Sequence[Floats]]) -> list[Floats]:
+        """Columns of each run, zero on the other runs."""
+        out = []
+        for (first, last), own in zip(self.places, columns, strict=True):
+            for column in own:
+                whole = np.zeros(self.places[-1][1])
+                whole[first:last] = column[self.start :]
+                out.append(whole)
+        return out
+
+    def _rows(self, offset: int) -> NDArray[np.intp]:
+        """Rows that have a past so far back in their own run."""
+        skip = max(INNOVATION_COUNTS) + 2 + offset
+        return np.concatenate([np.arange(min(first + skip, last), last) for first, last in self.places])
+
+    def _columns(self, rows: NDArray[np.intp], offset: int) -> Floats:
+        """Past residuals, their difference and slow part, and past innovations of the output."""
+        lag = self.shift + offset
+        back: Callable[[Floats, int], Floats] = lambda x, k: x[rows - k - offset]  # noqa: E731
+        innovations = [back(self.output_innovation, k + self.shift) for k in range(max(INNOVATION_COUNTS))]
+        now = self.residuals[rows - lag]
+        return np.column_stack([now, now - self.residuals[rows - lag - 1], self.slow[rows - lag], *innovations])
+
+    def _ratio(self, offset: int, clipped: Floats) -> tuple[float, Floats, NDArray[np.intp]]:
+        """Largest statistic over its limit, its columns and rows, with outputs so many rows further back."""
+        rows = self._rows(offset)
+        # Through the same weights, so that the score is orthogonal to what was estimated.
+        columns = _project_out(self.past[rows], self._columns(rows, offset), self.weights[rows])
+        sizes = np.linalg.norm(columns, axis=0)
+        columns = columns / np.where(sizes > 0, sizes, 1.0)
+        sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
+        ratios = [_score_ratio(clipped[rows], chosen) for chosen in sets]
+        best = int(np.argmax(ratios))
+        return ratios[best], sets[best], rows
+
+    def test(self) -> FeedbackTest:
+        """Run the test and the gates that an innovation must pass."""
+        count = self.inputs.size
+        if self.scale < PREDICTED_SHARE:
+            return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
+        if self.noise < QUIET_SHARE:
+            return FeedbackTest("none", "the output has no noise that could come back", rows=count)
+        clipped = np.clip(self.innovation / self.scale, -INPUT_CLIP, INPUT_CLIP)
+        clipped = clipped - clipped.mean()
+        ratio, columns, rows = self._ratio(0, clipped)
+        target = clipped[rows]
+        fitted = columns @ minimum_norm_solution(columns, target, 1e-12)
+        share = float(1 - np.sum((target - fitted) ** 2) / np.sum(target**2))
+
+        def result(state: FeedbackState, reason: str = "") -> FeedbackTest:
+            response = self._response(columns, rows) if state == "found" else ()
+            return FeedbackTest(state, reason, ratio, share, count, response=response)
+
+        # No two signals that were made beforehand explain most of what is new in a rough input.
+        if share >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
+            return result("found")
+        doubt = ""
+        if _local_color(clipped) > 1:
+            doubt = "its innovations have a tone of their own"
+        elif _local_past(clipped, self.past[:, :2]) > 1:
+            doubt = "its innovations follow its past here and there, as a sweep's do"
+        if doubt and ratio <= PLACEBO_RATIO_IN_DOUBT:
+            return result("cannot be told", doubt)
+        if ratio <= 1:
+            return result("none")
+        if count * share * self.scale**2 < MIN_FEEDBACK_POWER:
+            return result("none", "too little to matter")
+        if self._ratio_with_noisy_input(rows) <= 1:
+            return result("cannot be told", "a loop, or noise in the measured input")
+        # A loop acts all the time. Two signals that were made beforehand agree on one stretch by chance.
+        gains = np.array([part.sum() for part in np.array_split(fitted * target, STEADY_PARTS)])
+        if np.median(gains) < STEADY_SHARE * max(float(gains.sum()), 1e-300):
+            return result("cannot be told", "one stretch alone says so")
+        first = max(INNOVATION_COUNTS) + self.input_lags
+        last = min(end - begin for begin, end in self.places) // 3
+        far = np.unique(np.linspace(first, last, PLACEBO_COUNT).astype(int)).tolist() if last > first else []
+        placebo = max((self._ratio(k, clipped)[0] for k in far), default=1.0)
+        if ratio < (PLACEBO_RATIO_IN_DOUBT * max(placebo, 1.0) if doubt else PLACEBO_RATIO * placebo):
+            return result("cannot be told", doubt or f"outputs far back explain as much (ratio {placebo:.2g})")
+        return result("found")
+
+    def _ratio_with_noisy_input(self, rows: NDArray[np.intp]) -> float:
+        """Least ratio if the measured input had noise: corrected least squares, over shares of the largest noise.
+
+        What acted on the machine is known better by its output than by the input's own noisy past.
+        """
+        past, y = self.past[rows], self.inputs[rows]
+        weighted = past * self.weights[rows][:, None]
+        gram = weighted.T @ past
+        tiny = 1e-12 * float(np.trace(gram))
+        own, rest = np.arange(self.input_lags), np.arange(self.input_lags, past.shape[1])
+        cross, inner = gram[np.ix_(own, rest)], gram[np.ix_(rest, rest)] + tiny * np.eye(rest.size)
+        alone = gram[np.ix_(own, own)] - cross @ np.linalg.solve(inner, cross.T)
+        top = max(float(np.linalg.eigvalsh(alone)[0]), 0.0)
+        columns = self._columns(rows, 0)
+        at, from_columns = weighted.T @ y, weighted.T @ columns
+        least = math.inf
+        for share in INPUT_NOISE_SHARES:
+            less = gram + tiny * np.eye(len(gram))
+            less[own, own] -= share * top
+            inverse = np.linalg.inv(less)
+            w = y - past @ (inverse @ at)
+            w = np.clip(w / max(robust_deviation(w), 1e-300), -INPUT_CLIP, INPUT_CLIP)
+            w = w - w.mean()
+            left = columns - past @ (inverse @ from_columns)
+            sizes = np.linalg.norm(left, axis=0)
+            left = left / np.where(sizes > 0, sizes, 1.0)
+            sets = [left[:, :1], left[:, :3], *(left[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
+            least = min(least, max(_score_ratio(w, chosen) for chosen in sets))
+        return least
+
+    def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
+        """Part of the input that answers the output, by run: its innovations through the input's own past.
+
+        Where an answer was found, what the input shares with the residual of the same row is an answer, too.
+        """
+        now = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
+        columns = np.column_stack([columns, now / max(float(np.linalg.norm(now)), 1e-300)])
+        innovations = np.zeros(self.inputs.size)
+        innovations[rows] = columns @ minimum_norm_solution(columns, self.innovation[rows], 1e-12)
+        weighted = self.past * self.weights[:, None]
+        gram = weighted.T @ self.past
+        gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
+        law = np.linalg.solve(gram, weighted.T @ self.inputs)[: self.input_lags]
+        out = []
+        for first, last in self.places:
+            x = np.concatenate([np.zeros(self.start), innovations[first:last]])
+            divisor = np.zeros(x.size)
+            divisor[0] = 1.0
+            divisor[1 : 1 + law.size] = -law[: x.size - 1]
+            whole = _core.series_divide(x, divisor)
+            # An unstable law of the past would outgrow the input itself.
+            size = float(np.std(whole)) if np.all(np.isfinite(whole)) else math.inf
+            out.append(self.deviation * (whole if size <= 1.0 else x))
+        return tuple(out)
