@@ -37,11 +37,11 @@ pub fn fast_length(n: usize) -> usize {
     loop {
         let mut rest = len;
         for prime in [2, 3, 5] {
-            while rest % prime == 0 {
+            while rest.is_multiple_of(prime) {
                 rest /= prime;
             }
         }
-        if rest == 1 && len % 2 == 0 {
+        if rest == 1 && len.is_multiple_of(2) {
             return len;
         }
         len += 1;
@@ -225,10 +225,10 @@ impl Plan {
         if let Some(first) = spectrum.first_mut() {
             first.im = 0.0;
         }
-        if self.len % 2 == 0 {
-            if let Some(last) = spectrum.last_mut() {
-                last.im = 0.0;
-            }
+        if self.len.is_multiple_of(2)
+            && let Some(last) = spectrum.last_mut()
+        {
+            last.im = 0.0;
         }
         let scratch = workspace.at_least(self.inverse.get_scratch_len());
         let done = self.inverse.process_with_scratch(spectrum, time, scratch);

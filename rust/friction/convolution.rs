@@ -61,7 +61,7 @@ impl<'a> OnlineConvolution<'a> {
     pub fn push(&mut self, value: f64) {
         self.signal.push(value);
         let known = self.signal.len();
-        if known % DIRECT_SUM_LENGTH != 0 || known >= self.sums.len() {
+        if !known.is_multiple_of(DIRECT_SUM_LENGTH) || known >= self.sums.len() {
             return;
         }
         let level = (known / DIRECT_SUM_LENGTH).trailing_zeros() as usize;

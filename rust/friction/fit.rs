@@ -225,10 +225,10 @@ fn estimate_initial_state(
             continue;
         }
         // A start with a simulation that overflows is skipped.
-        if let Ok(found) = minimize(&problem, start, INITIAL_STATE_SETTINGS) {
-            if found.cost < best.0 {
-                best = (found.cost, found.point);
-            }
+        if let Ok(found) = minimize(&problem, start, INITIAL_STATE_SETTINGS)
+            && found.cost < best.0
+        {
+            best = (found.cost, found.point);
         }
     }
     best.1

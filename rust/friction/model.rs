@@ -339,15 +339,15 @@ impl FrictionModel {
         moved: &Parameter,
     ) -> Result<Vec<Vec<f64>>> {
         let (operators, motion, record) = (&part.operators, &part.run, &experiment.record);
-        if let Parameter::State(_, state) = *moved {
-            if let Some(State::Power(i, e)) = self.states(&point.orders).0.get(state).filter(|s| s.is_impulse()) {
-                // A filter transient does not move a body.
-                let mut slopes = vec![vec![0.0; record.m()]; self.equations.len()];
-                let mut own = vec![Vec::new(); self.equations.len()];
-                own[*i].push((*e, 1.0));
-                add_impulses(&mut slopes, &own, record.step());
-                return Ok(slopes);
-            }
+        if let Parameter::State(_, state) = *moved
+            && let Some(State::Power(i, e)) = self.states(&point.orders).0.get(state).filter(|s| s.is_impulse())
+        {
+            // A filter transient does not move a body.
+            let mut slopes = vec![vec![0.0; record.m()]; self.equations.len()];
+            let mut own = vec![Vec::new(); self.equations.len()];
+            own[*i].push((*e, 1.0));
+            add_impulses(&mut slopes, &own, record.step());
+            return Ok(slopes);
         }
         let BodyDerivatives { alphas, terms: moves, frictions } = self.moves(point, moved);
         let mut total = self.forcing_slope(point, &point.states[run], record, moved)?;
@@ -366,10 +366,10 @@ impl FrictionModel {
                     if deta != 0.0 {
                         add(i, c * deta, &driver.of(spectrum, 1));
                     }
-                    if let Parameter::Input(input) = moved {
-                        if signal == self.inputs[*input].signal {
-                            add(i, c, &driver.of(&Kernel::new(&part.input_slopes[*input]), 0));
-                        }
+                    if let Parameter::Input(input) = moved
+                        && signal == self.inputs[*input].signal
+                    {
+                        add(i, c, &driver.of(&Kernel::new(&part.input_slopes[*input]), 0));
                     }
                 }
                 if let (Some(kernels), Some(j)) = (&operators.own[i][k], body.place(signal)) {

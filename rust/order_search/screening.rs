@@ -255,20 +255,20 @@ impl<const L: usize> Screen<L> {
             if bound > limit {
                 continue;
             }
-            if let Some(adapted) = &catalogue.problem.tailored_vectors {
-                if adapted.excludes_candidate(columns, coefficients, limit, memory) {
-                    continue;
-                }
+            if let Some(adapted) = &catalogue.problem.tailored_vectors
+                && adapted.excludes_candidate(columns, coefficients, limit, memory)
+            {
+                continue;
             }
-            if let (Some(tangents), true) = (&catalogue.problem.linearized_vectors, limit < f64::INFINITY) {
-                if tangents.excludes_candidate(columns, coefficients, limit, held) {
-                    continue;
-                }
+            if let (Some(tangents), true) = (&catalogue.problem.linearized_vectors, limit < f64::INFINITY)
+                && tangents.excludes_candidate(columns, coefficients, limit, held)
+            {
+                continue;
             }
-            if let (Some(roots), true) = (&catalogue.problem.unstable_zeros, limit < f64::INFINITY) {
-                if roots.excludes_candidate(columns, coefficients, limit, path) {
-                    continue;
-                }
+            if let (Some(roots), true) = (&catalogue.problem.unstable_zeros, limit < f64::INFINITY)
+                && roots.excludes_candidate(columns, coefficients, limit, path)
+            {
+                continue;
             }
             open.push(OpenCandidate { index, bound, guess });
         }

@@ -65,16 +65,16 @@ impl Settings {
             ("fastest", self.fastest),
             ("late_limit", self.late_limit),
         ];
-        if let Some((frequency, damping)) = self.filter {
-            if !(frequency > 0.0 && frequency.is_finite() && damping > 0.0 && damping.is_finite()) {
-                let value = if frequency > 0.0 && frequency.is_finite() { damping } else { frequency };
-                return Err(Error::OutOfRange {
-                    name: "sensor filter".into(),
-                    value,
-                    range: "(0, ∞)".into(),
-                    remedy: "give its frequency in rad/s and its damping".into(),
-                });
-            }
+        if let Some((frequency, damping)) = self.filter
+            && !(frequency > 0.0 && frequency.is_finite() && damping > 0.0 && damping.is_finite())
+        {
+            let value = if frequency > 0.0 && frequency.is_finite() { damping } else { frequency };
+            return Err(Error::OutOfRange {
+                name: "sensor filter".into(),
+                value,
+                range: "(0, ∞)".into(),
+                remedy: "give its frequency in rad/s and its damping".into(),
+            });
         }
         let all = pairs.iter().flat_map(|(name, v)| v.map(|v| (*name, v))).chain(single);
         for (name, value) in all {

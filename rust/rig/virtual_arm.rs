@@ -177,10 +177,10 @@ impl Plant {
         #[allow(clippy::cast_possible_truncation)]
         let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j] + 0.5).floor() as i32);
         for injection in &self.injections {
-            if let Injection::DeadEncoder { stage, from } = *injection {
-                if self.sample >= from {
-                    counts[stage] = *self.frozen[stage].get_or_insert(counts[stage]);
-                }
+            if let Injection::DeadEncoder { stage, from } = *injection
+                && self.sample >= from
+            {
+                counts[stage] = *self.frozen[stage].get_or_insert(counts[stage]);
             }
         }
         Reading { analog, counts, switches }

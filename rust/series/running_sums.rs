@@ -44,7 +44,7 @@ pub fn running_sums(eta: usize, step: f64) -> Vec<f64> {
     let mut weights = Vec::with_capacity(eta + 1);
     for (l, number) in stirling.iter().enumerate() {
         factorial *= (l + 1) as f64;
-        let sign = if (eta - l) % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if (eta - l).is_multiple_of(2) { 1.0 } else { -1.0 };
         weights.push(scale * sign * factorial * number);
     }
     weights

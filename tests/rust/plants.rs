@@ -38,7 +38,8 @@ fn simulated(plant: &Value, derived: bool, every: usize) -> Vec<Vec<f64>> {
     assert_eq!(input["samples"], SAMPLES);
     // Counted in samples: the edges of the square fall on them.
     let half = (period / step / 2.0).round() as usize;
-    let current: Vec<f64> = (0..SAMPLES).map(|j| if j / half % 2 == 0 { amplitude } else { -amplitude }).collect();
+    let current: Vec<f64> =
+        (0..SAMPLES).map(|j| if (j / half).is_multiple_of(2) { amplitude } else { -amplitude }).collect();
     let m = (SAMPLES - 1) * every;
     let held = pulse_means(&current, m, Intersample::Hold).unwrap();
     let record = record(step / every as f64, vec![vec![0.0; m], vec![0.0; m], held]);

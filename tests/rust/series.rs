@@ -426,10 +426,10 @@ fn integrals_compose_with_second_order() {
 fn transform_lengths_are_fast_and_even() {
     for n in 0..3000 {
         let len = fft::fast_length(n);
-        assert!(len >= n.max(2) && len % 2 == 0 && len <= 2 * n.max(2));
+        assert!(len >= n.max(2) && len.is_multiple_of(2) && len <= 2 * n.max(2));
         let mut rest = len;
         for p in [2, 3, 5] {
-            while rest % p == 0 {
+            while rest.is_multiple_of(p) {
                 rest /= p;
             }
         }

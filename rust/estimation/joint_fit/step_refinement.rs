@@ -233,13 +233,11 @@ fn select_limit_or_optimum(
         return Ok(limit);
     }
     let ahead = best.iterate_at(&limit);
-    if settled {
-        if let Some(there) = grid.evaluate(&ahead)? {
-            let told = best.residuals.iter().zip(&way).map(|(e, w)| e + w);
-            let bent: Vec<f64> = there.residuals.iter().zip(told).map(|(e, told)| e - told).collect();
-            if length(&bent) <= MAX_CHANGE_STANDARD_ERRORS * length(&way) {
-                return Ok(limit);
-            }
+    if settled && let Some(there) = grid.evaluate(&ahead)? {
+        let told = best.residuals.iter().zip(&way).map(|(e, w)| e + w);
+        let bent: Vec<f64> = there.residuals.iter().zip(told).map(|(e, told)| e - told).collect();
+        if length(&bent) <= MAX_CHANGE_STANDARD_ERRORS * length(&way) {
+            return Ok(limit);
         }
     }
     let finer = match grid.finer() {

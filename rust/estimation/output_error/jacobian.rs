@@ -85,13 +85,12 @@ impl FreeModel {
                             rights.add(i, weight, (operator, turns), series, made);
                         }
                     }
-                    if parameter < orders.len() {
-                        if let Some(moved) =
+                    if parameter < orders.len()
+                        && let Some(moved) =
                             initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
-                        {
-                            let series = || Cow::Owned(shelf.filter_series(&moved));
-                            rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
-                        }
+                    {
+                        let series = || Cow::Owned(shelf.filter_series(&moved));
+                        rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
                     }
                 }
                 Ok(())

@@ -146,10 +146,10 @@ impl simd::Kernel for SliceScreening<'_> {
             for by in 0..lengths[1].div_ceil(1 << coarse[1]) {
                 stack.push([Interval { level: coarse[0], at }, Interval { level: coarse[1], at: by }]);
                 while let Some([u, v]) = stack.pop() {
-                    if let Some(cell) = ready.box_quantities(&strip, [u, v]) {
-                        if ready.bound([u, v], &cell, limit) > limit {
-                            continue;
-                        }
+                    if let Some(cell) = ready.box_quantities(&strip, [u, v])
+                        && ready.bound([u, v], &cell, limit) > limit
+                    {
+                        continue;
                     }
                     if u.level + v.level > SCREENING_LEVEL_SUM {
                         let part = usize::from(v.level > u.level);

@@ -441,15 +441,15 @@ impl Problem {
                 return Verdict::Bounded(lowest);
             }
         }
-        if let (Some(adapted), true) = (&self.tailored_vectors, limit < f64::INFINITY) {
-            if simd::dispatch_simd(TailoredVectorKernel { adapted, limit, terms: positions, coefficients, memory }) {
-                return Verdict::Bounded(limit);
-            }
+        if let (Some(adapted), true) = (&self.tailored_vectors, limit < f64::INFINITY)
+            && simd::dispatch_simd(TailoredVectorKernel { adapted, limit, terms: positions, coefficients, memory })
+        {
+            return Verdict::Bounded(limit);
         }
-        if let (Some(tangents), true) = (&self.linearized_vectors, limit < f64::INFINITY) {
-            if simd::dispatch_simd(LinearizedVectorKernel { tangents, limit, terms: positions, coefficients, held }) {
-                return Verdict::Bounded(limit);
-            }
+        if let (Some(tangents), true) = (&self.linearized_vectors, limit < f64::INFINITY)
+            && simd::dispatch_simd(LinearizedVectorKernel { tangents, limit, terms: positions, coefficients, held })
+        {
+            return Verdict::Bounded(limit);
         }
         let norm = self.options.norm;
         let mut raw = 0.0;

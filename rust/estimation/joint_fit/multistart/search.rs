@@ -120,11 +120,11 @@ fn multistart_without_history<'a>(
     reached = sort_by_cost(reached);
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         let finer = half.take().map_or_else(|| coarse.finer(), Ok)?;
-        if let Some(best) = reached.first() {
-            if !coarse.is_refinement_significant(&best.result.iterate, &finer)? {
-                half = Some(finer);
-                break;
-            }
+        if let Some(best) = reached.first()
+            && !coarse.is_refinement_significant(&best.result.iterate, &finer)?
+        {
+            half = Some(finer);
+            break;
         }
         coarse = finer;
         reached = laps.run(free, &coarse, &starts, FIRST_BUDGET_EVALUATIONS)?;
