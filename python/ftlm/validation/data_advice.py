@@ -196,8 +196,10 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
         return
     # The row in which an input moves is one of rest, too: the output answers later.
     held = [run[n][first : first + rows - 1] for n in run.inputs]
-    resting = all(np.ptp(values) == 0 for values in held)
-    if resting and (first == 0 or not any(values[0] for values in held)):
+    ends = [run[n][first + rows - 1 : first + rows + 1] for n in run.inputs]
+    moved = any(np.any(after != before[0]) for before, after in zip(held, ends, strict=True))
+    without_input = not any(values[0] for values in held)
+    if all(np.ptp(values) == 0 for values in held) and (without_input or (first == 0 and moved)):
         return
     begin, end = first * run.step, (first + rows) * run.step
     after = (
