@@ -12,9 +12,9 @@ LEAD = """# Findings
 
 What ftlm says about a result, a run, a selection or a frequency response is a record with a code, a level, a subject
 (run, output, input, parameter, method) and numbers: `result.findings`, a tuple of `ftlm.Finding`. Sentences and
-remedies are rendered from it, and nothing reads them: `result.warnings` are the sentences. Saved models keep the records.
-Verdicts count *do not use* first, then *with care*; a *fact* is worth knowing, a *note* says how data were read. What
-stands in italics is filled in. `docs/findings.py` writes this page from the catalogue.
+remedies are rendered from it, and nothing reads them: `result.warnings` are the sentences. Saved models keep the
+records. Verdicts count *do not use* first, then *with care*; a *fact* is worth knowing, a *note* says how data were
+read. What stands in italics is filled in. `docs/findings.py` writes this page from the catalogue.
 """
 
 
