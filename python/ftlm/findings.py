@@ -19,7 +19,7 @@ FINDING_LEVELS = (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT, LEVEL_NOTE)
 #: Maximum number of groups of findings in a summary.
 MAX_SUMMARY_FINDINGS = 3
 #: Codes of residuals that are not white.
-NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "response_not_white")
+NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "noise_coloured", "response_not_white")
 #: Fields of the subject of a finding.
 SUBJECT_FIELDS = ("run", "output", "input", "parameter", "method")
 #: Role of findings on runs that a model was not identified from.
@@ -88,6 +88,7 @@ FINDING_TOPICS: dict[str, Topic] = {
     "same": Topic("a validation run is one of its own", "give another run"),
     "errors": Topic("nothing says how sure its numbers are", "", "use {ask[method is output-error]}", "output-error"),
     "validation": Topic("how well it predicts other data is not known"),
+    "noise": Topic("the noise has a colour"),
     "other": Topic("to know"),
 }
 #: Texts of Python and of the command line by name, for templates.
@@ -147,6 +148,12 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_DO_NOT_USE,
         "the model is {stability}: its free run grows without bound, however well it fits a run of this length",
         "the free run grows without bound ({poles})",
+    ),
+    "growth_not_told": FindingKind(
+        "unstable",
+        LEVEL_FACT,
+        "the model is {stability}, but not significantly: its standard errors do not tell its growth from none",
+        remedy="leave the term out that makes it grow, or record a longer run",
     ),
     "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether its free run grows cannot be told"),
     "unstable_optimum_kept": FindingKind(
@@ -343,7 +350,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_WITH_CARE,
         "residuals of {output} are not white: the model leaves something out|; standard errors allow for the colour, "
         "not for the bias of what is left out",
-        f"residuals of {{shown}} are not white: {_LEFT_OUT}",
+        f"residuals of {{output}} are not white: {_LEFT_OUT}",
+    ),
+    "noise_coloured": FindingKind(
+        "noise",
+        LEVEL_FACT,
+        "residuals of {output} are not white, and follow no input: the noise has a colour, for which standard errors "
+        "allow",
     ),
     "output_not_white": FindingKind(
         "residuals",

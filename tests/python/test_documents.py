@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import json
 import re
@@ -174,3 +175,11 @@ def test_every_module_stands_on_the_map() -> None:
     for file in sorted((ROOT / "rust").glob("*.rs")):
         if file.stem not in ("lib", "error"):
             assert f"{file.name}`" in text, f"{file.name} is not on the map"
+
+
+def test_the_catalogue_of_findings_is_the_packages_own():
+    spec = importlib.util.spec_from_file_location("findings_page", ROOT / "docs" / "findings.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    # Otherwise: python docs/findings.py
+    assert module.PAGE.read_text(encoding="utf-8") == module.page()

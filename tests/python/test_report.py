@@ -178,8 +178,9 @@ def test_numbers_are_those_of_the_comparison(page, identified, square, sine):
 
 
 def test_warnings_come_first(tmp_path, identified):
+    notes = tuple(ftlm.Finding("data_note", numbers={"text": text}) for text in (HOSTILE, "second"))
     unstable = ftlm.Identification(
-        identified.model, "least-squares", identified.comparison, {}, identified.settings, (HOSTILE, "second")
+        identified.model, "least-squares", identified.comparison, {}, identified.settings, notes
     )
     path = report.identification_page(unstable, tmp_path / "p.html")
     text = path.read_text("utf-8")

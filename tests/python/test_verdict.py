@@ -335,21 +335,23 @@ def test_findings_survive_a_file(found, tmp_path):
 
 def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checked):
     tests = found.residuals.outputs["y"]
-    red = replace(tests, whiteness=replace(tests.whiteness, passed=False))
+    follows = {"u": replace(tests.inputs["u"], passed=False)}
+    red = replace(tests, whiteness=replace(tests.whiteness, passed=False), inputs=follows)
     for nr, trusted in ((0.01, False), (0.0009, True)):
         part = replace(found.residuals, outputs={"y": replace(red, nr=nr)})
         assert worse(found, residuals=part).verdict(checked).trusted == trusted
-    part = replace(
-        found.residuals,
-        outputs={"y": replace(tests, inputs={"u": replace(tests.inputs["u"], passed=False, conclusive=True)})},
-    )
+    # Colored noise that follows no input is a fact.
+    part = replace(found.residuals, outputs={"y": replace(red, inputs=tests.inputs)})
+    assert worse(found, residuals=part).verdict(checked).trusted
+    part = replace(found.residuals, outputs={"y": replace(tests, inputs=follows)})
     assert worse(found, residuals=part).verdict(checked).reason == (
         "residuals of y still follow u: it leaves something out"
     )
 
 
 def test_a_hidden_offset_is_named(found, checked):
-    hidden = worse(found, comparison=replace(found.comparison, offsets=({"y": {}},)))
+    past = [{"y": {0.5: 1.0}}]
+    hidden = worse(found, comparison=replace(found.comparison, offsets=({"y": {}},), initial=past))
     judged = hidden.verdict(checked)
     assert judged.level == "with care"
     assert judged.reason == "the offset of y is not told apart from what a run did before its start"
@@ -482,12 +484,12 @@ def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
         BOUND,
         finding("coefficient_law_broken", parameter="a", value=1.0, wanted=2.0),
         finding("quantised", run="r", output="y", step=1.0, noise=0.1),
-        finding("loop_found", output="y", input="u", how="u answers y", statistic=9.0, limit=1.0, or_else=""),
+        finding("loop_found", output="y", input="u", ratio=9.0, effect=""),
     )
     poor = worse(found, findings=many)
     text = str(poor)
     assert sum(line.startswith("! ") for line in text.splitlines()) == MAX_SUMMARY_FINDINGS == 3
-    assert "! y: u answers y" in text
+    assert "! y: u answers what y did before" in text
     assert "(4 more warnings: print(result.details()))" in text
     assert all(f"warning: {w}" in poor.details() for w in poor.warnings)
     assert poor.findings == many
@@ -594,3 +596,79 @@ def test_the_command_line_has_verdict_validation_and_more(run, other, tmp_path):
     assert "validation on chirp" in both.output
     document = json.loads(CliRunner().invoke(cli.app, [*words, "--json"]).output)
     assert document["verdict"]["level"] == "with care"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Levels: records whose fault is known to be none
+
+
+def integrator_record(seed, pole=0.0, noise=0.05):
+    """The level of a tank under steps that were drawn beforehand, or one that grows."""
+    rng = np.random.default_rng([seed, 41])
+    u = np.repeat(rng.integers(-3, 4, 24), 25).astype(float)
+    gain = math.expm1(0.02 * pole) / pole if pole else 0.02
+    level = np.zeros(u.size)
+    for k in range(1, u.size):
+        level[k] = math.exp(0.02 * pole) * level[k - 1] + gain * u[k - 1]
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": level + noise * rng.standard_normal(u.size)})
+
+
+def test_an_integrator_is_no_growth_by_chance():
+    positive = 0
+    for seed in range(8):
+        found = ftlm.identify(integrator_record(seed), ftlm.equation("D y = a0 y + b u"))
+        positive += found.coefficients["a0"] > 0
+        codes = [f.code for f in found.findings]
+        assert ("growth_not_told" in codes) == (found.coefficients["a0"] > 0)
+        assert found.verdict().level == "with care"
+        assert saved_verdict(found.model, []).level == "with care"
+    assert positive >= 2
+
+
+def test_a_pole_that_grows_is_still_found():
+    found = ftlm.identify(integrator_record(1, pole=0.15), ftlm.equation("D y = a0 y + b u"))
+    assert found.verdict().level == "do not use"
+    assert "free_run_grows" in [f.code for f in found.findings]
+    assert saved_verdict(found.model, []).level == "do not use"
+
+
+def test_a_noise_with_a_color_is_a_fact(other):
+    rng = np.random.default_rng(3)
+    run = record(SQUARE, noise=0.0)
+    noise = np.zeros(T.size)
+    for k, w in enumerate(rng.standard_normal(T.size)):
+        noise[k] = 0.9 * noise[k - 1] + 0.005 * w
+    red = ftlm.Run.from_arrays(step=0.02, inputs={"u": run["u"]}, outputs={"y": run["y"] + noise}, units=run.units)
+    found = ftlm.identify(red, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u"))
+    assert [f.level for f in found.findings if f.code == "noise_coloured"] == ["fact"]
+    assert "residuals_not_white" not in [f.code for f in found.findings]
+    assert found.verdict(found.validate(other)).trusted
+
+
+def test_a_machine_that_stands_still_has_no_outliers_and_no_dead_channel():
+    # A motor with a tachometer whose dead band makes its rest exact, for a third of the run.
+    rng = np.random.default_rng(9)
+    u = np.repeat([*rng.uniform(-2, 2, 10), *[0.0] * 10, *rng.uniform(-2, 2, 10)], 40)
+    speed = np.zeros(u.size)
+    for k in range(1, u.size):
+        speed[k] = 0.9 * speed[k - 1] + 0.1 * u[k - 1]
+    read = speed + 0.01 * rng.standard_normal(u.size)
+    read[np.abs(speed) < 0.02] = 0.0
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"w": read})
+    found = ftlm.identify(run, ftlm.equation("D w = a w + b u"))
+    assert not {"outliers", "outliers_dominate", "channel_off"} & {f.code for f in found.findings}
+    # A channel that is off while the motor moves is one.
+    off = speed + 0.01 * rng.standard_normal(u.size)
+    off[900:1000] = 0.0
+    dead = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"w": off})
+    assert "channel_off" in dead.advice().codes
+
+
+@pytest.mark.parametrize(("level", "input_level"), [(0.0, 0.0), (21.3, 0.0), (0.0, 2.0)])
+def test_a_rest_before_the_input_moves_is_a_rest_at_any_level(level, input_level):
+    u = np.repeat([0.0, 1.0, -1.0], [150, 200, 250])
+    y = np.zeros(u.size)
+    for k in range(1, u.size):
+        y[k] = 0.97 * y[k - 1] + 0.03 * u[k - 1]
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u + input_level}, outputs={"y": y + level})
+    assert "channel_off" not in run.advice().codes

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError
-from ftlm.estimation.model_checks import unstable_poles_text
+from ftlm.estimation.model_checks import has_growing_mode, unstable_poles_text
 from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_from, verdict_html
 from ftlm.findings import Finding, finding, group_findings, texts
 from ftlm.model.model import Model
@@ -309,7 +309,7 @@ class FrequencyIdentification:
         """Return a finding on poles with a positive real part, if there are any."""
         with contextlib.suppress(FtlmError):
             stable = self.model.stability(coupling="simulated")
-            if stable.unstable_poles > 0:
+            if stable.unstable_poles > 0 and has_growing_mode(self.model, "simulated"):
                 return [finding("response_grows", poles=unstable_poles_text(stable.unstable_poles))]
         return []
 

@@ -241,7 +241,7 @@ def assess_fit(fit: Fit) -> Identification:
     findings += dead_channel_findings(runs, fit.task.structure) + excitation_findings(runs, fit.task.structure)
     findings += (
         discretization_findings(model, comparison)
-        + stability_findings(model)
+        + stability_findings(replace(model, estimate=_estimate(fit, comparison, None, ())))
         + friction_direction_findings(model, free)
         + stribeck_findings(model, runs, free)
     )
@@ -253,7 +253,8 @@ def assess_fit(fit: Fit) -> Identification:
         # A run that is too short for correlations; everything else can be told.
         pass
     tests = None if tests is None else _with_feedback_bias(fit, tests)
-    findings += [] if tests is None else _residual_findings(fit, tests)
+    if tests is not None:
+        findings = [_noise_finding(f, tests) for f in findings] + _residual_findings(fit, tests)
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
     result = Identification(
@@ -273,6 +274,12 @@ def assess_fit(fit: Fit) -> Identification:
     if not against:
         return result
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
+
+
+def _noise_finding(item: Finding, tests: Residuals) -> Finding:
+    """Return residuals that are not white as colored noise, where they follow no input."""
+    colored = item.code == "residuals_not_white" and tests.outputs[item.output].is_noise
+    return finding("noise_coloured", output=item.output) if colored else item
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
@@ -308,7 +315,8 @@ def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return residual_findings(tests)
-    return [f for f in residual_findings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if f.code != "output_not_white"]
+    known = ("output_not_white", "noise_coloured")
+    return [f for f in residual_findings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if f.code not in known]
 
 
 def _estimate(

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 
 from ftlm import _core
+from ftlm.analysis.poles import modes
 from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
+from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
 from ftlm.estimation.result import Identification
@@ -35,12 +38,16 @@ MAX_RELATIVE_STANDARD_ERROR = 0.1
 MIN_OUTLIERS = 3
 MIN_OUTLIER_FRACTION = 2e-3
 MIN_OUTLIER_POWER_FRACTION = 0.5
+#: Smallest share of rows with motion whose residuals measure the usual size.
+MIN_MOVING_SHARE = 0.1
 #: Quantization step in noise standard deviations above which residuals are dominated by rounding.
 QUANTIZATION_NOISE_RATIO = 2.0
 #: Largest deviation of a value from a multiple of the quantization step, as a fraction of the step.
 QUANTIZATION_STEP_TOLERANCE = 0.01
 #: Smallest change within a sample that counts as motion, as a fraction of the range of the output.
 MIN_MOTION_RANGE_FRACTION = 1e-6
+#: A pole grows if its real part exceeds 0 by so many standard errors (99 %, one-sided).
+GROWTH_SIGMAS = NormalDist().inv_cdf(0.99)
 #: Fewest intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
 MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
 #: Largest relative deviation of two coefficients from the coefficient law.
@@ -85,9 +92,7 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
             findings.append(finding("not_different_from_0", parameter=name, value=value, error=errors[name]))
     findings += correlation_findings(joint) + unbounded_interval_findings(joint, unseen)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
-    if coloured:
-        findings.append(finding("residuals_not_white", output=", ".join(coloured), shown=join_names(coloured)))
-    return findings
+    return [*findings, *(finding("residuals_not_white", output=output) for output in coloured)]
 
 
 def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:
@@ -148,7 +153,9 @@ def _outlier_findings(runs: Sequence[Run], joint: JointFit, output: str) -> list
     if joint.robust is not None:
         return []
     every = drop_missing(np.concatenate([part[output] for part in joint.residuals]))
-    usual = robust_deviation(every)
+    # Where a machine stands still its residuals are rounding, and no measure of the others.
+    moved = [_while_moving(run, output, part[output]) for run, part in zip(runs, joint.residuals, strict=True)]
+    usual = robust_deviation(drop_missing(np.concatenate(moved)))
     far, first = 0, ""
     for run, part in zip(runs, joint.residuals, strict=True):
         rows = np.flatnonzero(np.abs(part[output]) > OUTLIER_DEVIATIONS * usual)
@@ -175,6 +182,13 @@ def _outlier_findings(runs: Sequence[Run], joint: JointFit, output: str) -> list
             noun=noun,
         )
     ]
+
+
+def _while_moving(run: Run, output: str, residuals: Floats) -> Floats:
+    """Return the residuals of the rows in which the output changed; all of them where few did."""
+    changed = np.flatnonzero(np.diff(run[output]) != 0)
+    changed = changed[changed < residuals.size]
+    return residuals[changed] if changed.size >= MIN_MOVING_SHARE * residuals.size else residuals
 
 
 def _quantization_findings(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> list[Finding]:
@@ -325,14 +339,33 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
 
 
 def stability_findings(model: Model) -> list[Finding]:
-    """Return a finding on poles with a positive real part, which a short run may hide."""
+    """Return a finding on poles with a positive real part, which a short run may hide.
+
+    They are a fault where one of them exceeds 0 by more than its standard error allows; where none does, an integrator
+    or a mode that decays slowly explains the run as well.
+    """
     if model.structure.has_friction:
         # Friction holds what would grow slowly; no poles say so.
         return []
-    verdict = model.stability(coupling=model.structure.coupling)
-    if not verdict.unstable_poles > 0:
+    stable = model.stability(coupling=model.structure.coupling)
+    if not stable.unstable_poles > 0:
         return []
-    return [finding("free_run_grows", stability=str(verdict), poles=unstable_poles_text(verdict.unstable_poles))]
+    code = "free_run_grows" if has_growing_mode(model, model.structure.coupling) else "growth_not_told"
+    return [finding(code, stability=str(stable), poles=unstable_poles_text(stable.unstable_poles))]
+
+
+def has_growing_mode(model: Model, coupling: str) -> bool:
+    """Whether an unstable mode is significant at 99 %; True where modes or their errors are not known."""
+    try:
+        unstable = [mode for mode in modes(model, coupling=coupling) if mode.unstable]
+    except FtlmError:
+        return True
+    # To first order the real part of a pole relates to its error as the damping does, on the axis as the size does.
+    ratios = [
+        (mode.damping, mode.damping_error) if mode.oscillatory else (mode.frequency, mode.frequency_error)
+        for mode in unstable
+    ]
+    return not ratios or any(not error or abs(part) > GROWTH_SIGMAS * error for part, error in ratios)
 
 
 def unstable_poles_text(count: float) -> str:

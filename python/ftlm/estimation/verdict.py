@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError
-from ftlm.estimation.model_checks import join_names, unstable_poles_text
+from ftlm.estimation.model_checks import join_names, stability_findings
 from ftlm.estimation.result import Identification
 from ftlm.findings import FINDING_TOPICS, LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, finding, group_findings
 from ftlm.model.model import Estimate, Model
@@ -224,13 +224,11 @@ def _unstable_poles(model: Model) -> Iterator[Finding]:
     """
     if model.structure.has_friction:
         return
-    stable = model.stability(coupling=model.structure.coupling)
-    if math.isnan(stable.unstable_poles):
+    growth = stability_findings(model)
+    yield from growth
+    if math.isnan(model.stability(coupling=model.structure.coupling).unstable_poles):
         yield finding("growth_untold")
-    elif stable.unstable_poles > 0:
-        poles = unstable_poles_text(stable.unstable_poles)
-        yield finding("free_run_grows", stability=str(stable), poles=poles)
-    else:
+    elif not any(f.code == "free_run_grows" for f in growth):
         with contextlib.suppress(FtlmError):
             yield from _undamped_modes(model)
 
@@ -301,9 +299,8 @@ def _residuals(result: Identification) -> Iterator[Finding]:
         yield finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
-    coloured = [] if looped else [o for o, r in judged.items() if not r.whiteness.passed]
-    if coloured:
-        yield finding("residuals_not_white", output=", ".join(coloured), shown=join_names(coloured))
+    coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]
+    yield from (finding("residuals_not_white", output=o) for o in coloured)
 
 
 def _is_uncertain(result: Identification, name: str) -> bool:

@@ -190,12 +190,16 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     first, rows = int(starts[at]), int(lengths[at]) + 1
     if rows < max(MIN_DEAD_SAMPLES, DEAD_SHARE * run.length):
         return
-    # Clipping at an extreme is reported as saturation; rest before the first input is legitimate.
+    # Clipping at an extreme is reported as saturation; rest at any level before the first input, and under no input,
+    # is legitimate.
     if _entered_steeply(y, first, rows):
         return
-    resting = y[first] == 0 and first == 0
-    inputs_moved = any(np.ptp(run[n][first : first + rows]) > 0 or run[n][first] != 0 for n in run.inputs)
-    if resting and not inputs_moved:
+    # The row in which an input moves is one of rest, too: the output answers later.
+    held = [run[n][first : first + rows - 1] for n in run.inputs]
+    ends = [run[n][first + rows - 1 : first + rows + 1] for n in run.inputs]
+    moved = any(np.any(after != before[0]) for before, after in zip(held, ends, strict=True))
+    without_input = not any(values[0] for values in held)
+    if all(np.ptp(values) == 0 for values in held) and (without_input or (first == 0 and moved)):
         return
     begin, end = first * run.step, (first + rows) * run.step
     after = (

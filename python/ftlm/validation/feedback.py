@@ -145,11 +145,11 @@ def feedback_test(
         if not kept:
             return FeedbackTest("cannot be told", f"{count} changes over {len(runs)} short runs", rows=longest)
         runs, inputs, changes = [runs[k] for k in kept], [inputs[k] for k in kept], [changes[k] for k in kept]
-        missed = [_filled(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
+        missed = [_fill_missing(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
         moves = [u[c] for u, c in zip(inputs, changes, strict=True)]
         beside = [[other[k][c] for k, c in zip(runs, changes, strict=True)] for other in others]
     else:
-        missed, moves = [_filled(residuals[k]) for k in runs], inputs
+        missed, moves = [_fill_missing(residuals[k]) for k in runs], inputs
         beside = [[other[k] for k in runs] for other in others]
     room = MAX_FEEDBACK_ROWS
     taken = []
@@ -178,7 +178,7 @@ def feedback_test(
     return replace(test, response=tuple(responses))
 
 
-def _filled(residuals: Floats) -> Floats:
+def _fill_missing(residuals: Floats) -> Floats:
     """Residuals with their mean at missing samples, which costs power alone."""
     gone = np.isnan(residuals)
     return np.where(gone, np.mean(residuals[~gone]), residuals) if gone.any() and not gone.all() else residuals
@@ -293,7 +293,7 @@ class _Innovations:
         deviation = math.sqrt(float(np.mean(np.concatenate([(u - u.mean()) ** 2 for u in moves]))))
         self.deviation = deviation
         inputs = [(u - u.mean()) / deviation for u in moves]
-        outputs = self._clipped(missed)
+        outputs = self._clip_outliers(missed)
         sizes = [u.size - self.start for u in moves]
         ends = np.cumsum(sizes).tolist()
         #: First and last row of every run among the stacked ones.
@@ -307,7 +307,7 @@ class _Innovations:
                 beside.append(np.concatenate([_lags((v - v.mean()) / size, 0, reach, self.start) for v in other]))
         lines = [[np.ones(u.size), *_line_columns(u)] for u in inputs]
         self.past = np.column_stack([*past, *beside, *self._block_diagonal(lines)])
-        self.inputs = self._stacked(inputs)
+        self.inputs = self._stack_rows(inputs)
         self.weights = np.ones(self.inputs.size)
         w = _project_out(self.past, self.inputs)
         for _ in range(ROBUST_ITERATIONS):
@@ -318,22 +318,22 @@ class _Innovations:
         levels = self._block_diagonal([[np.ones(u.size)] for u in inputs])
         own = [np.concatenate([_lags(e, 1, output_lags, self.start) for e in outputs])]
         driven = [np.concatenate([_lags(u, 0, output_lags, self.start) for u in inputs])]
-        self.residuals = self._stacked(outputs)
+        self.residuals = self._stack_rows(outputs)
         answer = _project_out(np.column_stack([*own, *driven, *beside, *levels]), self.residuals)
         self.noise = robust_deviation(answer)
         self.output_innovation = np.clip(answer / max(self.noise, 1e-300), -OUTPUT_CLIP, OUTPUT_CLIP)
         memory = SLOW_FORGETTING * (1 - SLOW_FORGETTING) ** np.arange(SLOW_MEMORY_ROWS)
-        self.slow = self._stacked([np.convolve(e, memory)[: e.size] for e in outputs])
+        self.slow = self._stack_rows([np.convolve(e, memory)[: e.size] for e in outputs])
 
-    def _clipped(self, missed: list[Floats]) -> list[Floats]:
-        """Centered residuals in units of their deviation, without far outliers, which cost power alone."""
+    def _clip_outliers(self, missed: list[Floats]) -> list[Floats]:
+        """Residuals about their mean in units of their deviation, without far outliers, which cost power alone."""
         every = np.concatenate([e - e.mean() for e in missed])
         size = float(np.std(every)) or 1.0
         middle = float(np.median(every)) / size
         reach = RESIDUAL_CLIP * max(robust_deviation(every / size - middle), 1e-12)
         return [np.clip((e - e.mean()) / size, middle - reach, middle + reach) for e in missed]
 
-    def _stacked(self, series: Sequence[Floats]) -> Floats:
+    def _stack_rows(self, series: Sequence[Floats]) -> Floats:
         return np.concatenate([x[self.start :] for x in series])
 
     def _block_diagonal(self, columns: Sequence[Sequence[Floats]]) -> list[Floats]:

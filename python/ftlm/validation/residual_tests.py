@@ -144,6 +144,11 @@ class OutputResiduals:
         return tuple(name for name, test in self.feedback_tests.items() if test.has_feedback)
 
     @property
+    def is_noise(self) -> bool:
+        """Whether the residuals follow no input that moves, by conclusive tests."""
+        return all(test.passed for test in self.informative_tests.values())
+
+    @property
     def informative_tests(self) -> dict[str, CorrelationTest]:
         """Tests of the inputs that vary, or of all inputs if none does."""
         return {n: t for n, t in self.inputs.items() if t.conclusive or not math.isnan(t.limit)} or self.inputs
@@ -437,7 +442,8 @@ def failed_tests(tests: Residuals) -> list[Finding]:
         white = output.whiteness
         if not white.passed:
             numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
-            found.append(finding("output_not_white", output=name, **numbers))
+            noise = finding("noise_coloured", output=name)
+            found.append(noise if output.is_noise else finding("output_not_white", output=name, **numbers))
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
