@@ -211,10 +211,11 @@ def _line_columns(u: Floats) -> list[Floats]:
     """Cosines and sines of the spectral lines of an input, whose memory exceeds any number of lags."""
     count = u.size
     size = 1 << math.ceil(math.log2(8 * count))
-    window, time, x = np.hanning(count), np.arange(count), u - u.mean()
+    window, time, x = np.hanning(count - 1), np.arange(count), u - u.mean()
     columns: list[Floats] = []
     for _ in range(min(MAX_LINES, count // 60)):
-        power = np.abs(np.fft.rfft(x * window, size)) ** 2
+        # Of differences, because the slow part of a random walk stands out like a line, and is none.
+        power = np.abs(np.fft.rfft(np.diff(x) * window, size)) ** 2
         power[:16] = 0
         at = int(np.argmax(power))
         near = power[max(0, at - LINE_NEIGHBORS) : at + LINE_NEIGHBORS + 1]
