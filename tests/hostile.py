@@ -516,6 +516,11 @@ class Sound:
         applies = self.sensor(record[1].shape[1], record[0]), [True, False][: len(model)]
         return record, model, list(self.INPUTS), self.terms(), self.one(None, None, applies)
 
+    def state_space_respond(self):
+        model, record = self.model(), self.record(sensor=False)
+        driving = [(2, self.normal((record[1].shape[1],)), True, 0.5, 0.0)]
+        return model, list(self.INPUTS), driving, [[(0.0, 1.0)] for _ in model], record[0], record[1].shape[1]
+
     def equation_error(self):
         return self.record(), self.equation(), list(self.INPUTS), self.terms()
 

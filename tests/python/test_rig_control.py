@@ -278,7 +278,7 @@ REFUSED = [
     ({"reference": np.zeros((200, 2)), "rate": 0}, ftlm.ModelError, "rate = 0"),
     ({"reference": np.zeros((200, 2)), "watchdog": 0.0}, ftlm.ModelError, "watchdog = 0"),
     ({"reference": np.zeros((200, 2)), "rig": "q9"}, ftlm.ModelError, "'q9' is not known"),
-    ({"reference": range(1 << 40)}, ftlm.DataError, "no array of numbers"),
+    ({"reference": range(1 << 40)}, ftlm.ModelError, "has more than 50000000 values"),
     ({"reference": np.zeros((200, 2)), "rig": 10**5000}, ftlm.ModelError, "rig is a int"),
     ({"reference": np.zeros((200, 2)), "rate": 10**5000}, ftlm.ModelError, "rate = an integer of"),
     ({"reference": np.zeros((200, 2)), "watchdog": "0.1"}, ftlm.ModelError, "watchdog = '0.1' is not a number"),

@@ -184,7 +184,7 @@ def test_tables_4_and_5_come_near_as_equation_errors(tables):
         table = printed.FRACTIONAL_ROWS[output]
         assert made.ratio < 1.15, output
         # With the identity for K0 only the hubs come near.
-        assert (made.away_at_one > 3) is output.endswith("2"), output
+        assert (made.ratio_at_unit_prior > 3) is output.endswith("2"), output
         for p, row in made.rows.items():
             assert np.sign(row.coefficients["a"]) == np.sign(table[p].coefficients["a"])
             assert row.equation.error / table[p].error == pytest.approx(1.0, abs=0.25), (output, p)

@@ -429,6 +429,7 @@ def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RA
     exact = roots_in_base(polynomial)
     if exact is not None:
         base, roots = exact
+        roots = roots[np.abs(roots) > 0]
         w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
         # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
         kept = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= reach)]

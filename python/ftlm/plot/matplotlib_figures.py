@@ -68,7 +68,7 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     """Return (figure, grid of rows by columns) from the given axes or a new figure."""
     if ax is None:
         return figure_of(rows, columns, **options)
-    given = np.atleast_1d(as_array("ax", ax)).ravel()
+    given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
     strange = [type(a).__name__ for a in given if not hasattr(a, "plot") or not hasattr(a, "figure")]
     if strange:
         raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")

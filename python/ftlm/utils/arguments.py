@@ -6,8 +6,10 @@ import functools
 import inspect
 import math
 import os
+import sys
+import sysconfig
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -17,6 +19,9 @@ from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, real_number, short_repr, 
 
 #: Exceptions that arguments of another type cause.
 _FROM_ARGUMENTS = (TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
+
+#: Folders of Python and of its packages.
+_LIBRARY_FOLDERS = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
@@ -62,7 +67,9 @@ def check_arguments(decorated: Decorated) -> Decorated:
             return decorated(*given, **named)
         except Exception as error:
             # A decorated function below names its own argument, and the caller knows the one of this function.
-            if not isinstance(error, FtlmError) or isinstance(error.__cause__, _FROM_ARGUMENTS):
+            cause = error.__cause__ if isinstance(error, FtlmError) else error
+            foreign = cause is error or isinstance(cause, _FROM_ARGUMENTS)
+            if foreign and cause is not None and not _is_raised_by_caller(cause):
                 _raise_in_words(decorated, given, named, error)
             raise
 
@@ -78,6 +85,17 @@ def _check_range(function: Callable[..., Any], given: Any, named: Any) -> None:
             )
 
 
+def _is_raised_by_caller(error: BaseException) -> bool:
+    """Whether an exception comes from code of the caller that ftlm called: a callback, a controller, a board."""
+    trace = error.__traceback__
+    while trace is not None:
+        package = str(trace.tb_frame.f_globals.get("__name__")).partition(".")[0]
+        if package != "ftlm" and not trace.tb_frame.f_code.co_filename.startswith(_LIBRARY_FOLDERS):
+            return True
+        trace = trace.tb_next
+    return False
+
+
 def _raise_in_words(function: Callable[..., Any], given: Any, named: Any, error: Exception) -> None:
     """Raise for the first argument that is not what its annotation says."""
     signature = inspect.signature(function)
@@ -88,7 +106,8 @@ def _raise_in_words(function: Callable[..., Any], given: Any, named: Any, error:
     for name, value in bound.arguments.items():
         annotation = signature.parameters[name].annotation
         kinds = _alternatives(annotation) if isinstance(annotation, str) else []
-        if kinds and not any(_fits(value, kind) for kind in kinds):
+        scope = getattr(inspect.unwrap(function), "__globals__", {})
+        if kinds and not any(_fits(value, kind, scope) for kind in kinds):
             words = " or ".join(dict.fromkeys(_KIND_WORDS.get(k.partition("[")[0], k) for k in kinds))
             raise ModelError(
                 f"{setting(name)} {short_repr(value)} is a {type(value).__name__}; give {words}"
@@ -107,8 +126,11 @@ def _alternatives(annotation: str) -> list[str]:
     return [part.strip() for part in found]
 
 
-def _fits(value: object, kind: str) -> bool:
-    """Whether a value is what an annotation without alternatives says; True for annotations that are not known."""
+def _fits(value: object, kind: str, scope: Mapping[str, Any]) -> bool:
+    """Whether a value is what an annotation without alternatives says; True for annotations that are not known.
+
+    ``scope`` holds the names of the module; a class is known if it is one of them or public, and no protocol.
+    """
     name, _, inner = kind.partition("[")
     inner = inner.removesuffix("]")
     if name == "None":
@@ -130,7 +152,7 @@ def _fits(value: object, kind: str) -> bool:
     if name == "Mapping":
         key, _, of = inner.partition(", ")
         items = list(value.items())[:_MAX_CHECKED_ITEMS] if isinstance(value, Mapping) else None
-        return items is not None and all(_fits_any(k, key) and _fits_any(v, of) for k, v in items)
+        return items is not None and all(_fits_any(k, key, scope) and _fits_any(v, of, scope) for k, v in items)
     if name == "Callable":
         return callable(value)
     if name in ("Sequence", "Iterable", "Collection", "tuple", "list"):
@@ -139,22 +161,16 @@ def _fits(value: object, kind: str) -> bool:
         members = inner.removesuffix(", ...").split(", ") if name == "tuple" else [inner]
         same = len(set(members)) == 1
         if isinstance(value, str):
-            return _fits_any(value, members[0])
+            return _fits_any(value, members[0], scope)
         return not (same and isinstance(value, (list, tuple))) or all(
-            _fits_any(v, members[0]) for v in value[:_MAX_CHECKED_ITEMS]
+            _fits_any(v, members[0], scope) for v in value[:_MAX_CHECKED_ITEMS]
         )
-    if name in ("Any", "object") or not name.isidentifier() or not name[0].isupper() or name in _OPEN_NAMES:
-        return True
-    return any(base.__name__ == name for base in type(value).__mro__)
+    known = scope.get(name, getattr(sys.modules.get("ftlm"), name, None))
+    return not isinstance(known, type) or Protocol in known.__mro__ or isinstance(value, known)
 
 
-#: Names of annotations that stand for several types.
-_OPEN_NAMES = {"ArrayLike", "Floats", "Complex", "Values", "Weights", "Controller", "EstimationMethod"}
-_OPEN_NAMES |= {"OrderParameters", "Self", "Intersample", "Initial"}
-
-
-def _fits_any(value: object, annotation: str) -> bool:
-    return not annotation or any(_fits(value, kind) for kind in _alternatives(annotation))
+def _fits_any(value: object, annotation: str, scope: Mapping[str, Any]) -> bool:
+    return not annotation or any(_fits(value, kind, scope) for kind in _alternatives(annotation))
 
 
 def _is_real(value: object) -> bool:
