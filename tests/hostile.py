@@ -517,9 +517,9 @@ class Sound:
         return record, model, list(self.INPUTS), self.terms(), self.one(None, None, applies)
 
     def state_space_respond(self):
-        model, record = self.model(), self.record(sensor=False)
-        driving = [(2, self.normal((record[1].shape[1],)), True, 0.5, 0.0)]
-        return model, list(self.INPUTS), driving, [[(0.0, 1.0)] for _ in model], record[0], record[1].shape[1]
+        model = [((0, 2.0, [(0, 0.0), (0, 1.0), (2, 0.0)]), [-3.0, self.number(-1, 0), 1.0])]
+        rows = self.m()
+        return model, list(self.INPUTS), [(2, self.normal((rows,)), True, 0.5, 0.0)], [[(0.0, 1.0)]], self.step(), rows
 
     def equation_error(self):
         return self.record(), self.equation(), list(self.INPUTS), self.terms()
