@@ -133,7 +133,7 @@ from ftlm.rig.quanser import QuanserBoard
 from quanser_stand_in import Board
 hardware = Board("linear", page={page!r})
 sys.modules |= hardware.modules()
-recording.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+recording.Limits = lambda: rig.Limits(max_write_delay=60.0, max_missed_deadlines=10**9)
 run = dict(arm=True, input="sine", amplitude=0.3, duration=25.0, watchdog=1.0)
 threading.Thread(target=rig.record, args=(QuanserBoard(),), kwargs=run, daemon=True).start()
 while hardware.page.volts == (0.0, 0.0):
