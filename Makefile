@@ -27,7 +27,6 @@ $(VENV)/.built: $(VENV)/.tools $(CORE)
 
 lint: $(VENV)/.built
 	cargo fmt --check
-	cargo clippy --release --quiet -- -D warnings
 	cargo clippy --release --all-targets --quiet -- -D warnings
 	cargo clippy --release --all-targets --features python --quiet -- -D warnings
 	cargo doc --no-deps --quiet --features rig,oracles
