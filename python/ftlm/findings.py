@@ -851,7 +851,7 @@ def _storable(value: float | str) -> float | int | str:
     return value if isinstance(value, str) else int(value)
 
 
-def finding(code: str, **words: Any) -> Finding:
+def make_finding(code: str, **words: Any) -> Finding:
     """Return a finding of the catalogue with its subject and numbers, by name."""
     subject = {n: words.pop(n) for n in SUBJECT_FIELDS if n in words}
     return Finding(code, **subject, numbers=words)
@@ -884,7 +884,7 @@ class FindingGroup:
     findings: tuple[Finding, ...]
 
     @property
-    def first(self) -> Finding:
+    def first_finding(self) -> Finding:
         """First finding."""
         return self.findings[0]
 
@@ -897,7 +897,11 @@ class FindingGroup:
     @property
     def remedy(self) -> str:
         """Remedy; empty if the sentence states it."""
-        return "" if self.first.kind.states_remedy or self.first.topic.remedy == _PLAIN_REMEDY else self.first.remedy
+        return (
+            ""
+            if self.first_finding.kind.states_remedy or self.first_finding.topic.remedy == _PLAIN_REMEDY
+            else self.first_finding.remedy
+        )
 
 
 def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.findings import finding
+from ftlm.findings import make_finding
 from ftlm.report.html_report import model_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -51,7 +51,7 @@ def folder(tmp_path_factory, small_model, small_run, with_noise):
     )
     free = ftlm.equation(words, orders={"alpha": "1.3:1.9:0.1", "nu": "0.2:1.2:0.1"})
     searched = ftlm.identify(run, replace(free, name="search " + HOSTILE), method="multi-innovation")
-    noted = finding("data_note", text="a warning " + HOSTILE)
+    noted = make_finding("data_note", text="a warning " + HOSTILE)
     warned = replace(searched, findings=(*searched.findings, noted))
     warned.report(where / "search.html")
     model_page(ftlm.load_model(fit.model.save(where / "m.json")), where / "model.html", validation=other)

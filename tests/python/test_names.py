@@ -42,7 +42,7 @@ NOUNS = frozenset(
     seed speed need feed string ring spring sampling damping spacing timing warning setting settings meaning
     heading padding mapping logging reading testing rounding bearing ceiling filling opening coupling scaling
     smoothing weighting plotting streaming indexing ordering loading screening pruning reply apply only
-    multiply family assembly thing king hundred feedback finding
+    multiply family assembly thing king hundred feedback
     """.split()  # noqa: SIM905 — read as words, not as a column of literals
 )
 #: Boolean properties, and names that an interface of a library or of the core dictates.

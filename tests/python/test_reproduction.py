@@ -12,7 +12,7 @@ import pytest
 
 import ftlm
 from ftlm import DataError
-from ftlm.findings import finding
+from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.claims import claims, table_3_coefficients
@@ -595,8 +595,8 @@ def test_threads_do_not_change_a_number(reproduction):
 
 def test_warnings_that_differ_in_numbers_alone_stand_together(reproduction):
     result = reproduction.stages[1].candidates["output error"].result
-    little = [finding("explains_little", output=o, nr=nr) for o, nr in (("y1", 0.6), ("y1", 0.7), ("y2", 0.6))]
-    edge = finding("on_edge", parameter="alpha1", value=1.05)
+    little = [make_finding("explains_little", output=o, nr=nr) for o, nr in (("y1", 0.6), ("y1", 0.7), ("y2", 0.6))]
+    edge = make_finding("on_edge", parameter="alpha1", value=1.05)
     one, two = replace(result, findings=(little[0], edge)), replace(result, findings=tuple(little[1:]))
     assert grouped_findings({"a": one, "b": two, "c": None}) == [
         "a, b: y1: the free run explains little of the output (NR 0.6) (numbers of the first)",

@@ -23,6 +23,7 @@ import store as bench
 from ftlm import _core
 from ftlm.errors import ModelError
 from ftlm.order_search import checkpoint as frames
+from ftlm.order_search.batches import EquationSearchState
 from ftlm.order_search.checkpoint import (
     FILE_SIGNATURE,
     CoupledTable,
@@ -963,3 +964,12 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path):
         os.waitpid(child, 0)
         os.close(ready)
         os.close(started)
+
+
+def test_candidates_excluded_in_boxes_count_once_in_the_progress():
+    state = object.__new__(EquationSearchState)
+    state._parts, state.done = [], 0
+    # 100 candidates: 2 kept, 3 beaten, 90 excluded by a bound, 60 of them in boxes, 4 stopped early, 1 singular.
+    counts = (100, 2, 3, 90, 4, 1, 0, 60)
+    state.add_block(frames.Rounds(0, 0, 1, ((), counts, ())))
+    assert state.done == counts[0]

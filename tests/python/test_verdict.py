@@ -19,7 +19,7 @@ from ftlm.estimation import estimators as estimating
 from ftlm.estimation import nuisance_parameters as history
 from ftlm.estimation.output_error import ProfileInterval, fit_output_error
 from ftlm.estimation.verdict import saved_verdict
-from ftlm.findings import FINDING_CATALOGUE, FINDING_TOPICS, MAX_SUMMARY_FINDINGS, Finding, finding, group_findings
+from ftlm.findings import FINDING_CATALOGUE, FINDING_TOPICS, MAX_SUMMARY_FINDINGS, Finding, group_findings, make_finding
 from ftlm.report.html_report import model_page
 from loops import loop
 
@@ -96,9 +96,9 @@ def test_a_validation_that_leaves_much_more_is_with_care(found, checked):
 @pytest.mark.parametrize(
     "doubt",
     [
-        finding("input_number_not_told", parameter="delay_u", words="delay of u"),
-        finding("stribeck_slow_untold", output="y", ratio=2.0, speed=1.0, slow=0, total=9),
-        finding("reference_weak", input="u", reference="r", f=2.0, needed=10.0),
+        make_finding("input_number_not_told", parameter="delay_u", words="delay of u"),
+        make_finding("stribeck_slow_untold", output="y", ratio=2.0, speed=1.0, slow=0, total=9),
+        make_finding("reference_weak", input="u", reference="r", f=2.0, needed=10.0),
     ],
 )
 def test_what_no_number_says_speaks_against_a_model(found, checked, doubt):
@@ -235,9 +235,9 @@ def test_rough_intervals_are_a_fact(found, checked):
 
 
 #: Findings as fits give them: facts, one of weight.
-ROUGH = finding("intervals_rough", parameter="a0")
-TIED = finding("numbers_correlated", parameter="a0 and b0", why="correlation 0.9960")
-BOUND = finding("on_bound", parameter="alpha", what="order alpha", value="2")
+ROUGH = make_finding("intervals_rough", parameter="a0")
+TIED = make_finding("numbers_correlated", parameter="a0 and b0", why="correlation 0.9960")
+BOUND = make_finding("on_bound", parameter="alpha", what="order alpha", value="2")
 
 
 @pytest.mark.parametrize("words", ["D y = 2 u", "D^2 y = 2 u", "D^2 y = -0.3 D y + u", "D^1.5 y = -D^0.5 y + u"])
@@ -325,7 +325,7 @@ def test_a_saved_model_keeps_the_records(found, tmp_path):
 
 
 def test_findings_survive_a_file(found, tmp_path):
-    infinite = finding("explains_little", output="y", nr=math.inf)
+    infinite = make_finding("explains_little", output="y", nr=math.inf)
     kept = replace_estimate(found.model, findings=(infinite.to_file(), BOUND.to_file()))
     read = ftlm.load_model(kept.save(tmp_path / "m.json")).estimate.findings
     assert [f.text for f in read] == [infinite.text, BOUND.text]
@@ -408,7 +408,7 @@ def test_nothing_reads_a_sentence():
 
 
 def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_path):
-    poor = replace(found, findings=(BOUND, TIED, finding("offset_missing", output="y", share=30.0, test="x")))
+    poor = replace(found, findings=(BOUND, TIED, make_finding("offset_missing", output="y", share=30.0, test="x")))
     model = replace_estimate(found.model, findings=(BOUND.to_file(),), against=(BOUND.to_file(),))
     before = poor.verdict(checked), saved_verdict(model, [])
     for code, kind in FINDING_CATALOGUE.items():
@@ -428,11 +428,11 @@ def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_
     "name", ["before the rig stopped", "psf, a channel that was off; a closed loop", "{code} | %s"]
 )
 def test_the_name_of_a_run_is_no_reason(found, checked, name):
-    noted = finding("data_note", run=name, text=f"resampled as {name}")
+    noted = make_finding("data_note", run=name, text=f"resampled as {name}")
     judged = replace(found, findings=(noted,)).verdict(checked)
     assert judged.trusted
     assert noted.text == f"run {name}: resampled as {name}"
-    fallen = finding("fit_falls", run=name, output=name, before=99.0, after=50.0, where="")
+    fallen = make_finding("fit_falls", run=name, output=name, before=99.0, after=50.0, where="")
     assert fallen.text.startswith(f"{name}: the fit of {name} falls from 99 % on")
 
 
@@ -461,11 +461,11 @@ def test_remedies_know_the_method():
 
 def test_findings_are_grouped_the_most_serious_first():
     said = [
-        finding("output_not_white", output="theta11", statistic=3.0, lags=25, limit=2.0),
-        finding("on_edge", parameter="alpha", value=1.6),
-        finding("residuals_follow_input", output="theta11", input="I1", value=0.3, lag=1, limit=0.1),
-        finding("free_run_grows", stability="not stable: 1 pole", poles="1 pole"),
-        finding("data_note", run="r", text="time read in ms, as the header 'time [ms]' says"),
+        make_finding("output_not_white", output="theta11", statistic=3.0, lags=25, limit=2.0),
+        make_finding("on_edge", parameter="alpha", value=1.6),
+        make_finding("residuals_follow_input", output="theta11", input="I1", value=0.3, lag=1, limit=0.1),
+        make_finding("free_run_grows", stability="not stable: 1 pole", poles="1 pole"),
+        make_finding("data_note", run="r", text="time read in ms, as the header 'time [ms]' says"),
     ]
     found = group_findings([*said, said[0]])
     assert [g.first.kind.topic for g in found] == ["unstable", "residuals", "edge", "other"]
@@ -474,17 +474,17 @@ def test_findings_are_grouped_the_most_serious_first():
     assert sum(len(g.findings) for g in found) == len(said)
     assert group_findings([]) == ()
     # What is of no topic stands alone.
-    notes = [finding("data_note", text=text) for text in ("this", "that")]
+    notes = [make_finding("data_note", text=text) for text in ("this", "that")]
     assert [g.findings for g in group_findings(notes)] == [(notes[0],), (notes[1],)]
 
 
 def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
     many = (
-        *(finding("prior_pulls", output="y", prior=k, share=3.0, length=7) for k in range(3)),
+        *(make_finding("prior_pulls", output="y", prior=k, share=3.0, length=7) for k in range(3)),
         BOUND,
-        finding("coefficient_law_broken", parameter="a", value=1.0, wanted=2.0),
-        finding("quantised", run="r", output="y", step=1.0, noise=0.1),
-        finding("loop_found", output="y", input="u", ratio=9.0, effect=""),
+        make_finding("coefficient_law_broken", parameter="a", value=1.0, wanted=2.0),
+        make_finding("quantised", run="r", output="y", step=1.0, noise=0.1),
+        make_finding("loop_found", output="y", input="u", ratio=9.0, effect=""),
     )
     poor = worse(found, findings=many)
     text = str(poor)

@@ -11,7 +11,7 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.fit import Fit
-from ftlm.findings import Finding, finding
+from ftlm.findings import Finding, make_finding
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import minimum_norm_solution
 from ftlm.utils.parameters import parameter
@@ -89,7 +89,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
         found = first_stage_f(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
         if found < MIN_FIRST_STAGE_F:
             numbers = {"f": found, "needed": MIN_FIRST_STAGE_F}
-            findings.append(finding("reference_weak", input=name, reference=reference, **numbers))
+            findings.append(make_finding("reference_weak", input=name, reference=reference, **numbers))
     return [run_with_inputs(run, {n: a[k] for n, a in answers.items()}) for k, run in enumerate(runs)], findings
 
 

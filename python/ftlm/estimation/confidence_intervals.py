@@ -22,7 +22,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance, covariance_of
 from ftlm.estimation.output_error import JointFit, Loss, ProfileInterval, fit_output_error
 from ftlm.estimation.result import Identification
-from ftlm.findings import Finding, finding
+from ftlm.findings import Finding, make_finding
 from ftlm.utils.linalg import dot, projections, thin_svd
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import interruptible_pool
@@ -609,9 +609,9 @@ def with_intervals(
             continue
         joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
         before, after = (", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise))
-        findings = [finding("lower_optimum_found", starts=tried, before=before, after=after)]
+        findings = [make_finding("lower_optimum_found", starts=tried, before=before, after=after)]
     if found.incomplete_names:
-        findings.append(finding("intervals_rough", parameter=", ".join(found.incomplete_names)))
+        findings.append(make_finding("intervals_rough", parameter=", ".join(found.incomplete_names)))
     return replace(joint, profiles=found.intervals), findings
 
 

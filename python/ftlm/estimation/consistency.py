@@ -16,7 +16,7 @@ from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.methods import EstimationMethod, resolve_method
 from ftlm.estimation.result import Identification
-from ftlm.findings import Finding, finding, texts
+from ftlm.findings import Finding, make_finding, texts
 from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.arguments import check_arguments
@@ -149,12 +149,12 @@ class Consistency(ReportMixin):
         """Limitations of the comparison: parameters that are not identifiable, and findings on each segment."""
         out = []
         if self.not_identifiable and self.consistent is not None:
-            out.append(finding("not_told_by_part", parameter=", ".join(self.not_identifiable)))
+            out.append(make_finding("not_told_by_part", parameter=", ".join(self.not_identifiable)))
         for name, result in zip(self.names, self.results, strict=True):
             if result.fit is not None and not result.fit.converged:
-                out.append(finding("part_not_converged", run=name))
+                out.append(make_finding("part_not_converged", run=name))
         if any(f.code == "residuals_not_white" for r in self.results for f in r.findings):
-            out.append(finding("parts_not_white"))
+            out.append(make_finding("parts_not_white"))
         return tuple(out)
 
     @property

@@ -24,7 +24,7 @@ from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_ini
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, Loss
 from ftlm.estimation.result import Task
-from ftlm.findings import Finding, finding
+from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import SearchSettings
@@ -209,7 +209,7 @@ def estimate_output_error(
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = replace(structure, initial="history")
-        findings.append(finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
+        findings.append(make_finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
@@ -285,7 +285,7 @@ def estimate_order_search(
             *fit.findings,
             *step_bias_findings(task.runs, at_orders, settings, fit),
             *coefficient_law_findings(model),
-            *(finding("on_edge", parameter=n, value=v) for n, v in edges),
+            *(make_finding("on_edge", parameter=n, value=v) for n, v in edges),
         ],
         searches,
         errors,

@@ -18,7 +18,7 @@ from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.frequency_result import FrequencyIdentification
 from ftlm.estimation.levenberg_marquardt import LeastSquaresResult, constrained_least_squares
 from ftlm.estimation.objective import covariance_of
-from ftlm.findings import Finding, finding
+from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.structure.equation import Equation, Term
@@ -805,12 +805,12 @@ def _result(
     names = problem.names
     standard = dict(zip(names, errors.tolist(), strict=True))
     if too_large:
-        findings.append(finding("deviations_exceeded", ratio=math.sqrt(chi)))
+        findings.append(make_finding("deviations_exceeded", ratio=math.sqrt(chi)))
     if not white:
-        findings.append(finding("response_not_white"))
+        findings.append(make_finding("response_not_white"))
     if not best.converged:
-        findings.append(finding("response_not_converged"))
-    findings += [finding("response_on_bound", bound=bound) for bound in held]
+        findings.append(make_finding("response_not_converged"))
+    findings += [make_finding("response_on_bound", bound=bound) for bound in held]
     findings += _identifiability_findings(problem, values, standard)
     named = dict(zip(names, values.tolist(), strict=True))
     model = _model(problem, records, named, values, covariance, standard, findings)
@@ -854,12 +854,12 @@ def _identifiability_findings(problem: ResponseProblem, values: Floats, standard
     unseen = [n for n, e in standard.items() if not math.isfinite(e)]
     out = []
     if unseen:
-        out.append(finding("response_not_told_apart", parameter=", ".join(unseen)))
+        out.append(make_finding("response_not_told_apart", parameter=", ".join(unseen)))
     for name, value in zip(problem.names, values.tolist(), strict=True):
         error = standard[name]
         vague = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)
         if math.isfinite(error) and vague:
-            out.append(finding("response_number_vague", parameter=name, value=value, error=error))
+            out.append(make_finding("response_number_vague", parameter=name, value=value, error=error))
     return out
 
 

@@ -18,7 +18,7 @@ from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError
 from ftlm.estimation.model_checks import has_growing_mode, unstable_poles_text
 from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_from, verdict_html
-from ftlm.findings import Finding, finding, group_findings, texts
+from ftlm.findings import Finding, group_findings, make_finding, texts
 from ftlm.model.model import Model
 from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
@@ -288,17 +288,17 @@ class FrequencyIdentification:
         for error in (*own, *(others or ())):
             if not error.rms <= 100 * MAX_RELATIVE_ERROR:
                 subject = {"run": error.name, "output": error.output, "input": error.input}
-                found.append(finding("response_missed", **subject, rms=error.rms))
+                found.append(make_finding("response_missed", **subject, rms=error.rms))
         found += self._unstable_poles()
-        found += [group.first for group in group_findings(self.findings)]
+        found += [group.first_finding for group in group_findings(self.findings)]
         if others is not None:
             most = max(e.rms for e in own)
             lost = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
             if lost:
-                found.append(finding("response_lost", run=lost[0].name, own=most, rms=lost[0].rms))
+                found.append(make_finding("response_lost", run=lost[0].name, own=most, rms=lost[0].rms))
         same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
         if others is None or same:
-            found.append(finding("response_not_validated"))
+            found.append(make_finding("response_not_validated"))
         against = verdict_from(found)
         if against is not None:
             return against
@@ -310,7 +310,7 @@ class FrequencyIdentification:
         with contextlib.suppress(FtlmError):
             stable = self.model.stability(coupling="simulated")
             if stable.unstable_poles > 0 and has_growing_mode(self.model, "simulated"):
-                return [finding("response_grows", poles=unstable_poles_text(stable.unstable_poles))]
+                return [make_finding("response_grows", poles=unstable_poles_text(stable.unstable_poles))]
         return []
 
     @check_arguments

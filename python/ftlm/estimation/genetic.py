@@ -18,7 +18,7 @@ from ftlm.errors import ModelError
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction, make_model
 from ftlm.estimation.model_checks import coefficient_law_findings
 from ftlm.estimation.result import Task
-from ftlm.findings import finding
+from ftlm.findings import make_finding
 from ftlm.order_search.options import Norm
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import Record, order_grid_tuple, prepare
@@ -559,11 +559,11 @@ class GeneticAlgorithm:
         for name, (low, high) in bounds.items():
             value = {**orders, **coefficients}[name]
             if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
-                findings.append(finding("genetic_on_bound", parameter=name, value=value))
+                findings.append(make_finding("genetic_on_bound", parameter=name, value=value))
         for name, end in ends.items():
             low, high = min(end.errors.values()), max(end.errors.values())
             if high > MAX_SEED_ERROR_RATIO * low:
-                findings.append(finding("seeds_disagree", output=name, low=low, high=high))
+                findings.append(make_finding("seeds_disagree", output=name, low=low, high=high))
         used = {
             "method": self.name,
             "norm": self.norm,

@@ -36,7 +36,7 @@ from ftlm.estimation.nuisance_parameters import (
 from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import result_findings
-from ftlm.findings import Finding, finding, unique
+from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
@@ -99,7 +99,7 @@ def _history_offset_findings(fit: Fit) -> list[Finding]:
         return []
     less = joint.initial_terms - few.initial_terms
     outputs = ", ".join(fit.model.outputs)
-    return [finding("constant_instead_of_past", output=outputs, terms=joint.initial_terms, fewer=less)]
+    return [make_finding("constant_instead_of_past", output=outputs, terms=joint.initial_terms, fewer=less)]
 
 
 def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
@@ -279,7 +279,7 @@ def assess_fit(fit: Fit) -> Identification:
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
     """Return residuals that are not white as colored noise, where they follow no input."""
     colored = item.code == "residuals_not_white" and tests.outputs[item.output].is_noise
-    return finding("noise_coloured", output=item.output) if colored else item
+    return make_finding("noise_coloured", output=item.output) if colored else item
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:

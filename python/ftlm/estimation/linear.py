@@ -13,7 +13,7 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import check_step
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError
-from ftlm.findings import Finding, finding
+from ftlm.findings import Finding, make_finding
 from ftlm.order_search.options import RowBasis, SearchSettings
 from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
 from ftlm.structure.equation import Equation
@@ -104,9 +104,11 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             IV_RELATIVE_TOLERANCE,
         )
         if not found["converged"]:
-            fit.findings.append(finding("instruments_not_converged", output=outputs, iterations=found["iterations"]))
+            fit.findings.append(
+                make_finding("instruments_not_converged", output=outputs, iterations=found["iterations"])
+            )
         if found["damped"]:
-            fit.findings.append(finding("instruments_unstable", output=outputs))
+            fit.findings.append(make_finding("instruments_unstable", output=outputs))
         for item, (raw, _, _, _), covariance in zip(group, found["estimates"], found["covariances"], strict=True):
             fit.values.update(named_coefficients(item, raw))
             free = [t for t in item.terms if t.fixed is None]
@@ -137,7 +139,7 @@ def step_bias_findings(
     finer = f"raise m, up to {carried}, or " if fit.m < carried else ""
     # Far from the limit a third of the move says no more than that it is large.
     amount = f"about {moved[worst]:.2g}" if moved[worst] <= 10 else "more than 10"
-    return [finding("step_bias", parameter=worst, m=fit.m, amount=amount, finer=finer)]
+    return [make_finding("step_bias", parameter=worst, m=fit.m, amount=amount, finer=finer)]
 
 
 def _prior_findings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[Finding]:
@@ -147,7 +149,7 @@ def _prior_findings(output: str, raw: list[float], weak: list[float], settings: 
     if worst <= MAX_PRIOR_SHIFT:
         return []
     numbers = {"prior": settings.prior_covariance, "share": 100 * min(worst, 9.99)}
-    return [finding("prior_pulls", output=output, length=settings.innovation_length, **numbers)]
+    return [make_finding("prior_pulls", output=output, length=settings.innovation_length, **numbers)]
 
 
 @dataclass(frozen=True)

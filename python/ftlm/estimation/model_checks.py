@@ -17,7 +17,7 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
 from ftlm.estimation.result import Identification
-from ftlm.findings import Finding, finding, unique
+from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import compared_values, has_nonuniform_samples
 from ftlm.simulation.output_samples import OutputSamples
@@ -58,41 +58,41 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
     """Return findings on convergence and on parameters that the runs do not determine."""
     findings = []
     if not joint.converged:
-        findings.append(finding("not_converged"))
+        findings.append(make_finding("not_converged"))
     if not joint.step_converged:
-        findings.append(finding("step_moves_estimate", pulses=joint.refinement))
+        findings.append(make_finding("step_moves_estimate", pulses=joint.refinement))
     findings += _unstable_optimum_findings(joint)
     errors = joint.standard_errors
     unseen = [n for n in joint.names if math.isinf(errors[n])]
     if unseen:
-        findings.append(finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen)))
+        findings.append(make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen)))
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
         # Negated so that a standard error that is not a number counts as too large.
         if name in unseen:
             continue
         if not errors[name] <= high - low and not _has_bounded_interval(joint, name):
-            findings.append(finding("order_not_told", parameter=name))
+            findings.append(make_finding("order_not_told", parameter=name))
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
-            findings.append(finding("on_bound", parameter=name, what=f"order {name}", value=f"{value:g}"))
+            findings.append(make_finding("on_bound", parameter=name, what=f"order {name}", value=f"{value:g}"))
     for item in problem.inputs:
         value, (low, high) = joint.inputs[item.name], item.bounds
         if item.name in unseen:
             continue
         if not errors[item.name] <= high - low and not _has_bounded_interval(joint, item.name):
-            findings.append(finding("input_number_not_told", parameter=item.name, words=item.words))
+            findings.append(make_finding("input_number_not_told", parameter=item.name, words=item.words))
         elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
             unit = " s" if item.law == "delay" else ""
             findings.append(
-                finding("on_bound", parameter=item.name, what=f"the {item.words}", value=f"{value:g}{unit}")
+                make_finding("on_bound", parameter=item.name, what=f"the {item.words}", value=f"{value:g}{unit}")
             )
     for name, value in joint.coefficients.items():
         # Where the cost is no parabola, its profile knows better.
         told = name in joint.profiles and 0.0 not in joint.profiles[name]
         if name not in unseen and not errors[name] <= abs(value) and not told:
-            findings.append(finding("not_different_from_0", parameter=name, value=value, error=errors[name]))
+            findings.append(make_finding("not_different_from_0", parameter=name, value=value, error=errors[name]))
     findings += correlation_findings(joint) + unbounded_interval_findings(joint, unseen)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
-    return [*findings, *(finding("residuals_not_white", output=output) for output in coloured)]
+    return [*findings, *(make_finding("residuals_not_white", output=output) for output in coloured)]
 
 
 def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:
@@ -104,10 +104,10 @@ def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:
     if not joint.unstable_optimum.is_accepted:
         limit = joint.unstable_optimum.at_stability_limit
         smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.unstable_optimum.residual_excess))
-        return [finding("damping_not_told" if limit else "unstable_optimum_discarded", smaller=smaller)]
+        return [make_finding("damping_not_told" if limit else "unstable_optimum_discarded", smaller=smaller)]
     if not math.isfinite(excess):
-        return [finding("no_stable_optimum")]
-    return [finding("unstable_optimum_kept", excess=excess)]
+        return [make_finding("no_stable_optimum")]
+    return [make_finding("unstable_optimum_kept", excess=excess)]
 
 
 def _has_bounded_interval(joint: JointFit, name: str) -> bool:
@@ -127,7 +127,7 @@ def unbounded_interval_findings(joint: JointFit, unseen: Sequence[str]) -> list[
     if not open_ended:
         return []
     words = [f"{n} {' or '.join(s)}" for n, s in open_ended.items()]
-    return [finding("interval_open", parameter=", ".join(open_ended), sides=", ".join(words))]
+    return [make_finding("interval_open", parameter=", ".join(open_ended), sides=", ".join(words))]
 
 
 def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[Finding]:
@@ -144,7 +144,7 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
         run.name for run in runs if run.sample_times is not None and not has_nonuniform_samples(run, problem.structure)
     ]
     if kept:
-        findings.append(finding("times_not_honoured", run=", ".join(kept)))
+        findings.append(make_finding("times_not_honoured", run=", ".join(kept)))
     return findings
 
 
@@ -169,7 +169,7 @@ def _outlier_findings(runs: Sequence[Run], joint: JointFit, output: str) -> list
         return []
     verb, holds, noun = ("lies", "holds", "an outlier") if far == 1 else ("lie", "hold", "outliers")
     return [
-        finding(
+        make_finding(
             "outliers_dominate" if share >= MIN_OUTLIER_POWER_FRACTION else "outliers",
             output=output,
             count=far,
@@ -198,7 +198,7 @@ def _quantization_findings(runs: Sequence[Run], structure: Structure, output: st
     if not coarse:
         return []
     step, run = max(coarse, key=lambda pair: pair[0])
-    return [finding("quantised", run=run.name, output=output, step=step, noise=noise)]
+    return [make_finding("quantised", run=run.name, output=output, step=step, noise=noise)]
 
 
 def quantization_step(values: Floats) -> float:
@@ -234,7 +234,7 @@ def correlation_findings(joint: JointFit) -> list[Finding]:
         known = [c for i in group for j in group if i < j and math.isfinite(c := float(correlation[i, j]))]
         of = "correlation" if len(group) == 2 else "correlations up to"
         why = f"{of} {max(known):.4f}" if known else "their standard errors are not finite"
-        said.append(finding("numbers_correlated", parameter=f"{', '.join(most)} and {last}", why=why))
+        said.append(make_finding("numbers_correlated", parameter=f"{', '.join(most)} and {last}", why=why))
     return said
 
 
@@ -268,7 +268,7 @@ def coefficient_law_findings(model: Model) -> list[Finding]:
             continue
         wanted = sign * math.prod(known)
         if abs(values[name] - wanted) > MAX_LAW_DEVIATION * max(abs(wanted), abs(values[name])):
-            findings.append(finding("coefficient_law_broken", parameter=name, value=values[name], wanted=wanted))
+            findings.append(make_finding("coefficient_law_broken", parameter=name, value=values[name], wanted=wanted))
     ratios: dict[str, list[tuple[str, float]]] = {}
     for name, sign, factors in law:
         free = [f for f in factors if f not in values]
@@ -280,7 +280,7 @@ def coefficient_law_findings(model: Model) -> list[Finding]:
         wrong = [(n, v) for n, v in said if not v > 1]
         if wrong:
             listed = ", ".join(f"{v:.4g} by {n}" for n, v in wrong)
-            findings.append(finding("inertia_ratio_broken", parameter=ratio, listed=listed))
+            findings.append(make_finding("inertia_ratio_broken", parameter=ratio, listed=listed))
     return findings
 
 
@@ -299,7 +299,7 @@ def discretization_findings(model: Model, comparison: Comparison) -> list[Findin
         ]
         margin = min(_core.nyquist_margin(own, step) for step in comparison.step)
         if margin <= 0:
-            findings.append(finding("scheme_unstable", output=item.output, m=comparison.m, margin=margin))
+            findings.append(make_finding("scheme_unstable", output=item.output, m=comparison.m, margin=margin))
     return findings
 
 
@@ -313,7 +313,7 @@ def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> 
         return bool(np.any(moved > least) and np.any(moved < -least))
 
     return [
-        finding("friction_unsigned", output=model.outputs[i])
+        make_finding("friction_unsigned", output=model.outputs[i])
         for i in model.structure.friction_equations
         if not any(turns(run.outputs[i]) for run in free)
     ]
@@ -332,9 +332,9 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
         slow = int(np.sum(pace < SLOW_SPEED_RATIO * vs))
         if slow < MIN_SLOW_INTERVALS:
             numbers = {"ratio": SLOW_SPEED_RATIO, "speed": SLOW_SPEED_RATIO * vs, "slow": slow, "total": pace.size}
-            said.append(finding("stribeck_slow_untold", output=item.output, **numbers))
+            said.append(make_finding("stribeck_slow_untold", output=item.output, **numbers))
         elif pace.max(initial=0.0) < vs:
-            said.append(finding("stribeck_fast_untold", output=item.output, speed=vs))
+            said.append(make_finding("stribeck_fast_untold", output=item.output, speed=vs))
     return said
 
 
@@ -351,7 +351,7 @@ def stability_findings(model: Model) -> list[Finding]:
     if not stable.unstable_poles > 0:
         return []
     code = "free_run_grows" if has_growing_mode(model, model.structure.coupling) else "growth_not_told"
-    return [finding(code, stability=str(stable), poles=unstable_poles_text(stable.unstable_poles))]
+    return [make_finding(code, stability=str(stable), poles=unstable_poles_text(stable.unstable_poles))]
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:

@@ -23,7 +23,7 @@ from ftlm.estimation.output_error import (
     Loss,
     fit_output_error,
 )
-from ftlm.findings import Finding, finding
+from ftlm.findings import Finding, make_finding
 from ftlm.progress import ShareTracker
 from ftlm.simulation.initial_conditions import (
     common_initial_conditions,
@@ -231,7 +231,7 @@ def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str])
     if test is None or not test.exceeds(UNREQUESTED_OFFSET_LEVEL, size=MIN_OFFSET_SIZE_RATIO):
         return []
     numbers = {"share": 100 * min(test.share, 1), "test": test.statistic_text}
-    return [finding("offset_missing", output=", ".join(outputs), **numbers)]
+    return [make_finding("offset_missing", output=", ".join(outputs), **numbers)]
 
 
 def errors_with_orders(

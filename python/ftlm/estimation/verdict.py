@@ -16,7 +16,7 @@ from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError
 from ftlm.estimation.model_checks import join_names, stability_findings
 from ftlm.estimation.result import Identification
-from ftlm.findings import FINDING_TOPICS, LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, finding, group_findings
+from ftlm.findings import FINDING_TOPICS, LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
@@ -132,7 +132,7 @@ def _combined_verdict(
     found = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison)]
     found += [f for comparison in runs for f in _validation_losses(before, comparison)]
     own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
-    return verdict_from([*own_first, *found, *own, *([] if tried else [finding("not_validated")])])
+    return verdict_from([*own_first, *found, *own, *([] if tried else [make_finding("not_validated")])])
 
 
 def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
@@ -148,7 +148,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Return the verdict on a saved model, from its file and from comparisons with runs."""
     known, own = model.estimate, [*_unstable_poles(model)]
     if known is None:
-        own.append(finding("origin_unknown"))
+        own.append(make_finding("origin_unknown"))
         judged = _combined_verdict(own, {}, validation, True)
     else:
         own += saved_findings(known)
@@ -166,9 +166,9 @@ def saved_findings(known: Estimate) -> list[Finding]:
     found = [] if known.against is UNSET else list(known.against)
     unseen = [n for n, e in known.standard_errors.items() if e is None]
     if unseen and not any(f.topic is UNSEEN_TOPIC for f in found):
-        found.append(finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen)))
+        found.append(make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen)))
     if known.warnings:
-        found.append(finding("sentences_alone"))
+        found.append(make_finding("sentences_alone"))
     return found
 
 
@@ -184,35 +184,38 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     errors, joint = result.standard_errors, result.fit
     unseen = [n for n, e in errors.items() if not math.isfinite(e)]
     if unseen:
-        yield finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen))
+        yield make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen))
     yield from (f for f in result.findings if f.code == "equation_says_identity")
     yield from (f for f in result.findings if f.code == "offset_missing")
     yield from _residuals(result)
     if joint is not None and not joint.converged and "not_converged" not in codes:
-        yield finding("not_converged")
+        yield make_finding("not_converged")
     vague = [n for n in errors if n not in unseen and _is_uncertain(result, n)]
     if vague:
         shown = join_names([_format_uncertain(result, n) for n in vague])
-        yield finding("number_vague", parameter=", ".join(vague), shown=shown)
+        yield make_finding("number_vague", parameter=", ".join(vague), shown=shown)
     endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
     if endless:
-        yield finding("interval_open", parameter=join_names(endless), sides=", ".join(endless))
+        yield make_finding("interval_open", parameter=join_names(endless), sides=", ".join(endless))
     runs = zip(result.comparison.offsets, result.comparison.initial, strict=False)
     hidden = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
     if hidden:
-        yield finding("offset_hidden", output=", ".join(hidden), shown=join_names(list(hidden)))
+        yield make_finding("offset_hidden", output=", ".join(hidden), shown=join_names(list(hidden)))
     for group in group_findings(result.findings):
-        if group.first.kind.topic not in RULED_TOPICS and group.first.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE):
-            yield group.first
+        if group.first_finding.kind.topic not in RULED_TOPICS and group.first_finding.level in (
+            LEVEL_DO_NOT_USE,
+            LEVEL_WITH_CARE,
+        ):
+            yield group.first_finding
     if not errors:
-        yield finding("no_standard_errors")
+        yield make_finding("no_standard_errors")
 
 
 def _free_runs(result: Identification) -> Iterator[Finding]:
     """Yield findings about simulations: overflow, instability and poor fit."""
     lost = [o for o, f in result.output_error.items() if not math.isfinite(f.nr)]
     if lost:
-        yield finding("out_of_range", output=", ".join(lost))
+        yield make_finding("out_of_range", output=", ".join(lost))
     yield from _unstable_poles(result.model)
     yield from _poor_fits("", result.comparison)
 
@@ -227,7 +230,7 @@ def _unstable_poles(model: Model) -> Iterator[Finding]:
     growth = stability_findings(model)
     yield from growth
     if math.isnan(model.stability(coupling=model.structure.coupling).unstable_poles):
-        yield finding("growth_untold")
+        yield make_finding("growth_untold")
     elif not any(f.code == "free_run_grows" for f in growth):
         with contextlib.suppress(FtlmError):
             yield from _undamped_modes(model)
@@ -238,7 +241,7 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
     for mode in modes(model, coupling=model.structure.coupling):
         if mode.oscillatory and mode.damping - NORMAL_95 * (mode.damping_error or 0.0) <= 0.0:
             spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
-            yield finding("swing_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=spread)
+            yield make_finding("swing_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=spread)
             return
 
 
@@ -251,7 +254,7 @@ def _poor_fits(where: str, comparison: Comparison) -> Iterator[Finding]:
         useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL]
         if useless:
             shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in useless)
-            yield finding("poor_fit", run=run, output=", ".join(useless), where=where, shown=shown)
+            yield make_finding("poor_fit", run=run, output=", ".join(useless), where=where, shown=shown)
             return
 
 
@@ -279,14 +282,14 @@ def _validation_losses(before: Mapping[str, float], validation: Comparison) -> I
                 and all(left <= times * own or left <= little for times, little in VALIDATION_LOSS_LIMITS)
             ):
                 numbers = {"before": before[output], "after": figures.fit, "where": _on(run)}
-                yield finding("fit_falls", run=run, output=output, **numbers)
+                yield make_finding("fit_falls", run=run, output=output, **numbers)
                 return
 
 
 def _residuals(result: Identification) -> Iterator[Finding]:
     """Yield findings of residual tests: feedback, dependence on an input, color."""
     if result.residuals is None:
-        yield finding("too_short_for_tests")
+        yield make_finding("too_short_for_tests")
         return
     looped = "reference" in result.settings
     judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
@@ -296,11 +299,11 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     if following:
         shown = ", ".join(f"{o} still follow {join_names(signals)}" for o, signals in following.items())
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
-        yield finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
+        yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]
-    yield from (finding("residuals_not_white", output=o) for o in coloured)
+    yield from (make_finding("residuals_not_white", output=o) for o in coloured)
 
 
 def _is_uncertain(result: Identification, name: str) -> bool:

@@ -21,7 +21,7 @@ from ftlm.experiment_design.problem import Bounds, Criterion, Kind, per_signal_v
 from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
 from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
 from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
-from ftlm.findings import NOT_WHITE_CODES, Finding, finding
+from ftlm.findings import NOT_WHITE_CODES, Finding, make_finding
 from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
@@ -400,7 +400,7 @@ def _check_arguments(
     words = (
         ()
         if colour is None or noise is not None
-        else (finding("designed_for_white_noise", output=colour.output, text=colour.text),)
+        else (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
     )
     return DesignTask(
         laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words

@@ -31,6 +31,7 @@ from ftlm.order_search.checkpoint import (
     Span,
     Store,
     Verdicts,
+    finished_count,
 )
 from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.discretization import InitialTuple
@@ -431,7 +432,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
     def add_block(self, done: Rounds) -> int:
         """Add a block of rounds."""
         self._parts.append(done.part)
-        self.done += sum(done.part[1][1:])
+        self.done += finished_count(done.part[1])
         return 0
 
     def table(self) -> _core._Found:

@@ -63,6 +63,13 @@ Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
 #: Counts: candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.
 Counts = Annotated[tuple[Natural, ...], msgspec.Meta(min_length=7, max_length=8)]
+
+
+def finished_count(counts: Counts) -> int:
+    """Return the number of candidates that are kept or excluded; those excluded in boxes are among the bounded."""
+    return sum(counts[1:7])
+
+
 Failures = tuple[tuple[Natural, bool], ...]
 #: Rows (index, raw score, coefficients, initial terms by record), counts, failures (index, whether diverged).
 Part = tuple[tuple[Row, ...], Counts, Failures]
@@ -509,8 +516,8 @@ class Section:
     @property
     def processed_count(self) -> int:
         """Number of candidates evaluated or excluded."""
-        done = (len(f.kinds) if isinstance(f, Verdicts) else sum(f.part[1][1:7]) for f in self.frames.values())
-        return sum(done) + sum(sum(half.counts[1:7]) for half in self.open.values())
+        done = (len(f.kinds) if isinstance(f, Verdicts) else finished_count(f.part[1]) for f in self.frames.values())
+        return sum(done) + sum(finished_count(half.counts) for half in self.open.values())
 
     @property
     def best(self) -> float | None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ftlm.findings import Finding, finding
+from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
@@ -215,7 +215,7 @@ class SearchResult:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the best orders: those on the edge of their interval."""
-        return tuple(finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items())
+        return tuple(make_finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items())
 
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)

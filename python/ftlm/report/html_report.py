@@ -26,8 +26,8 @@ from ftlm.findings import (
     MAX_SUMMARY_FINDINGS,
     VALIDATION_ROLE,
     Finding,
-    finding,
     group_findings,
+    make_finding,
     texts,
     unique,
 )
@@ -82,7 +82,7 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
             left += texts(group.findings)
             continue
         todo = Markup(' <span class="todo">→ {}</span>').format(group.remedy) if group.remedy else Markup("")
-        shown.append(Markup("{}{}{}").format(group.first.text, group.count, todo))
+        shown.append(Markup("{}{}{}").format(group.first_finding.text, group.count, todo))
         left += texts(group.findings[1:])
     return shown, left
 
@@ -219,7 +219,7 @@ def identification_page(
     findings = list(result.findings)
     undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
     if undefined:
-        findings.append(finding("errors_undefined", parameter=", ".join(undefined)))
+        findings.append(make_finding("errors_undefined", parameter=", ".join(undefined)))
     for run, comparison in zip(others, validated, strict=True):
         findings += _on_validation([*comparison.findings, *data_notes(run)], run)
     compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
@@ -560,7 +560,7 @@ def model_page(
         there = [*comparison.findings, *data_notes(run)]
         if known is not None:
             there += validation_fit_findings({n: f for n, f in known.fit.items() if f is not None}, comparison)
-            there += [finding("run_of_its_own", run=run.name)] * (run.name in known.runs)
+            there += [make_finding("run_of_its_own", run=run.name)] * (run.name in known.runs)
         findings += _on_validation(there, run)
     compared = [("validation", comparison) for comparison in validated]
     sections = first_sections(model, findings, compared, bool(others), None, others)

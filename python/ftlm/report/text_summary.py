@@ -179,7 +179,7 @@ def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[s
     found = group_findings(findings)
     lines = []
     for group in found[:MAX_SUMMARY_FINDINGS]:
-        lines += wrap_text(f"{group.first}{group.count}", "! ")
+        lines += wrap_text(f"{group.first_finding}{group.count}", "! ")
         if group.remedy:
             lines += wrap_text(group.remedy, "  -> ")
     more = hidden_findings_text(found)

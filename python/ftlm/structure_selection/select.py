@@ -13,7 +13,7 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify
-from ftlm.findings import finding
+from ftlm.findings import make_finding
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
@@ -242,12 +242,12 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
     if winner.joint is not None and found.fit is not None and found.fit.noise:
         lower = [o for o, v in found.fit.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
         if lower:
-            findings.append(finding("other_optimum", output=", ".join(lower)))
+            findings.append(make_finding("other_optimum", output=", ".join(lower)))
     if winner.validation_fit < 50.0:
-        findings.append(finding("none_is_the_machine", fit=format_fit(winner.validation_fit)))
+        findings.append(make_finding("none_is_the_machine", fit=format_fit(winner.validation_fit)))
     worse = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
     if worse:
-        findings.append(finding("worse_than_mean", parts=", ".join(worse)))
+        findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
     return Selection(
         tuple(ranked),
         ranked.index(winner),

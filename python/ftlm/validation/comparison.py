@@ -15,7 +15,7 @@ from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError
-from ftlm.findings import Finding, finding, texts
+from ftlm.findings import Finding, make_finding, texts
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import (
     Record,
@@ -303,9 +303,9 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
     found = _pooled_comparison(model, runs, parts, m, times, sampled=True)
     findings = list(found.findings)
     if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
-        findings.append(finding("sampling_coarse", run=", ".join(restless)))
+        findings.append(make_finding("sampling_coarse", run=", ".join(restless)))
     if moving := runs_in_motion(model, runs):
-        findings.append(finding("simulated_from_rest", run=", ".join(moving)))
+        findings.append(make_finding("simulated_from_rest", run=", ".join(moving)))
     return replace(found, findings=tuple(findings))
 
 
@@ -490,11 +490,13 @@ def near_identity_findings(
             listed = ", ".join(f"{order:g}" for order in close)
             listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
             numbers = {"orders": listed, "alpha": alpha, "nr": output.nr, "equation_nr": equation.nr}
-            findings.append(finding("equation_says_identity", output=name, **numbers))
+            findings.append(make_finding("equation_says_identity", output=name, **numbers))
         elif worse and useless:
-            findings.append(finding("flattered_by_equation_error", output=name, nr=output.nr, equation_nr=equation.nr))
+            findings.append(
+                make_finding("flattered_by_equation_error", output=name, nr=output.nr, equation_nr=equation.nr)
+            )
         elif useless:
-            findings.append(finding("explains_little", output=name, nr=output.nr))
+            findings.append(make_finding("explains_little", output=name, nr=output.nr))
     return findings
 
 
@@ -504,7 +506,7 @@ def validation_findings(own: Comparison, validation: Comparison) -> list[Finding
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
             if all(np.array_equal(own.measured[o][k], validation.measured[o][j], equal_nan=True) for o in own.measured):
-                findings.append(finding("validates_itself", run=other, other=name))
+                findings.append(make_finding("validates_itself", run=other, other=name))
     return findings + validation_fit_findings({n: f.fit for n, f in own.output_error.items()}, validation)
 
 
@@ -516,7 +518,7 @@ def validation_fit_findings(before: Mapping[str, float], validation: Comparison)
             # Negated so that a fit that is not a number counts as lost.
             if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - MAX_FIT_DROP_POINTS:
                 numbers = {"before": before[output], "after": f.fit, "where": ""}
-                findings.append(finding("fit_falls", run=other, output=output, **numbers))
+                findings.append(make_finding("fit_falls", run=other, output=output, **numbers))
     return findings
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
-from ftlm.findings import Finding, finding, unique
+from ftlm.findings import Finding, make_finding, unique
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.linalg import minimum_norm_solution, orthonormal
@@ -166,14 +166,14 @@ def _duplicate_channels(run: Run, names: list[str]) -> Iterator[Finding]:
     for one, other in itertools.combinations(names, 2):
         if np.array_equal(run[one], run[other]):
             role = {"input" if other in run.inputs else "output": other}
-            yield finding("twin", run=run.name, **role, other=one)
+            yield make_finding("twin", run=run.name, **role, other=one)
 
 
 def _constant(run: Run, name: str) -> Finding:
     level = _with_unit(run, name, float(run[name][0]))
     if name in run.inputs:
-        return finding("constant_input", run=run.name, input=name, level=level, rows=run.length)
-    return finding("constant_output", run=run.name, output=name, level=level, rows=run.length)
+        return make_finding("constant_input", run=run.name, input=name, level=level, rows=run.length)
+    return make_finding("constant_output", run=run.name, output=name, level=level, rows=run.length)
 
 
 def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
@@ -208,7 +208,9 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
         else "check the sensor, or cut it away"
     )
     level = _with_unit(run, name, float(y[first]))
-    yield finding("channel_off", run=run.name, output=name, level=level, begin=begin, end=end, rows=rows, after=after)
+    yield make_finding(
+        "channel_off", run=run.name, output=name, level=level, begin=begin, end=end, rows=rows, after=after
+    )
 
 
 def _few_levels(x: Floats) -> bool:
@@ -252,7 +254,7 @@ def _saturation(run: Run, name: str) -> Iterator[Finding]:
         if clipped >= max(MIN_CLIPPED_SAMPLES, CLIPPED_SHARE * y.size):
             level = _with_unit(run, name, float(extreme))
             numbers = {"extreme": word, "level": level, "rows": clipped, "share": 100 * clipped / y.size}
-            yield finding(code, run=run.name, **{role: name}, **numbers)
+            yield make_finding(code, run=run.name, **{role: name}, **numbers)
 
 
 def _spikes(run: Run, name: str) -> Iterator[Finding]:
@@ -276,7 +278,7 @@ def _spikes(run: Run, name: str) -> Iterator[Finding]:
     if not rows.size or rows.size > MAX_SPIKE_SHARE * y.size:
         return
     worst = rows[int(np.argmax(height[rows - 1]))]
-    yield finding(
+    yield make_finding(
         "spikes",
         run=run.name,
         output=name,
@@ -309,7 +311,7 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
     size = float(np.median(np.abs(steps[np.array(rows) - 1])))
     turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
     numbers = {"size": _with_unit(run, name, size), "turn": turn, "times": _times(len(rows)), "first": rows[0]}
-    yield finding("wrap", run=run.name, output=name, **numbers)
+    yield make_finding("wrap", run=run.name, output=name, **numbers)
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
@@ -330,12 +332,12 @@ def _excitation(run: Run, inputs: list[str]) -> Iterator[Finding]:
         lines, at = spectral_lines(run[name])
         if lines < 2 and at > 2:
             omega = 2 * math.pi * at / (run.length * run.step)
-            yield finding("one_sine", run=run.name, input=name, omega=omega)
+            yield make_finding("one_sine", run=run.name, input=name, omega=omega)
     for i, name in enumerate(inputs):
         for other in inputs[:i]:
             r = float(np.corrcoef(run[name], run[other])[0, 1])
             if abs(r) > MAX_INPUT_CORRELATION:
-                yield finding("inputs_collinear", run=run.name, input=name, other=other, correlation=r)
+                yield make_finding("inputs_collinear", run=run.name, input=name, other=other, correlation=r)
 
 
 def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
@@ -360,14 +362,14 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
         free = len(item.order_names) + len(item.coefficient_names)
         if free > known:
             listed = ", ".join(inputs) or "no input"
-            yield finding(
+            yield make_finding(
                 "excitation_short", run=run.name, output=item.output, free=free, listed=listed, known=int(known)
             )
 
 
 def _insufficient_duration(run: Run, outputs: list[str]) -> Iterator[Finding]:
     if run.length < MIN_USEFUL_SAMPLES:
-        yield finding("few_rows", run=run.name, rows=run.length, needed=MIN_USEFUL_SAMPLES)
+        yield make_finding("few_rows", run=run.name, rows=run.length, needed=MIN_USEFUL_SAMPLES)
         return
     for name in outputs:
         y = run[name]
@@ -378,13 +380,13 @@ def _insufficient_duration(run: Run, outputs: list[str]) -> Iterator[Finding]:
         crossings = int(np.sum(np.diff(sides) != 0))
         tail = y[-y.size // 5 :]
         if crossings <= 2 and np.ptp(tail) > 0.1 * np.ptp(y):
-            yield finding("short", run=run.name, output=name, times=_times(crossings), duration=run.duration)
+            yield make_finding("short", run=run.name, output=name, times=_times(crossings), duration=run.duration)
 
 
 def _offset(run: Run, name: str) -> Iterator[Finding]:
     if not is_rest(run[name]):
         level = _with_unit(run, name, float(run[name][0]))
-        yield finding("starts_off_zero", run=run.name, output=name, level=level)
+        yield make_finding("starts_off_zero", run=run.name, output=name, level=level)
 
 
 def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
@@ -419,7 +421,7 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
         size = float(np.std(y))
         if abs(slope) > DRIFT_SHARE * size and abs(slope) > DRIFT_SIGMAS * spread:
             numbers = {"slope": _with_unit(run, name, slope), "share": 100 * abs(slope) / size}
-            yield finding("drift", run=run.name, output=name, **numbers)
+            yield make_finding("drift", run=run.name, output=name, **numbers)
 
 
 def _lag_matrix(x: Floats, order: int) -> Floats:
@@ -460,7 +462,7 @@ def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterable[Findi
         if len({np.sign(p) for p in parts}) > 1:
             continue
         numbers = {"lag": k, "plural": "s" if k > 1 else "", "correlation": float(r[k - 1])}
-        item = finding("loop_in_data", run=run.name, input=u_name, output=y_name, **numbers)
+        item = make_finding("loop_in_data", run=run.name, input=u_name, output=y_name, **numbers)
         pairs.append((abs(r[k - 1]), item))
     # Report one finding per input: the pair with the strongest correlation.
     strongest: dict[str, Finding] = {}
@@ -583,19 +585,19 @@ def inspect_run(run: Run) -> Inspection:
     findings = data_notes(run)
     for s in signals:
         if s.constant:
-            findings.append(finding("signal_constant", run=run.name, **{s.role: s.name}, level=s.first))
+            findings.append(make_finding("signal_constant", run=run.name, **{s.role: s.name}, level=s.first))
         elif s.role == "output" and not s.at_rest:
-            findings.append(finding("signal_in_motion", run=run.name, output=s.name, level=s.first))
+            findings.append(make_finding("signal_in_motion", run=run.name, output=s.name, level=s.first))
     return Inspection(run.name, run.length, run.step, run.duration, signals, unique(findings))
 
 
 def data_notes(run: Run) -> list[Finding]:
     """Return how a run was read and processed as findings, and whether its rig stopped it."""
-    notes = [finding("data_note", run=run.name, text=text) for text in run.warnings]
+    notes = [make_finding("data_note", run=run.name, text=text) for text in run.warnings]
     faults = run.metadata.get("faults")
     if not (isinstance(faults, list) and faults):
         return notes
-    return [finding("rig_stopped", run=run.name, cause="; ".join(map(str, faults))), *notes]
+    return [make_finding("rig_stopped", run=run.name, cause="; ".join(map(str, faults))), *notes]
 
 
 def _figures(run: Run, name: str) -> SignalFigures:

@@ -16,7 +16,7 @@ from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import DataError, ModelError
-from ftlm.findings import Finding, finding, texts
+from ftlm.findings import Finding, make_finding, texts
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
@@ -437,24 +437,24 @@ def failed_tests(tests: Residuals) -> list[Finding]:
     found = []
     for name, output in tests.outputs.items():
         if not math.isfinite(output.rms):
-            found.append(finding("out_of_range", output=name))
+            found.append(make_finding("out_of_range", output=name))
             continue
         white = output.whiteness
         if not white.passed:
             numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
-            noise = finding("noise_coloured", output=name)
-            found.append(noise if output.is_noise else finding("output_not_white", output=name, **numbers))
+            noise = make_finding("noise_coloured", output=name)
+            found.append(noise if output.is_noise else make_finding("output_not_white", output=name, **numbers))
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
                 code = "follow_undecided_still" if math.isnan(test.limit) else "follow_undecided"
-                found.append(finding(code, output=name, input=signal, limit=test.limit))
+                found.append(make_finding(code, output=name, input=signal, limit=test.limit))
             elif not test.passed:
                 numbers = {"value": value, "lag": lag, "limit": test.limit}
-                found.append(finding("residuals_follow_input", output=name, input=signal, **numbers))
+                found.append(make_finding("residuals_follow_input", output=name, input=signal, **numbers))
             elif test.first:
                 at_once = test.values[test.lags == 0]
-                found.append(finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
+                found.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
         found += [feedback_finding(name, signal, output) for signal in output.feedback]
     return found
 
@@ -467,9 +467,9 @@ def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding
         # Without a joint fit the color decides: white noise does not come back into an output error.
         code = "loop_harmless" if output.whiteness.passed else "loop_found"
         effect = " little" if output.whiteness.passed else ""
-        return finding(code, output=name, input=signal, effect=effect, **numbers)
+        return make_finding(code, output=name, input=signal, effect=effect, **numbers)
     effect = f" by up to {test.bias:.2g} of their standard errors"
-    return finding(
+    return make_finding(
         "loop_found" if test.bias > 1 else "loop_harmless", output=name, input=signal, effect=effect, **numbers
     )
 
