@@ -777,7 +777,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def topic(self) -> Topic:
-        """Topic in the catalogue."""
+        """Group of the catalogue: findings that share a remedy and stand together in a summary."""
         return FINDING_TOPICS[self.kind.topic]
 
     @property
@@ -797,7 +797,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def text(self) -> str:
-        """Sentence with the name of the run, where it is about one."""
+        """Sentence, with the name of the run if the finding concerns a single run."""
         prefix = "validation run {run}: " if self.role == VALIDATION_ROLE else self.kind.prefix if self.run else ""
         return self._render(prefix) + self.sentence
 
@@ -829,7 +829,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
             return self.written or self.code
 
     def to_file(self) -> Finding:
-        """Return the record for a file: with its sentence, and numbers that are not finite as text."""
+        """Return the finding as it is stored: with its sentence, and numbers that are not finite as text."""
         numbers = {n: _storable(v) for n, v in self.numbers.items()}
         return msgspec.structs.replace(self, numbers=numbers, written=self.text)
 
@@ -852,7 +852,7 @@ def _storable(value: float | str) -> float | int | str:
 
 
 def make_finding(code: str, **words: Any) -> Finding:
-    """Return a finding of the catalogue with its subject and numbers, by name."""
+    """Return a finding from its code in the catalogue; subject and numbers are keyword arguments."""
     subject = {n: words.pop(n) for n in SUBJECT_FIELDS if n in words}
     return Finding(code, **subject, numbers=words)
 

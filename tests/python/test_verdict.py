@@ -468,7 +468,7 @@ def test_findings_are_grouped_the_most_serious_first():
         make_finding("data_note", run="r", text="time read in ms, as the header 'time [ms]' says"),
     ]
     found = group_findings([*said, said[0]])
-    assert [g.first.kind.topic for g in found] == ["unstable", "residuals", "edge", "other"]
+    assert [g.first_finding.kind.topic for g in found] == ["unstable", "residuals", "edge", "other"]
     assert found[1].findings == (said[0], said[2])
     assert found[1].count == " (and 1 more alike)"
     assert sum(len(g.findings) for g in found) == len(said)

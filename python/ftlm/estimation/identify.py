@@ -232,7 +232,7 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
 
 
 def assess_fit(fit: Fit) -> Identification:
-    """Validate a fit: both errors, residual tests, information criteria and findings."""
+    """Assess a fit on its own runs: equation and output error, residual tests, information criteria, findings."""
     runs, model = as_runs(fit.task.runs), fit.model
     free = simulate_runs(model, runs)
     comparison = compare_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))

@@ -154,7 +154,7 @@ def _outlier_findings(runs: Sequence[Run], joint: JointFit, output: str) -> list
         return []
     every = drop_missing(np.concatenate([part[output] for part in joint.residuals]))
     # Where a machine stands still its residuals are rounding, and no measure of the others.
-    moved = [_while_moving(run, output, part[output]) for run, part in zip(runs, joint.residuals, strict=True)]
+    moved = [_moving_residuals(run, output, part[output]) for run, part in zip(runs, joint.residuals, strict=True)]
     usual = robust_deviation(drop_missing(np.concatenate(moved)))
     far, first = 0, ""
     for run, part in zip(runs, joint.residuals, strict=True):
@@ -184,8 +184,8 @@ def _outlier_findings(runs: Sequence[Run], joint: JointFit, output: str) -> list
     ]
 
 
-def _while_moving(run: Run, output: str, residuals: Floats) -> Floats:
-    """Return the residuals of the rows in which the output changed; all of them where few did."""
+def _moving_residuals(run: Run, output: str, residuals: Floats) -> Floats:
+    """Return the residuals of rows in which the output changed, or all residuals if there are too few such rows."""
     changed = np.flatnonzero(np.diff(run[output]) != 0)
     changed = changed[changed < residuals.size]
     return residuals[changed] if changed.size >= MIN_MOVING_SHARE * residuals.size else residuals
@@ -380,7 +380,7 @@ def join_names(names: Sequence[str]) -> str:
 
 
 def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
-    """Compare a result with other runs and add findings; see :meth:`ftlm.Identification.validate`."""
+    """Compare simulated and measured outputs of other runs; see :meth:`ftlm.Identification.validate`."""
     there = compare(result.model, runs)
     findings = [
         *there.findings,

@@ -162,7 +162,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 
 
 def saved_findings(known: Estimate) -> list[Finding]:
-    """Return the findings against a saved model, those of the fit first."""
+    """Return all findings that speak against using a saved model, those recorded at the fit first."""
     found = [] if known.against is UNSET else list(known.against)
     unseen = [n for n, e in known.standard_errors.items() if e is None]
     if unseen and not any(f.topic is UNSEEN_TOPIC for f in found):

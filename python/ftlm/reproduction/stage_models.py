@@ -495,7 +495,7 @@ class StageWork:
         )
 
     def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
-        """Compare the optimizers on each equation at equal budgets; empty if they are not installed."""
+        """Compare multi-innovation with other optimizers on each equation; empty if these are not installed."""
         if self.preset.rivals_increment is None:
             return {}
         lattice = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)

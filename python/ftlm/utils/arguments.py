@@ -51,8 +51,8 @@ _MAX_NUMBER = 2.0**62
 def check_arguments(decorated: Decorated) -> Decorated:
     """Decorate a function or a class: an exception that a wrong argument causes becomes a :class:`ModelError`.
 
-    The arguments are compared with their annotations only after the call failed, so that a call that succeeds pays
-    nothing, and an error in words of the function itself stands. Sequences too long to be read are refused before it.
+    The arguments are compared with their annotations only after the call failed, so that a call that succeeds costs
+    nothing. Messages that the function raises itself are kept. A range with too many values is refused before the call.
     """
     if inspect.isclass(decorated):
         type.__setattr__(decorated, "__init__", check_arguments(decorated.__init__))

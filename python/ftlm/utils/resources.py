@@ -173,7 +173,7 @@ def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, Any]:
-    """Return command, environment and working directory of a script of ftlm in a Python process of its own.
+    """Return command, environment and working directory to run a script in an isolated Python subprocess.
 
     A file that somebody uploaded or downloaded must not become a module of the child. Python therefore runs isolated
     (``-I``: neither ``PYTHONPATH`` nor the working directory is searched), in the folder of its installation. The

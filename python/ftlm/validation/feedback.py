@@ -102,13 +102,13 @@ class FeedbackTest:
 def feedback_test(
     residuals: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]] = ()
 ) -> FeedbackTest:
-    """Test whether an input answers past outputs (Granger, doi:10.2307/1912791).
+    """Test whether an input depends on past outputs: feedback in Granger's sense (doi:10.2307/1912791).
 
-    The innovation of the input is what its own past and the other inputs leave of it. If the input was made beforehand,
-    this innovation is independent of all that the output did before, whatever the model lacks. A score test that
-    normalizes itself (White, doi:10.2307/1912934) asks whether past residuals, their difference, their slow part and
-    past innovations of the output predict it. The present residual is not used, because an answer within a row and a
-    direct feedthrough have the same distribution.
+    The innovation of the input is its residual after regression on its own past and on the other inputs. In open loop
+    it is independent of past outputs, provided that this past is long enough and that no other input depends on both
+    the output and this input. A heteroskedasticity-robust score test (White, doi:10.2307/1912934) tests whether past
+    residuals, their differences, their low-pass part and past innovations of the output predict it. The present
+    residual is not used, because feedback within one sample cannot be distinguished from direct feedthrough.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
     return windows[start - last : x.size - last][:, ::-1]
 
 
-def _line_columns(u: Floats) -> list[Floats]:
+def _line_regressors(u: Floats) -> list[Floats]:
     """Cosines and sines of the spectral lines of an input, whose memory exceeds any number of lags."""
     count = u.size
     size = 1 << math.ceil(math.log2(8 * count))
@@ -234,7 +234,7 @@ def _line_columns(u: Floats) -> list[Floats]:
 
 
 def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
-    """Targets less their weighted projection onto the past, by its Gram matrix with a small ridge, refined once."""
+    """Return the residual of a weighted regression of the targets on the past: small ridge, one refinement step."""
     weighted = past if weights is None else past * weights[:, None]
     gram = weighted.T @ past
     gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
@@ -306,7 +306,7 @@ class _Innovations:
             if size > 0:
                 reach = min(self.input_lags, MAX_OTHER_LAGS)
                 beside.append(np.concatenate([_lags((v - v.mean()) / size, 0, reach, self.start) for v in other]))
-        lines = [[np.ones(u.size), *_line_columns(u)] for u in inputs]
+        lines = [[np.ones(u.size), *_line_regressors(u)] for u in inputs]
         self.past = np.column_stack([*past, *beside, *self._block_diagonal(lines)])
         self.inputs = self._stack_rows(inputs)
         self.weights = np.ones(self.inputs.size)
@@ -352,8 +352,8 @@ class _Innovations:
         skip = max(INNOVATION_COUNTS) + 2 + offset
         return np.concatenate([np.arange(min(first + skip, last), last) for first, last in self.places])
 
-    def _columns(self, rows: NDArray[np.intp], offset: int) -> Floats:
-        """Past residuals, their difference and slow part, and past innovations of the output."""
+    def _regressors(self, rows: NDArray[np.intp], offset: int) -> Floats:
+        """Return the regressors: past residuals, their differences, their low-pass part, past output innovations."""
         lag = self.shift + offset
         back: Callable[[Floats, int], Floats] = lambda x, k: x[rows - k - offset]  # noqa: E731
         innovations = [back(self.output_innovation, k + self.shift) for k in range(max(INNOVATION_COUNTS))]
@@ -364,7 +364,7 @@ class _Innovations:
         """Largest statistic over its limit, its columns and rows, with outputs so many rows further back."""
         rows = self._rows(offset)
         # Through the same weights, so that the score is orthogonal to what was estimated.
-        columns = _project_out(self.past[rows], self._columns(rows, offset), self.weights[rows])
+        columns = _project_out(self.past[rows], self._regressors(rows, offset), self.weights[rows])
         sizes = np.linalg.norm(columns, axis=0)
         columns = columns / np.where(sizes > 0, sizes, 1.0)
         sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
@@ -431,7 +431,7 @@ class _Innovations:
         cross, inner = gram[np.ix_(own, rest)], gram[np.ix_(rest, rest)] + tiny * np.eye(rest.size)
         alone = gram[np.ix_(own, own)] - cross @ np.linalg.solve(inner, cross.T)
         top = max(float(np.linalg.eigvalsh(alone)[0]), 0.0)
-        columns = self._columns(rows, 0)
+        columns = self._regressors(rows, 0)
         at, from_columns = weighted.T @ y, weighted.T @ columns
         least = math.inf
         for share in INPUT_NOISE_SHARES:

@@ -145,7 +145,7 @@ class OutputResiduals:
 
     @property
     def is_noise(self) -> bool:
-        """Whether the residuals follow no input that moves, by conclusive tests."""
+        """Whether the residuals are uncorrelated with every input that varies, as far as the tests are conclusive."""
         return all(test.passed for test in self.informative_tests.values())
 
     @property
@@ -475,7 +475,7 @@ def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding
 
 
 def residual_findings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RATIO) -> list[Finding]:
-    """Return failed residual tests, except for outputs with a normalized residual of at most ``floor``."""
+    """Return findings on failed residual tests; outputs with an NR of at most ``floor`` are skipped."""
     return failed_tests(replace(tests, outputs={n: o for n, o in tests.outputs.items() if not o.nr <= floor}))
 
 
