@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import builtins
 import functools
 import inspect
 import math
 import os
 import sys
 import sysconfig
-from collections.abc import Callable, Hashable, Iterable, Mapping
-from typing import Any, Protocol, TypeVar, cast
+import types
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin
 
 import numpy as np
 
@@ -25,22 +27,21 @@ _LIBRARY_FOLDERS = tuple(sysconfig.get_path(name) for name in ("stdlib", "platst
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
-#: Annotations of arguments that are checked by their text, and what they are called in messages.
-_KIND_WORDS = {
-    "float": "a finite number",
-    "complex": "a number",
-    "int": "a whole number",
-    "bool": "True or False",
-    "str": "text",
-    "Mapping": "a mapping of names",
-    "Sequence": "a list",
-    "Iterable": "a list",
-    "Collection": "a list",
-    "tuple": "a tuple",
-    "list": "a list",
-    "Callable": "a function",
-    "os.PathLike": "a path",
-    "None": "None",
+#: Types that stand for a list, also of another kind.
+_LISTS = (Sequence, Iterable, Collection, tuple, list)
+#: Names of types in messages.
+_KIND_WORDS: dict[Any, str] = {
+    float: "a finite number",
+    complex: "a number",
+    int: "a whole number",
+    bool: "True or False",
+    str: "text",
+    Mapping: "a mapping of names",
+    Callable: "a function",
+    os.PathLike: "a path",
+    types.NoneType: "None",
+    tuple: "a tuple",
+    **dict.fromkeys((Sequence, Iterable, Collection, list), "a list"),
 }
 #: Items of a mapping or a list that are checked.
 _MAX_CHECKED_ITEMS = 1000
@@ -103,74 +104,79 @@ def _raise_in_words(function: Callable[..., Any], given: Any, named: Any, error:
         bound = signature.bind(*given, **named)
     except TypeError:
         return
+    names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))
     for name, value in bound.arguments.items():
-        annotation = signature.parameters[name].annotation
-        kinds = _alternatives(annotation) if isinstance(annotation, str) else []
-        scope = getattr(inspect.unwrap(function), "__globals__", {})
-        if kinds and not any(_fits(value, kind, scope) for kind in kinds):
-            words = " or ".join(dict.fromkeys(_KIND_WORDS.get(k.partition("[")[0], k) for k in kinds))
+        annotation = _annotation(signature.parameters[name].annotation, names)
+        if not _fits(value, annotation):
+            words = " or ".join(dict.fromkeys(_words(kind) for kind in _alternatives(annotation)))
             raise ModelError(
                 f"{setting(name)} {short_repr(value)} is a {type(value).__name__}; give {words}"
             ) from error
 
 
-def _alternatives(annotation: str) -> list[str]:
+class _Names(dict[str, Any]):
+    """Names of a module, public names of ftlm, and ``Any`` for names that only a type checker imports."""
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, None) or getattr(sys.modules.get("ftlm"), name, Any)
+
+
+def _annotation(annotation: Any, names: _Names) -> Any:
+    """Evaluate an annotation; ``Any`` where it cannot be evaluated."""
+    if not isinstance(annotation, str):
+        return Any
+    try:
+        return eval(annotation, {}, names)  # the text of an annotation of ftlm's own
+    except (TypeError, SyntaxError, NameError):
+        return Any
+
+
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
     """Return the members of a union."""
-    found, depth = [""], 0
-    for sign in annotation:
-        depth += (sign == "[") - (sign == "]")
-        if sign == "|" and depth == 0:
-            found.append("")
-        else:
-            found[-1] += sign
-    return [part.strip() for part in found]
+    if get_origin(annotation) in (Union, types.UnionType):
+        return tuple(kind for member in get_args(annotation) for kind in _alternatives(member))
+    return (annotation,)
 
 
-def _fits(value: object, kind: str, scope: Mapping[str, Any]) -> bool:
-    """Whether a value is what an annotation without alternatives says; True for annotations that are not known.
+def _words(kind: Any) -> str:
+    """Say what a value of a type without alternatives is."""
+    if get_origin(kind) is Literal:
+        return ", ".join(map(repr, get_args(kind)))
+    kind = get_origin(kind) or kind
+    return _KIND_WORDS.get(kind, getattr(kind, "__name__", repr(kind)))
 
-    ``scope`` holds the names of the module; a class is known if it is one of them or public, and no protocol.
-    """
-    name, _, inner = kind.partition("[")
-    inner = inner.removesuffix("]")
-    if name == "None":
+
+def _fits(value: object, annotation: Any) -> bool:
+    """Whether a value is what an annotation says; True for annotations that cannot be checked."""
+    return any(_fits_one(value, kind) for kind in _alternatives(annotation))
+
+
+def _fits_one(value: object, kind: Any) -> bool:
+    origin, inner = get_origin(kind) or kind, get_args(kind)
+    if origin in (None, types.NoneType):
         return value is None
-    if name == "bool":
-        return isinstance(value, bool)
-    if name == "str":
-        return isinstance(value, str)
-    if name == "os.PathLike":
-        return isinstance(value, os.PathLike)
-    if name in ("float", "complex"):
-        return (name == "complex" and isinstance(value, complex)) or (type(value) in (int, float) and _is_real(value))
-    if name == "int":
+    if origin is Literal:
+        return any(type(value) is type(choice) and value == choice for choice in inner)
+    if origin in (float, complex):
+        return (origin is complex and isinstance(value, complex)) or (type(value) in (int, float) and _is_real(value))
+    if origin is int:
         return whole_number(value) is not None and _is_real(value)
-    if name == "Hashable":
-        return isinstance(value, Hashable)
-    if name == "Literal":
-        return isinstance(value, str)
-    if name == "Mapping":
-        key, _, of = inner.partition(", ")
+    if not isinstance(origin, type) or origin is Any or Protocol in origin.__mro__:
+        return True
+    if issubclass(origin, Mapping):
         items = list(value.items())[:_MAX_CHECKED_ITEMS] if isinstance(value, Mapping) else None
-        return items is not None and all(_fits_any(k, key, scope) and _fits_any(v, of, scope) for k, v in items)
-    if name == "Callable":
-        return callable(value)
-    if name in ("Sequence", "Iterable", "Collection", "tuple", "list"):
+        key, item = inner or (Any, Any)
+        return items is not None and all(_fits(k, key) and _fits(v, item) for k, v in items)
+    if origin in _LISTS:
         if isinstance(value, (bytes, Mapping, np.ndarray)) or not isinstance(value, Iterable):
             return False
-        members = inner.removesuffix(", ...").split(", ") if name == "tuple" else [inner]
-        same = len(set(members)) == 1
+        members = {member for member in inner if member is not Ellipsis} or {Any}
         if isinstance(value, str):
-            return _fits_any(value, members[0], scope)
-        return not (same and isinstance(value, (list, tuple))) or all(
-            _fits_any(v, members[0], scope) for v in value[:_MAX_CHECKED_ITEMS]
+            return any(_fits(value, member) for member in members)
+        return not (len(members) == 1 and isinstance(value, (list, tuple))) or all(
+            _fits(v, *members) for v in value[:_MAX_CHECKED_ITEMS]
         )
-    known = scope.get(name, getattr(sys.modules.get("ftlm"), name, None))
-    return not isinstance(known, type) or Protocol in known.__mro__ or isinstance(value, known)
-
-
-def _fits_any(value: object, annotation: str, scope: Mapping[str, Any]) -> bool:
-    return not annotation or any(_fits(value, kind, scope) for kind in _alternatives(annotation))
+    return isinstance(value, origin)
 
 
 def _is_real(value: object) -> bool:
