@@ -8,10 +8,9 @@ import inspect
 import math
 import os
 import sys
-import sysconfig
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin
+from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -22,13 +21,13 @@ from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, real_number, short_repr, 
 #: Exceptions that arguments of another type cause.
 _FROM_ARGUMENTS = (TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
 
-#: Folders of Python and of its packages.
-_LIBRARY_FOLDERS = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+#: Parts of the paths of installed packages.
+_PACKAGE_FOLDERS = ("site-packages", "dist-packages")
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 #: Types that stand for a list, also of another kind.
-_LISTS = (Sequence, Iterable, Collection, tuple, list)
+_LIST_TYPES = (Sequence, Iterable, Collection, tuple, list)
 #: Names of types in messages.
 _KIND_WORDS: dict[Any, str] = {
     float: "a finite number",
@@ -91,7 +90,8 @@ def _is_raised_by_caller(error: BaseException) -> bool:
     trace = error.__traceback__
     while trace is not None:
         package = str(trace.tb_frame.f_globals.get("__name__")).partition(".")[0]
-        if package != "ftlm" and not trace.tb_frame.f_code.co_filename.startswith(_LIBRARY_FOLDERS):
+        file = trace.tb_frame.f_code.co_filename
+        if package not in ("ftlm", *sys.stdlib_module_names) and not any(f in file for f in _PACKAGE_FOLDERS):
             return True
         trace = trace.tb_next
     return False
@@ -114,21 +114,24 @@ def _raise_in_words(function: Callable[..., Any], given: Any, named: Any, error:
             ) from error
 
 
+class _UnknownType:
+    """Type of a name that only a type checker imports."""
+
+    def __class_getitem__(cls, item: object) -> type[_UnknownType]:
+        return cls
+
+
 class _Names(dict[str, Any]):
-    """Names of a module, public names of ftlm, and ``Any`` for names that only a type checker imports."""
+    """Names of a module and public names of ftlm; others are unknown types."""
 
     def __missing__(self, name: str) -> Any:
-        return getattr(builtins, name, None) or getattr(sys.modules.get("ftlm"), name, Any)
+        return getattr(builtins, name, None) or getattr(sys.modules.get("ftlm"), name, _UnknownType)
 
 
 def _annotation(annotation: Any, names: _Names) -> Any:
-    """Evaluate an annotation; ``Any`` where it cannot be evaluated."""
-    if not isinstance(annotation, str):
-        return Any
-    try:
-        return eval(annotation, {}, names)  # the text of an annotation of ftlm's own
-    except (TypeError, SyntaxError, NameError):
-        return Any
+    """Return the type that an annotation names."""
+    owner = types.SimpleNamespace(__annotations__={"value": annotation})
+    return _UnknownType if annotation is inspect.Parameter.empty else get_type_hints(owner, {}, names)["value"]
 
 
 def _alternatives(annotation: Any) -> tuple[Any, ...]:
@@ -161,13 +164,13 @@ def _fits_one(value: object, kind: Any) -> bool:
         return (origin is complex and isinstance(value, complex)) or (type(value) in (int, float) and _is_real(value))
     if origin is int:
         return whole_number(value) is not None and _is_real(value)
-    if not isinstance(origin, type) or origin is Any or Protocol in origin.__mro__:
+    if not isinstance(origin, type) or origin in (Any, _UnknownType) or Protocol in origin.__mro__:
         return True
     if issubclass(origin, Mapping):
         items = list(value.items())[:_MAX_CHECKED_ITEMS] if isinstance(value, Mapping) else None
         key, item = inner or (Any, Any)
         return items is not None and all(_fits(k, key) and _fits(v, item) for k, v in items)
-    if origin in _LISTS:
+    if origin in _LIST_TYPES:
         if isinstance(value, (bytes, Mapping, np.ndarray)) or not isinstance(value, Iterable):
             return False
         members = {member for member in inner if member is not Ellipsis} or {Any}
