@@ -410,7 +410,7 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
         "--increment",
         "0.25",
         "--seeds",
-        "5",
+        "2",
         "--evaluations",
         "400",
         "-o",

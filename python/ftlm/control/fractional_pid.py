@@ -208,6 +208,7 @@ class DiscretePid:
     @check_arguments
     def __call__(self, error: float) -> float:
         """Return the output for the error of a sample."""
+        error = float(error)
         if self._lags is None:
             # The derivative starts in the steady state of a constant error, where it is zero.
             bank = self._derivative

@@ -76,9 +76,11 @@ def output_error_landscape(
     """
     joint, task, pair = result.fit, result.task, orders
     chosen = correlated_orders(result)
-    if joint is None or task is None or (pair is None and chosen is None):
+    if pair is None and chosen is not None:
+        pair = chosen[:2]
+    if joint is None or task is None or pair is None:
         return None
-    first, second = pair or chosen[:2]  # type: ignore[index]
+    first, second = pair
     names = list(joint.orders)
     if first == second or first not in names or second not in names:
         raise ModelError(f"a landscape needs two different free orders; this fit has {', '.join(names)}")

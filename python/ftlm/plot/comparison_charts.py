@@ -13,7 +13,7 @@ from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, short_repr, whole_number
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import CorrelationTest, Residuals
 
@@ -189,9 +189,23 @@ def error_chart(
         Units of the outputs.
     points
         Most points of a line.
+
+    Raises
+    ------
+    DataError
+        No comparison, or no such output or run in one of them.
     """
     if not compared:
         raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
+    index = whole_number(run)
+    for name, comparison in compared:
+        outputs = list(comparison.measured)
+        if output not in outputs:
+            raise DataError(f"comparison {name!r} has no output {output!r}; it has {', '.join(outputs)}")
+        count = len(comparison.measured[output])
+        if index is None or not 0 <= index < count:
+            raise DataError(f"comparison {name!r} has no run {short_repr(run)}; give 0 to {count - 1}")
+    run = index or 0
     errors = [(name, np.abs(c.measured[output][run] - c.simulated[output][run])) for name, c in compared]
     return line_chart(
         pulse_times(compared[0][1], run),

@@ -173,12 +173,12 @@ def _fits_one(value: object, kind: Any) -> bool:
     if origin in _LIST_TYPES:
         if isinstance(value, (bytes, Mapping, np.ndarray)) or not isinstance(value, Iterable):
             return False
-        members = {member for member in inner if member is not Ellipsis} or {Any}
+        if origin is tuple and inner and Ellipsis not in inner:
+            return isinstance(value, (list, tuple)) and len(value) == len(inner) and all(map(_fits, value, inner))
+        member = inner[0] if inner else Any
         if isinstance(value, str):
-            return any(_fits(value, member) for member in members)
-        return not (len(members) == 1 and isinstance(value, (list, tuple))) or all(
-            _fits(v, *members) for v in value[:_MAX_CHECKED_ITEMS]
-        )
+            return _fits(value, member)
+        return not isinstance(value, (list, tuple)) or all(_fits(v, member) for v in value[:_MAX_CHECKED_ITEMS])
     return isinstance(value, origin)
 
 
