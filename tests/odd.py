@@ -323,7 +323,6 @@ EXEMPT = {
     "ftlm.FrequencyIdentification.report": "writes a page, half a second a call",
     "rig.record": "starts a rig; a rate beyond its limit is attacked in test_rig.py",
     "rig.Excitation.commands": "called by record with a checked rate",
-    "rig.Limits.guard": "called by Rig with checked settings",
     "ftlm.Model.from_control": "takes a system of python-control",
 }
 #: Classes whose objects are made by callers; those of others are results, whose constructors nobody calls.
