@@ -154,7 +154,11 @@ def core_arguments(structure: Structure) -> Any:
         (
             signals.index(e.output),
             order(e.order),
-            [(signals.index(t.signal), order(t.order), t.coefficient, t.factor) for t in e.terms],
+            # Rounding, and with it the optimum of a difficult fit, does not depend on how the equation is written.
+            sorted(
+                ((signals.index(t.signal), order(t.order), t.coefficient, t.factor) for t in e.terms),
+                key=lambda term: (term[0] != signals.index(e.output), term[0], -term[1][0], repr(term)),
+            ),
             friction(e.friction),
         )
         for e in structure.equations

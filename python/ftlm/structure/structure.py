@@ -256,8 +256,8 @@ class Structure:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of all signals, outputs first."""
-        return tuple(dict.fromkeys([e.output for e in self.equations] + [s for e in self.equations for s in e.signals]))
+        """Names of all signals: outputs in the order of their equations, then the others by name."""
+        return (*self.outputs, *sorted({s for e in self.equations for s in e.signals} - set(self.outputs)))
 
     @property
     def all_filtered(self) -> bool:
