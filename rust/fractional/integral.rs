@@ -68,7 +68,7 @@ pub fn integrate_signals(signals: &mut [f64], m: usize, eta: f64, step: f64, rul
     check_step(step)?;
     check_order("order", eta)?;
     check_finite("x", signals)?;
-    if m == 0 || signals.len() % m != 0 {
+    if m == 0 || !signals.len().is_multiple_of(m) {
         return if signals.is_empty() { Ok(()) } else { check_length("the last signal", m, signals.len() % m.max(1)) };
     }
     if eta == 0.0 {
