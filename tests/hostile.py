@@ -99,6 +99,17 @@ class Sound:
     def block_pulse_kernel(self):
         return self.order(), self.m(), self.step(), {"derivative": self.one(True, False)}
 
+    def block_pulse_kernels(self):
+        return np.array([self.order(), self.order()]), self.m(), self.step(), {"derivative": self.one(True, False)}
+
+    def toeplitz_apply(self):
+        m = self.m()
+        kernels = 0.1 * self.normal((2, m))
+        kernels[:, 0] = 1.0
+        return kernels, self.normal((3, m)), [0, 1, self.one(0, 1)]
+
+    toeplitz_solve = toeplitz_apply
+
     def grunwald_letnikov_weights(self):
         return self.order(), self.m()
 
@@ -147,6 +158,10 @@ class Sound:
         m = self.m()
         return self.samples(m * self.one(1, 2, 3) + 1), m, self.one(True, False)
 
+    def pulse_mean_rows(self):
+        m = self.m()
+        return self.normal((self.one(1, 2), m * self.one(1, 2) + 1)), m, self.one(True, False)
+
     def point_samples(self):
         return (self.samples(),)
 
@@ -193,6 +208,11 @@ class Sound:
 
     def terms(self):
         return self.one((True, []), (False, []), (False, [0.0]), (True, [], 1), (False, [0.0, 1.0], 2))
+
+    def multi_innovation_estimate(self):
+        count, problems, width = self.one(8, 16), self.one(1, 2), self.one(1, 3)
+        q, m = self.normal((count * problems, width)), self.normal(count * problems)
+        return q, m, count, self.one(1, 3, 7), [self.number(0.1, 9.0) for _ in range(width)], self.one(True, False)
 
     def least_squares(self):
         structure = self.structure()
@@ -775,7 +795,14 @@ def of_arm():
 
 
 #: Entries whose last arguments are given by name.
-NAMED = {"block_pulse_kernel", "certify", "operational_matrix", "series_multiply", "series_divide"}
+NAMED = {
+    "block_pulse_kernel",
+    "block_pulse_kernels",
+    "certify",
+    "operational_matrix",
+    "series_multiply",
+    "series_divide",
+}
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Hostile values

@@ -161,6 +161,7 @@ _PUBLIC_MODULES = frozenset(
         "control",
         "errors",
         "analysis",
+        "kernels",
         "plot",
         "progress",
         "report",

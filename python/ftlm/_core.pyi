@@ -24,6 +24,7 @@ __all__ = [
     "__version__",
     "autocovariances",
     "block_pulse_kernel",
+    "block_pulse_kernels",
     "block_pulse_matrix",
     "certify",
     "chi_squared",
@@ -56,6 +57,7 @@ __all__ = [
     "long_run_covariance",
     "metrics",
     "multi_innovation",
+    "multi_innovation_estimate",
     "nyquist_margin",
     "operational_matrix",
     "order_grid_size",
@@ -63,6 +65,7 @@ __all__ = [
     "panic_on_purpose",
     "point_samples",
     "projected_errors",
+    "pulse_mean_rows",
     "pulse_means",
     "refine_candidates",
     "respond",
@@ -76,6 +79,8 @@ __all__ = [
     "series_multiply",
     "singular_values",
     "state_space_respond",
+    "toeplitz_apply",
+    "toeplitz_solve",
     "trace_errors",
     "triangular_factor",
     "whitening_filter",
@@ -224,6 +229,9 @@ SIMD: Final[str]
 # ---------------------------------------------------------------------------------------------- kernels and transforms
 
 def block_pulse_kernel(order: float, m: int, step: float, *, derivative: bool = False) -> _Vector: ...
+def block_pulse_kernels(orders: _Floats, m: int, step: float, *, derivative: bool = False) -> _Matrix: ...
+def toeplitz_apply(first_columns: _Floats, x: _Floats, groups: Sequence[int]) -> _Matrix: ...
+def toeplitz_solve(first_columns: _Floats, b: _Floats, groups: Sequence[int]) -> _Matrix: ...
 def grunwald_letnikov_weights(order: float, m: int) -> _Vector: ...
 def haar_transform(x: _Floats) -> _Matrix: ...
 def haar_inverse(x: _Floats) -> _Matrix: ...
@@ -238,6 +246,7 @@ def fractional_derivative(x: _Floats, order: float, step: float, definition: str
 # -------------------------------------------------------------------------------------------------- samples to records
 
 def pulse_means(samples: _Floats, m: int, hold: bool) -> _Vector: ...
+def pulse_mean_rows(samples: _Floats, m: int, hold: bool) -> _Matrix: ...
 def point_samples(means: _Floats) -> _Vector: ...
 def delay_samples(samples: _Floats, delay: float, before: float) -> _Vector: ...
 def filter_series(
@@ -278,6 +287,9 @@ def multi_innovation(
     haar: bool,
     recursion: bool,
 ) -> tuple[_Estimate, _Matrix | None]: ...
+def multi_innovation_estimate(
+    q: _Floats, m: _Floats, count: int, length: int, prior_covariance: Sequence[float], path: bool
+) -> _Matrix: ...
 def instrumental_variables(
     runs: Sequence[_Record],
     equations: Sequence[_Structure],

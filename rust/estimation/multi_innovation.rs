@@ -6,10 +6,11 @@
 //! prior.
 
 use crate::equation::{Initial, Structure};
-use crate::error::{Error, Result};
+use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::least_squares::{self, Estimate, Regression};
 use crate::fractional::operational_matrices;
 use crate::linalg::small::Recursion;
+use crate::parallel::Stop;
 use crate::regressors::Record;
 
 /// Row basis of the recursion.
@@ -95,31 +96,107 @@ pub fn closed_form(
     innovation: &Innovation,
 ) -> Result<Estimate> {
     let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
-    let mut columns = regression.columns.clone();
-    let mut target = regression.target.clone();
+    let Regression { columns, target, starts, .. } = &regression;
+    let prior = vec![innovation.prior_covariance; columns.len()];
+    let (columns, target) = weighted_rows(columns.clone(), target.clone(), starts, innovation.length, &prior);
+    // With a prior no column is linearly dependent in exact arithmetic.
+    let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
+    if let Some(&index) = dropped.iter().find(|&&d| d < regression.free_count()) {
+        return Err(Error::Singular { index, count: columns.len() });
+    }
+    regression.estimate(&solution, &dropped)
+}
+
+/// Rows times the square roots of their weights, and below them those of the prior.
+fn weighted_rows(
+    mut columns: Vec<Vec<f64>>,
+    mut target: Vec<f64>,
+    starts: &[usize],
+    length: usize,
+    prior: &[f64],
+) -> (Vec<Vec<f64>>, Vec<f64>) {
     for series in columns.iter_mut().chain(std::iter::once(&mut target)) {
-        for pair in regression.starts.windows(2) {
+        for pair in starts.windows(2) {
             let m = pair[1] - pair[0];
             for (i, value) in series[pair[0]..pair[1]].iter_mut().enumerate() {
                 #[allow(clippy::cast_precision_loss)]
-                let weight = innovation.weight(i, m) as f64;
+                let weight = length.min(m - i) as f64;
                 *value *= weight.sqrt();
             }
         }
     }
     let (k, end) = (columns.len(), target.len());
-    let prior = 1.0 / innovation.prior_covariance.sqrt();
-    for (j, column) in columns.iter_mut().enumerate() {
+    for (j, (column, covariance)) in columns.iter_mut().zip(prior).enumerate() {
         column.resize(end + k, 0.0);
-        column[end + j] = prior;
+        column[end + j] = 1.0 / covariance.sqrt();
     }
     target.resize(end + k, 0.0);
-    // With a prior no column is linearly dependent in exact arithmetic.
-    let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
-    if let Some(&index) = dropped.iter().find(|&&d| d < regression.free_count()) {
-        return Err(Error::Singular { index, count: k });
+    (columns, target)
+}
+
+/// Multi-innovation estimate (44) of m = Q X, from X₀ = 0 with a prior covariance of each coefficient, in closed form.
+///
+/// `columns` are those of Q. O(M k²).
+///
+/// # Errors
+/// An innovation length of 0, a prior covariance that is not positive and finite, values that are not finite,
+/// [`Error::Length`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// let (q, m) = (vec![1.0, 2.0, 3.0], vec![2.0, 4.0, 6.0]);
+/// let found = ftlm::estimation::multi_innovation::estimate(&[q], &m, 2, &[1e9])?;
+/// assert!((found[0] - 2.0).abs() < 1e-8);
+/// # Ok(())
+/// # }
+/// ```
+pub fn estimate(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<Vec<f64>> {
+    check_problem(columns, target, length, prior_covariance)?;
+    let (rows, outputs) =
+        weighted_rows(columns.to_vec(), target.to_vec(), &[0, target.len()], length, prior_covariance);
+    let (solution, dropped) = least_squares::solve(&rows, &outputs, 0)?;
+    match dropped.first() {
+        Some(&index) => Err(Error::Singular { index, count: columns.len() }),
+        None => Ok(solution),
     }
-    regression.estimate(&solution, &dropped)
+}
+
+/// Coefficients after every step of the recursion (44) on m = Q X, as in [`estimate`]. O(M k³).
+///
+/// # Errors
+/// As [`estimate`], and [`Error::Diverged`] if rounding makes the covariance indefinite.
+pub fn path(
+    columns: &[Vec<f64>],
+    target: &[f64],
+    length: usize,
+    prior_covariance: &[f64],
+    stop: &Stop,
+) -> Result<Vec<Vec<f64>>> {
+    check_problem(columns, target, length, prior_covariance)?;
+    let mut state = Recursion::with_prior(&vec![0.0; columns.len()], prior_covariance)?;
+    let rows: Vec<Vec<f64>> = (0..target.len()).map(|i| columns.iter().map(|c| c[i]).collect()).collect();
+    (0..target.len())
+        .map(|newest| {
+            stop.check()?;
+            let oldest = (newest + 1).saturating_sub(length);
+            state
+                .step((oldest..=newest).rev().map(|i| (rows[i].as_slice(), target[i])))
+                .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;
+            Ok(state.coefficients().to_vec())
+        })
+        .collect()
+}
+
+fn check_problem(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<()> {
+    check_length("prior covariances", columns.len(), prior_covariance.len())?;
+    for &prior_covariance in prior_covariance {
+        Innovation { length, prior_covariance, row_basis: RowBasis::Time }.check()?;
+    }
+    check_finite("m", target)?;
+    columns.iter().try_for_each(|column| {
+        check_length("column of Q", target.len(), column.len())?;
+        check_finite("Q", column)
+    })
 }
 
 /// Run the recursion (44) from X₀ = 0; return the last estimate and the coefficients after every step.

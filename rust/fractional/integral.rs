@@ -1,6 +1,6 @@
 //! Fractional integrals and derivatives of uniformly sampled signals.
 
-use crate::error::{check_finite, check_overflow, check_step, Error, Result};
+use crate::error::{check_finite, check_length, check_overflow, check_step, Error, Result};
 use crate::fractional::kernels::{block_pulse_kernel, check_order, grunwald_letnikov_weights, SecondDifferences};
 use crate::series;
 
@@ -45,37 +45,57 @@ pub enum Derivative {
 /// # }
 /// ```
 pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -> Result<Vec<f64>> {
+    let mut out = x.to_vec();
+    integrate_signals(&mut out, x.len(), eta, step, rule)?;
+    Ok(out)
+}
+
+/// I^η of uniformly sampled signals of m samples, one after another, in place. The kernel is computed once.
+///
+/// # Errors
+/// As [`fractional_integral`], and signals that do not end with a whole one.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::fractional::integral::{integrate_signals, IntegralRule};
+/// let mut signals = [1.0, 1.0, 2.0, 2.0];
+/// integrate_signals(&mut signals, 2, 1.0, 1.0, IntegralRule::BlockPulse)?;
+/// assert_eq!(signals, [0.5, 1.5, 1.0, 3.0]);
+/// # Ok(())
+/// # }
+/// ```
+pub fn integrate_signals(signals: &mut [f64], m: usize, eta: f64, step: f64, rule: IntegralRule) -> Result<()> {
     check_step(step)?;
     check_order("order", eta)?;
-    check_finite("x", x)?;
-    let m = x.len();
-    if eta == 0.0 || m == 0 {
-        return Ok(x.to_vec());
+    check_finite("x", signals)?;
+    if m == 0 || !signals.len().is_multiple_of(m) {
+        return if signals.is_empty() { Ok(()) } else { check_length("the last signal", m, signals.len() % m.max(1)) };
     }
-    let integral = match rule {
-        IntegralRule::BlockPulse => series::multiply(&block_pulse_kernel(eta, m, step), x, m),
+    if eta == 0.0 {
+        return Ok(());
+    }
+    match rule {
+        IntegralRule::BlockPulse => series::multiply_signals(&block_pulse_kernel(eta, m, step), signals),
         IntegralRule::GrunwaldLetnikov => {
             let scale = libm::pow(step, eta);
-            let mut out = series::multiply(&grunwald_letnikov_weights(-eta, m), x, m);
-            out.iter_mut().for_each(|v| *v *= scale);
-            out
+            series::multiply_signals(&grunwald_letnikov_weights(-eta, m), signals);
+            signals.iter_mut().for_each(|v| *v *= scale);
         }
         IntegralRule::Trapezoidal => {
             let differences = SecondDifferences::new(eta);
-            // The block-pulse kernel is also the trapezoidal weight of every sample but the first.
-            let mut out = series::multiply(&block_pulse_kernel(eta, m, step), x, m);
             let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
-            for (n, value) in out.iter_mut().enumerate() {
-                *value += x[0] * scale * (first_sample_weight(eta, n) - differences.value(n + 1));
+            let weights: Vec<f64> =
+                (0..m).map(|n| scale * (first_sample_weight(eta, n) - differences.value(n + 1))).collect();
+            let first: Vec<f64> = signals.iter().step_by(m).copied().collect();
+            // The block-pulse kernel is also the trapezoidal weight of every sample but the first.
+            series::multiply_signals(&block_pulse_kernel(eta, m, step), signals);
+            for (out, first) in signals.chunks_exact_mut(m).zip(first) {
+                out.iter_mut().zip(&weights).for_each(|(value, weight)| *value += first * weight);
+                out[0] = 0.0;
             }
-            if let Some(first) = out.first_mut() {
-                *first = 0.0;
-            }
-            out
         }
-    };
-    check_overflow(&integral, step)?;
-    Ok(integral)
+    }
+    check_overflow(signals, step)
 }
 
 /// Trapezoidal weight of the first sample at point n: `(n−1)^{η+1} − (n−1−η) n^η`.

@@ -247,18 +247,27 @@ impl Recursion {
     /// # Errors
     /// [`Error::OutOfRange`] for a prior that is not positive and finite.
     pub fn new(start: &[f64], prior: f64) -> Result<Self> {
-        let k = start.len();
-        if !(prior > 0.0 && prior.is_finite()) {
+        Self::with_prior(start, &vec![prior; start.len()])
+    }
+
+    /// Recursion from coefficients `start` with a prior covariance of each.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a prior that is not positive and finite, [`Error::Length`].
+    pub fn with_prior(start: &[f64], prior: &[f64]) -> Result<Self> {
+        check_length("prior covariances", start.len(), prior.len())?;
+        if let Some(&value) = prior.iter().find(|&&p| !(p > 0.0 && p.is_finite())) {
             return Err(Error::OutOfRange {
                 name: "prior covariance K0".into(),
-                value: prior,
+                value,
                 range: "(0, ∞)".into(),
                 remedy: "use a large number for a weak prior".into(),
             });
         }
+        let precision: Vec<f64> = prior.iter().map(|p| 1.0 / p).collect();
         Ok(Self {
             coefficients: DVector::from_column_slice(start),
-            information: DMatrix::from_diagonal_element(k, k, 1.0 / prior),
+            information: DMatrix::from_diagonal(&DVector::from_column_slice(&precision)),
         })
     }
 

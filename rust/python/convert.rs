@@ -55,8 +55,8 @@ pub fn copy_vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Ve
     Ok(array.as_array().iter().copied().collect())
 }
 
-/// Rows of a two-dimensional array. An array with zero strides may seem larger than memory.
-pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
+/// Check the size of a two-dimensional array. An array with zero strides may seem larger than memory.
+pub fn check_size(array: &PyReadonlyArray2<'_, f64>) -> PyResult<()> {
     let [rows, columns] = [array.shape()[0], array.shape()[1]];
     check_points("rows of an array", rows)?;
     check_points("columns of an array", columns)?;
@@ -64,6 +64,12 @@ pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
         let what = format!("an array of {rows} rows and {columns} columns");
         return Err(Error::Structure { what, remedy: format!("give at most {MOST_VALUES} values at once") }.into());
     }
+    Ok(())
+}
+
+/// Rows of a two-dimensional array.
+pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
+    check_size(array)?;
     Ok(array.as_array().outer_iter().map(|row| row.iter().copied().collect()).collect())
 }
 

@@ -7,6 +7,7 @@ mod errors;
 mod estimation;
 mod friction;
 mod joint_fit;
+mod kernels;
 mod operators;
 mod order_search;
 mod simulation;
@@ -28,6 +29,11 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::operators::{singular_values, triangular_factor};
+
+    #[pymodule_export]
+    use crate::python::kernels::{
+        block_pulse_kernels, multi_innovation_estimate, pulse_mean_rows, toeplitz_apply, toeplitz_solve,
+    };
 
     #[pymodule_export]
     use crate::python::estimation::{

@@ -3,7 +3,7 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::convert::{columns, copy_vector, matrix, rows, stack_rows, vector, List};
+use super::convert::{check_size, columns, copy_vector, matrix, rows, stack_rows, vector, List};
 use super::errors::run_detached;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
@@ -158,17 +158,23 @@ pub fn fractional_integral<'py>(
         "grunwald-letnikov" => IntegralRule::GrunwaldLetnikov,
         other => return Err(choice("rule", other, "block-pulse, trapezoidal, grunwald-letnikov").into()),
     };
-    let all = rows(&x)?;
-    let points = all.iter().map(Vec::len).sum();
-    let out = run_interruptible(py, points, None, move |stop| {
-        let integral = |row: &Vec<f64>| {
+    check_size(&x)?;
+    let (count, width) = (x.as_array().nrows(), columns(&x));
+    let mut values: Vec<f64> = x.as_array().iter().copied().collect();
+    let values = run_interruptible(py, values.len(), None, move |stop| {
+        let rows_at_once = (MAX_BLOCK_POINTS / width.max(1)).max(1);
+        for block in values.chunks_mut(rows_at_once * width.max(1)) {
             stop.check()?;
-            integral::fractional_integral(row, order, step, rule)
-        };
-        all.iter().map(integral).collect()
+            integral::integrate_signals(block, width, order, step, rule)?;
+        }
+        Ok(values)
     })?;
-    join_rows(py, out, columns(&x))
+    use numpy::PyArrayMethods;
+    PyArray1::from_vec(py, values).reshape([count, width])
 }
+
+/// Values of a batch that are integrated between two checks for a stop.
+const MAX_BLOCK_POINTS: usize = 1 << 17;
 
 #[pyfunction]
 pub fn fractional_derivative<'py>(

@@ -25,5 +25,5 @@ pub mod running_sums;
 pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK_TERMS};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
-pub use product::{multiply, Buffers, Kernel, SumOfProducts};
+pub use product::{multiply, multiply_signals, Buffers, Kernel, SumOfProducts};
 pub use running_sums::{running_sums, Recursion, Source, MAX_SUMS, RIGHT_SIDE_LANES};

@@ -34,6 +34,36 @@ pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     out
 }
 
+/// Products mod z^m of one series of m terms with many signals of m terms, in place. O(m log m) a signal.
+///
+/// The spectrum of the series is computed once. `signals` holds them one after another; a rest of fewer than m terms is
+/// left as it is. A series that is zero from its second term on multiplies exactly.
+///
+/// ```
+/// let mut signals = [1.0, 2.0, 3.0, 0.0, 1.0, 0.0];
+/// ftlm::series::multiply_signals(&[1.0, -1.0, 0.0], &mut signals);
+/// assert_eq!(signals, [1.0, 1.0, 1.0, 0.0, 1.0, -1.0]);
+/// ```
+pub fn multiply_signals(series: &[f64], signals: &mut [f64]) {
+    let m = series.len();
+    let Some((&first, rest)) = series.split_first() else { return };
+    if rest.iter().all(|&v| v == 0.0) {
+        let whole = signals.len() / m * m;
+        signals[..whole].iter_mut().for_each(|v| *v *= first);
+    } else if m <= MAX_DIRECT_TERMS {
+        signals.chunks_exact_mut(m).for_each(|signal| signal.copy_from_slice(&direct(series, signal, m)));
+    } else {
+        let kernel = Kernel::new(series);
+        let mut product = vec![0.0; m];
+        with_thread_buffers(kernel.plan.len(), |buffers| {
+            for signal in signals.chunks_exact_mut(m) {
+                kernel.apply(signal, &mut product, buffers);
+                signal.copy_from_slice(&product);
+            }
+        });
+    }
+}
+
 /// Longest transform whose buffers a thread reuses.
 const MAX_REUSED_BUFFER_POINTS: usize = 1 << 17;
 

@@ -16,7 +16,7 @@ LAYERS = (
     {"utils"},
     {"progress", "findings"},
     {"svg", "structure", "fractional_calculus"},
-    {"data"},
+    {"data", "kernels"},
     {"io", "model"},
     {"simulation", "arm"},
     {"analysis", "validation", "order_search"},

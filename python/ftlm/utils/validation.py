@@ -299,7 +299,7 @@ def apply_along_axis(
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
     moved = np.moveaxis(array, axis, -1)
-    if moved.size == 0:
+    if moved.shape[-1] == 0:
         raise DataError(f"{name} has shape {array.shape} and holds no value; give at least one")
     rows = np.ascontiguousarray(moved.reshape(-1, moved.shape[-1]))
     return np.moveaxis(work(rows).reshape(moved.shape), -1, axis)

@@ -1,0 +1,165 @@
+"""`ftlm.kernels` against dense matrices, SciPy and the recursion as published; broadcasting, and arguments refused."""
+
+import threading
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
+
+import ftlm
+from ftlm import kernels
+
+STEP = 0.1
+ORDERS = np.array([0.0, 0.5, 1.3, 2.0])
+
+
+def noise(*shape, seed=0):
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def dense(kernel):
+    return scipy.linalg.toeplitz(kernel, np.r_[kernel[0], np.zeros(len(kernel) - 1)])
+
+
+@pytest.mark.parametrize("m", [1, 7, 64, 65, 300])
+def test_integrals_are_products_with_dense_matrices(m):
+    x = noise(3, m)
+    found = kernels.integrate(x[:, None], ORDERS, step=STEP)
+    assert found.shape == (3, 4, m)
+    for order, integrals in zip(ORDERS, found.swapaxes(0, 1), strict=True):
+        expected = x @ ftlm.block_pulse_matrix(order, m, m * STEP)
+        np.testing.assert_allclose(integrals, expected, rtol=1e-10, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("rule", ["block-pulse", "trapezoidal", "grunwald-letnikov"])
+@pytest.mark.parametrize("m", [5, 200])
+def test_a_batch_has_the_integrals_of_its_signals(m, rule):
+    x = noise(5, m)
+    batch = ftlm.fractional_integral(x, 0.7, step=STEP, rule=rule)
+    alone = [ftlm.fractional_integral(row, 0.7, step=STEP, rule=rule) for row in x]
+    np.testing.assert_array_equal(batch, alone)
+
+
+def test_orders_of_integrals_add():
+    x = noise(2, 500)
+    twice = kernels.integrate(kernels.integrate(x, 0.4, step=STEP), 0.6, step=STEP)
+    once = kernels.integrate(x, 1.0, step=STEP)
+    # Block pulses are second order in the step: the matrices of two orders commute, their product is near the sum's.
+    assert np.abs(twice - once).max() < 0.02 * np.abs(once).max()
+
+
+def test_the_derivative_of_a_kernel_is_that_of_differences():
+    low, high = kernels.block_pulse_kernel([0.8 - 1e-6, 0.8 + 1e-6], 50, step=STEP)
+    slope = kernels.block_pulse_kernel(0.8, 50, step=STEP, derivative=True)
+    np.testing.assert_allclose(slope, (high - low) / 2e-6, rtol=1e-5, atol=1e-9)
+
+
+@given(
+    lead=st.sampled_from([((), ()), ((3,), ()), ((), (3,)), ((2, 1), (3,)), ((0,), (1,))]),
+    m=st.integers(1, 150),
+)
+def test_toeplitz_systems_broadcast_and_are_solved(lead, m):
+    kernel, x = 0.3 * noise(*lead[0], m) / np.arange(1, m + 1), noise(*lead[1], m, seed=1)
+    kernel[..., 0] = 1.0
+    product = kernels.toeplitz_apply(kernel, x)
+    shape = np.broadcast_shapes(*lead)
+    assert product.shape == (*shape, m)
+    every, vectors = np.broadcast_to(kernel, (*shape, m)), np.broadcast_to(x, (*shape, m))
+    for index in np.ndindex(shape):
+        np.testing.assert_allclose(product[index], dense(every[index]) @ vectors[index], rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(kernels.toeplitz_solve(kernel, product), vectors, rtol=1e-8, atol=1e-8)
+
+
+def published_recursion(q, m, p, prior):
+    """(44) step by step, with the covariance as the paper writes it."""
+    x, covariance, path = np.zeros(q.shape[1]), np.diag(prior), []
+    for i in range(len(m)):
+        rows = q[max(0, i - p + 1) : i + 1]
+        inverse = np.linalg.inv(np.eye(len(rows)) + rows @ covariance @ rows.T)
+        covariance = covariance - covariance @ rows.T @ inverse @ rows @ covariance
+        x = x + covariance @ rows.T @ (m[max(0, i - p + 1) : i + 1] - rows @ x)
+        path.append(x)
+    return np.array(path)
+
+
+@pytest.mark.parametrize("p", [1, 3, 7, 500])
+@pytest.mark.parametrize("prior", [2.0, [0.1, 10.0, 1e3]])
+def test_multi_innovation_is_the_published_recursion(p, prior):
+    q, m = noise(2, 40, 3), noise(2, 40, seed=1)
+    path = kernels.multi_innovation(q, m, p, prior_covariance=prior, trace=True)
+    last = kernels.multi_innovation(q, m, p, prior_covariance=prior)
+    assert path.shape == (2, 40, 3)
+    for k in range(2):
+        expected = published_recursion(q[k], m[k], p, np.broadcast_to(prior, 3))
+        np.testing.assert_allclose(path[k], expected, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(last[k], expected[-1], rtol=1e-7, atol=1e-9)
+
+
+def test_means_haar_and_errors_are_those_of_one_signal():
+    samples = noise(2, 3, 65)
+    means = kernels.pulse_means(samples, 32, hold=True)
+    np.testing.assert_allclose(means[1, 2], samples[1, 2, :-1].reshape(32, 2).mean(axis=1), rtol=1e-13)
+    np.testing.assert_allclose(kernels.pulse_means(samples)[0, 0], (samples[0, 0, 1:] + samples[0, 0, :-1]) / 2)
+    np.testing.assert_allclose(kernels.haar(means), means @ ftlm.haar_matrix(32).T, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(kernels.haar_inverse(kernels.haar(means)), means, rtol=1e-12, atol=1e-12)
+    found = kernels.errors(means, means[0] + 0.1)
+    one = ftlm.metrics(means[1, 2], means[0, 2] + 0.1)
+    np.testing.assert_allclose(found[1, 2], [one.error, one.rmse, one.nr, one.fit], rtol=1e-12)
+
+
+def test_arguments_of_any_strides_stay_as_they_are():
+    x = noise(300, 4).T
+    x.flags.writeable = False
+    whole = np.asarray(x, dtype=np.float32)
+    kept = whole.copy()
+    np.testing.assert_allclose(
+        kernels.integrate(whole, 0.5, step=STEP), kernels.integrate(kept.astype(float), 0.5, step=STEP)
+    )
+    np.testing.assert_array_equal(whole, kept)
+    kernels.integrate(x, 0.5, step=STEP)
+    assert kernels.integrate(np.zeros((0, 3, 8)), ORDERS[:3], step=STEP).shape == (0, 3, 8)
+    assert kernels.haar(np.zeros((0, 8))).shape == (0, 8)
+    assert kernels.multi_innovation(np.zeros((0, 5, 2)), np.zeros((0, 5)), prior_covariance=1.0).shape == (0, 2)
+
+
+def test_two_threads_compute_what_one_does():
+    x, found = noise(64, 4096), {}
+
+    def work(name):
+        found[name] = kernels.integrate(x, 0.3, step=STEP)
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: kernels.integrate([[1.0, np.nan]], 0.5, step=STEP), r"x is not finite at index \[0, 1\] \(1 such"),
+        (lambda: kernels.integrate(np.ma.masked_array([1.0, 2.0], [0, 1]), 0.5, step=STEP), "masked"),
+        (lambda: kernels.integrate([1j, 2.0], 0.5, step=STEP), "complex"),
+        (lambda: kernels.integrate([1.0, 2.0], 11.0, step=STEP), "order"),
+        (lambda: kernels.integrate([1.0, 2.0], 0.5, step=0.0), "step"),
+        (lambda: kernels.integrate(np.ones((2, 4)), np.ones(3), step=STEP), r"x \(2,\) and order \(3,\) do not"),
+        (lambda: kernels.integrate(1.0, 0.5, step=STEP), "no axis of time"),
+        (lambda: kernels.toeplitz_apply(np.ones(3), np.ones(4)), "3 terms and x 4"),
+        (lambda: kernels.toeplitz_solve([0.0, 1.0], [1.0, 1.0]), r"kernel begins with 0 at index \[0\]"),
+        (lambda: kernels.haar(np.ones(6)), "power of two"),
+        (lambda: kernels.pulse_means([1.0]), "samples|pulse"),
+        (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(5), prior_covariance=1.0), r"\(4, 2\), m \(5,\)"),
+        (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), 0, prior_covariance=1.0), "p = 0"),
+        (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), prior_covariance=-1.0), "prior"),
+        (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), prior_covariance=[1.0] * 3), "prior_covariance"),
+        (lambda: kernels.errors(np.ones(3), np.ones(4)), r"\(3,\), predicted \(4,\)"),
+        (lambda: kernels.block_pulse_kernel(0.5, 0, step=STEP), "m"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_words(call, words):
+    with pytest.raises(ftlm.FtlmError, match=words):
+        call()
