@@ -24,6 +24,7 @@ from ftlm.estimation.model_checks import (
     excitation_findings,
     friction_direction_findings,
     stability_findings,
+    start_findings,
     stribeck_findings,
 )
 from ftlm.estimation.nuisance_parameters import (
@@ -65,7 +66,7 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
     if structure.offset != "auto":
         fit = estimate(structure)
         # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
-        if structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
+        if fit.task.structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
             return fit
         said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
         return replace(fit, findings=[*fit.findings, *said])
@@ -79,6 +80,8 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         words = f"none: {twin} is constant on every run, which an offset cannot be told from"
         return _with_offset_decision(estimate(replace(structure, offset="none")), words)
     fit = estimate(asked)
+    if fit.task.structure.offset == "level":
+        return _with_offset_decision(fit, "level: the runs rest at their own level before an input moves")
     test = fit_offset_test(fit)
     if test is not None and test.exceeds():
         return _with_offset_decision(fit, test.decision)
@@ -163,9 +166,10 @@ def identify(
         ``"genetic"``.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
-        friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
-        ``.comparison.offsets``, estimated anew on any run that the model is judged on; beside a history (a run that
-        starts in motion) it is estimated, but cannot be told from it. ``"auto"``: a constant where the
+        friction that the model lacks; ``"level"``: a constant that is added to each output; ``"ramp"``: a constant and
+        a drift in proportion to time. One each run, in ``.comparison.offsets``, estimated anew on any run that the
+        model is judged on; beside a history (a run that starts in motion) it is estimated, but cannot be told from it.
+        A run that rests at its own level before an input moves has a level by default. ``"auto"``: a constant where the
         runs ask for one at 99 %, none where they do not, with the statistic in ``.settings["offset_test"]``; it fits
         once with the constant and, where none is asked for, once without. Default what the structure says. Where it
         says none and a constant would explain much, a warning does.
@@ -238,6 +242,7 @@ def assess_fit(fit: Fit) -> Identification:
     comparison = compare_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
     findings = [*comparison.findings, *fit.findings]
     findings += [note for run in runs for note in data_notes(run)]
+    findings += start_findings(runs, model.structure)
     findings += dead_channel_findings(runs, fit.task.structure) + excitation_findings(runs, fit.task.structure)
     findings += (
         discretization_findings(model, comparison)

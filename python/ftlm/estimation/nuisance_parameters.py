@@ -32,6 +32,7 @@ from ftlm.simulation.initial_conditions import (
     misfit_of_fits,
     needs_history,
     resolve_common_initial_conditions,
+    resolve_start,
 )
 from ftlm.simulation.output_samples import initial_exponents, is_in_motion
 from ftlm.structure.equation import Term
@@ -99,6 +100,7 @@ def evaluate_at_point(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
 ) -> tuple[Objective, Iterate]:
     """Evaluate the output error at given parameters, with output weights from the residuals."""
+    structure = resolve_start(runs, structure)
     problem = FreeProblem.of(replace(structure, initial=resolve_common_initial_conditions(runs, structure)))
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     start = Iterate(orders, coefficients, "given", {}, inputs)

@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, make_read_only
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import History, Initial, Structure
 from ftlm.utils.linalg import vector_norm
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared, estimate_noise, huber_excess, is_rest
+from ftlm.utils.statistics import (
+    NEGLIGIBLE_RESIDUAL_SHARE,
+    NOISE_SAMPLES,
+    REST_SHARE,
+    chi_squared,
+    estimate_noise,
+    huber_excess,
+    is_rest,
+    white_noise,
+)
 from ftlm.utils.validation import Floats
 
 #: Increment of the powers of time.
@@ -36,6 +48,152 @@ HISTORY_TEST_LEVEL, HISTORY_TEST_LEVEL_WITH_OFFSET = 0.25, 0.02
 #: Weight of the excess in the residual sum of squares, as an alternative to the robust excess. Few outliers must not
 #: require a history, but a least-squares fit must not be worse than one with a history and fewer parameters.
 SQUARES_WEIGHT = 0.25
+
+
+#: Least number of rows before the inputs move that can show rest.
+MIN_QUIET_ROWS = 5
+#: Standard errors within which slope, scatter and level of quiet rows are those of noise.
+QUIET_SIGMAS = 3.3
+#: Relative standard error of the noise, times the root of the number of samples (300 records of 30 to 4000 samples).
+NOISE_ERROR = 1.5
+#: Noise of a signal without noise, as a share of its standard deviation.
+NOISE_SHARE = 1e-6
+#: Standard error of a drift in quiet rows, over the whole run and as a share of the output's standard deviation, up to
+#: which they show rest under a command that is held at a value other than 0 and changes often.
+MAX_DRIFT_SHARE = 0.1
+#: Change of a constant input, relative to its largest value, that is rounding.
+CONSTANT_SHARE = 1e-9
+
+
+@dataclass(frozen=True)
+class RestEvidence:
+    """Evidence of the first rows that the plant rested before the run.
+
+    Parameters
+    ----------
+    rows
+        Number of rows in which inputs and outputs stand still before an input moves; 0 if the inputs are constant from
+        the first or second row on, so that rest is an assumption.
+    levels
+        Level of each output before the run.
+    inputs
+        Value of each input before the run.
+    shows_level
+        Whether outputs or inputs rest at values other than 0.
+    """
+
+    rows: int
+    levels: dict[str, float]
+    inputs: dict[str, float]
+    shows_level: bool
+
+
+_EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, ...]], RestEvidence | None]] = (
+    WeakKeyDictionary()
+)
+
+
+def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
+    """Return the evidence that the plant rested before the run, or None if it may have been in motion."""
+    found = _EVIDENCE_BY_RUN.setdefault(run, {})
+    key = structure.outputs, structure.signals
+    if key not in found:
+        found[key] = _rest_evidence(run, structure)
+    return found[key]
+
+
+def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
+    """Return the evidence of quiet rows, or of inputs that are constant from the first or second row on."""
+    inputs = [n for n in structure.signals if n in run.inputs]
+    outputs = [n for n in structure.signals if n in run.outputs]
+    if not inputs or not outputs or any(n not in run for n in structure.signals):
+        return None
+    if run.sample_times is not None and run.missing_samples:
+        return None
+    moves = [_rows_of_change(run[n]) for n in inputs]
+    quiet = min((int(rows[0]) for rows in moves if rows.size), default=0)
+    if quiet >= MIN_QUIET_ROWS:
+        levels = {}
+        visible = any(run[n][0] != 0.0 for n in inputs)
+        # A command that is held and changed again and again may have been so before: quiet rows must be long then.
+        held = visible and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
+        for name in outputs:
+            rows = drop_missing(run[name][:quiet])
+            noise = noise_at_start(run[name])
+            if rows.size < MIN_QUIET_ROWS or not _stands_still(rows, noise):
+                return None
+            if held and noise * run.length / _slope_weight(rows.size) > MAX_DRIFT_SHARE * float(np.nanstd(run[name])):
+                return None
+            levels[name] = float(np.mean(rows))
+            size = QUIET_SIGMAS * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
+            visible |= abs(levels[name]) > size
+        return RestEvidence(quiet, levels, {n: float(run[n][0]) for n in inputs}, visible)
+    constant = all(_rows_of_change(run[n][1:]).size == 0 for n in inputs)
+    if not constant or not any(np.any(run[n][1:]) for n in inputs):
+        return None
+    first = {n: float(drop_missing(run[n])[0]) for n in outputs}
+    return RestEvidence(0, first, dict.fromkeys(inputs, 0.0), not starts_at_rest(run, structure))
+
+
+def noise_at_start(samples: Floats) -> float:
+    """Return the largest likely standard deviation of the noise: two standard errors above its estimate."""
+    count = min(samples.size, NOISE_SAMPLES)
+    noise = white_noise(samples) * (1.0 + 2.0 * NOISE_ERROR / math.sqrt(count))
+    return max(noise, NOISE_SHARE * float(np.nanstd(samples)))
+
+
+def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
+    """Return the rows in which a signal differs from its first value."""
+    return np.flatnonzero(np.abs(samples - samples[0]) > CONSTANT_SHARE * float(np.max(np.abs(samples))))
+
+
+def _stands_still(rows: Floats, noise: float) -> bool:
+    """Whether slope and scatter of rows are those of noise."""
+    t = np.arange(rows.size) - 0.5 * (rows.size - 1)
+    slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
+    limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
+    return abs(slope) <= QUIET_SIGMAS * limits[0] and scatter <= noise + QUIET_SIGMAS * limits[1]
+
+
+def _slope_weight(rows: int) -> float:
+    """Return the ratio of the noise of rows to the standard error of their slope a row."""
+    return math.sqrt(rows * (rows**2 - 1) / 12.0)
+
+
+def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
+    """Return the structure with the start of runs that rested before their first row: from rest, with its level.
+
+    Initial terms and offset that are given stay, and ``"auto"`` stays if a run may have been in motion. A constant in
+    the equations is a level where the plant rested under it.
+    """
+    automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
+    if structure.has_friction or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
+        return structure
+    found = [rest_evidence(run, structure) for run in runs]
+    known = [f for f in found if f is not None]
+    constant = structure.offset == "constant" and any(f.rows == 0 for f in known)
+    offset = "level" if constant or any(f.shows_level for f in known) else structure.offset
+    initial = "rest" if automatic and len(known) == len(found) else structure.initial
+    return replace(structure, initial=initial, offset=offset)
+
+
+def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
+    """Return a run as deviations from its level before the first row, and the levels of its outputs.
+
+    Inputs deviate from their values in quiet rows, unless they have a saturation or a dead zone.
+    """
+    evidence = rest_evidence(run, structure)
+    limited = {limit.signal for limit in structure.limits}
+    outputs = [n for n in structure.signals if n in run.outputs]
+    levels = {n: float(drop_missing(run[n])[0]) for n in outputs} if evidence is None else evidence.levels
+    inputs = {} if evidence is None else {n: v for n, v in evidence.inputs.items() if n not in limited}
+    moved = {n: v for n, v in {**levels, **inputs}.items() if v != 0.0}
+    if not moved:
+        return run, levels
+    samples = {n: run[n] - v for n, v in moved.items()}
+    read = run.sample_times
+    own = None if read is None else {n: read.data[n] - v for n, v in moved.items()}
+    return run.with_samples(samples, own), levels
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
@@ -70,9 +228,10 @@ def history(run: Run, structure: Structure) -> History:
 
 def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
     """Return the initial conditions of a structure on a run, resolving ``"auto"``."""
+    structure = resolve_start([run], structure)
     initial = structure.initial
     if initial == "auto":
-        if starts_at_rest(run, structure):
+        if structure.offset != "level" and starts_at_rest(run, structure):
             return "rest"
         # A body with friction has no velocities but its own, so that only level and velocity are asked for.
         initial = "history" if has_memory(structure) and not structure.has_friction else "caputo"
