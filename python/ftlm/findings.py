@@ -439,6 +439,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "estimated with the model: {ask[initial]} overrules it",
         prefix="{run}: ",
     ),
+    "level_estimated": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "{output} does not start at zero, and a level that is added to it explains the runs better than what came "
+        "before them alone|: the plant {was} about a level of its own before the start; {ask[offset]} and "
+        "{ask[initial]} overrule it",
+        prefix="{run}: ",
+    ),
     "rest_assumed": FindingKind(
         "history",
         LEVEL_WITH_CARE,

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
@@ -46,13 +48,15 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import run_in_worker
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, variance_inflation
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
 from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
 
+#: Initial terms of fits with a level.
+LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
@@ -69,7 +73,8 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         if fit.task.structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
             return fit
         said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
-        return replace(fit, findings=[*fit.findings, *said])
+        level = _fit_with_level(fit, structure, estimate) if said and structure.initial == "auto" else None
+        return level or replace(fit, findings=[*fit.findings, *said])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
@@ -87,6 +92,46 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         return _with_offset_decision(fit, test.decision)
     decision = "none: its test has no finite free run" if test is None else test.decision
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
+
+
+def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit | None:
+    """Return the best fit with a level of the outputs, from rest or in motion, if the runs prefer it; else None.
+
+    It is sought where a constant would explain much of runs that do not start at zero.
+    """
+    if fit.joint is None or fit.joint.initial == "rest":
+        return None
+    best, chosen = _start_score(fit, fit), None
+    for initial in LEVEL_STARTS:
+        try:
+            level = estimate(replace(structure, initial=initial, offset="level"))
+        except FtlmError:
+            continue
+        score = _start_score(level, fit)
+        if score < best:
+            best, chosen = score, level
+    if chosen is None or chosen.joint is None:
+        return None
+    was = "rested" if chosen.joint.initial == "rest" else "moved"
+    about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
+    return replace(chosen, findings=[*chosen.findings, make_finding("level_estimated", **about)])
+
+
+def _start_score(fit: Fit, reference: Fit) -> float:
+    """Return the Bayesian information criterion of a fit's start; residuals count as their color in `reference` tells.
+
+    All starts are allowed the same smooth misfit, so that none wins by what the structure lacks.
+    """
+    joint, base = fit.joint, reference.joint
+    if joint is None or base is None:
+        return math.inf
+    score = 0.0
+    for output, noise in joint.noise.items():
+        series = [drop_missing(part[output]) for part in base.residuals]
+        count = sum(map(len, series)) / max(1.0, variance_inflation(np.concatenate(series)))
+        score += 2.0 * count * math.log(max(noise, 1e-300))
+    levels = len(joint.noise) * len(fit.task.runs) * (fit.task.structure.offset == "level")
+    return score + math.log(joint.samples) * (joint.initial_terms + levels)
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:
