@@ -13,7 +13,6 @@ import numpy as np
 from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
-from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
@@ -32,6 +31,7 @@ from ftlm.estimation.model_checks import (
 from ftlm.estimation.nuisance_parameters import (
     DEFAULT_PULSES_PER_SAMPLE,
     OffsetTest,
+    fit_score,
     fit_without_history,
     offset_test,
     unrequested_offset_findings,
@@ -48,7 +48,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import run_in_worker
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, variance_inflation
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import check_threads
 from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
 from ftlm.validation.data_advice import data_notes
@@ -101,13 +101,14 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
     """
     if fit.joint is None or fit.joint.initial == "rest":
         return None
-    best, chosen = _start_score(fit, fit), None
+    best, chosen = fit_score(fit.joint, fit.joint), None
     for initial in LEVEL_STARTS:
         try:
             level = estimate(replace(structure, initial=initial, offset="level"))
         except FtlmError:
             continue
-        score = _start_score(level, fit)
+        levels = len(fit.task.runs) * len(fit.model.outputs)
+        score = math.inf if level.joint is None else fit_score(level.joint, fit.joint, levels)
         if score < best:
             best, chosen = score, level
     if chosen is None or chosen.joint is None:
@@ -115,23 +116,6 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
     was = "rested" if chosen.joint.initial == "rest" else "moved"
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
     return replace(chosen, findings=[*chosen.findings, make_finding("level_estimated", **about)])
-
-
-def _start_score(fit: Fit, reference: Fit) -> float:
-    """Return the Bayesian information criterion of a fit's start; residuals count as their color in `reference` tells.
-
-    All starts are allowed the same smooth misfit, so that none wins by what the structure lacks.
-    """
-    joint, base = fit.joint, reference.joint
-    if joint is None or base is None:
-        return math.inf
-    score = 0.0
-    for output, noise in joint.noise.items():
-        series = [drop_missing(part[output]) for part in base.residuals]
-        count = sum(map(len, series)) / max(1.0, variance_inflation(np.concatenate(series)))
-        score += 2.0 * count * math.log(max(noise, 1e-300))
-    levels = len(joint.noise) * len(fit.task.runs) * (fit.task.structure.offset == "level")
-    return score + math.log(joint.samples) * (joint.initial_terms + levels)
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:

@@ -24,6 +24,7 @@ from ftlm.utils.statistics import (
     estimate_noise,
     huber_excess,
     is_rest,
+    variance_inflation,
     white_noise,
 )
 from ftlm.utils.validation import Floats
@@ -37,6 +38,8 @@ REFERENCE_SIGNAL_RATIO, REFERENCE_QUARTERS = 2500.0, 6
 SIGNAL_RATIO_PER_QUARTER = 2.5
 #: Minimum and maximum number of quarters.
 MIN_QUARTERS, MAX_QUARTERS = 2, 12
+#: Inflation of the variance of a mean above which residuals are those of a structure that leaves something out.
+MAX_WHITE_INFLATION = 2.0
 #: Minimum number of samples of a run per quarter.
 MIN_SAMPLES_PER_QUARTER = 16
 #: Integer powers below this are always included, so that the list is the same for any order up to 3.
@@ -109,6 +112,9 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     if not inputs or not outputs or any(n not in run for n in structure.signals):
         return None
     if run.sample_times is not None and run.missing_samples:
+        return None
+    if any(np.nanstd(run[n]) == 0.0 for n in outputs):
+        # An output that never moves shows nothing, such as that of a run which is to be simulated.
         return None
     moves = [_rows_of_change(run[n]) for n in inputs]
     quiet = min((int(rows[0]) for rows in moves if rows.size), default=0)
@@ -291,10 +297,38 @@ def output_residuals(measured: Floats, simulated: Floats) -> Floats:
     return rows
 
 
-def needs_history(structure: Structure, excess: float, terms: int) -> bool:
-    """Whether an excess over residuals with additional terms requires a history instead of Caputo's terms."""
+def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Floats]) -> float:
+    """Return the Bayesian information criterion of a start with so many terms, from the residuals of each output.
+
+    The residuals count as white ones by the color of `reference`: all starts are allowed the same smooth misfit, so
+    that none wins by what the structure lacks.
+    """
+    score, total = 0.0, 0
+    for own, other in zip(residuals, reference, strict=True):
+        there, known = drop_missing(own), drop_missing(other)
+        total += there.size
+        score += there.size / variance_inflation(known) * math.log(max(float(np.mean(there**2)), 1e-300))
+    return score + math.log(max(total, 1)) * terms
+
+
+def needs_history(
+    structure: Structure,
+    few: Sequence[Floats],
+    many: Sequence[Floats],
+    sizes: Sequence[float],
+    terms: tuple[int, int],
+) -> bool:
+    """Whether residuals with Caputo's terms require a history instead, by the number of terms of both.
+
+    Powers of t follow what a structure leaves out in any run, so colored residuals do not require them at the same
+    level as white ones.
+    """
+    more = terms[1] - terms[0]
+    finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few, *many))
+    if finite and more > 0 and max(variance_inflation(drop_missing(r)) for r in many) > MAX_WHITE_INFLATION:
+        return start_score(many, terms[1], few) < start_score(few, terms[0], few)
     doubt = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
-    return terms > 0 and excess > chi_squared(terms, doubt)
+    return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, doubt)
 
 
 #: Length of the fit of the transient, in time constants of the fastest pole, over which the filter's input is nearly a

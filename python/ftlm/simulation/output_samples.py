@@ -30,7 +30,6 @@ from ftlm.simulation.initial_conditions import (
     has_memory,
     history,
     misfit,
-    misfit_of_fits,
     needs_history,
     output_residuals,
     resolve_initial_conditions,
@@ -231,10 +230,10 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
     except ModelError:
         # The coarse grid makes the equations unsolvable; finer ones need not.
         return long
-    more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
+    terms = sum(map(len, ours.values())), sum(map(len, theirs.values()))
+    residuals = [*output_residuals(measured, few)], [*output_residuals(measured, many)]
     sizes = np.nanstd(measured, axis=1).tolist()
-    excess = misfit_of_fits([*output_residuals(measured, few)], [*output_residuals(measured, many)], sizes)
-    return long if needs_history(model.structure, excess, more) else short
+    return long if needs_history(model.structure, *residuals, sizes, terms) else short
 
 
 def simulate_samples(
