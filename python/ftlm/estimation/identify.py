@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
@@ -57,6 +58,8 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_fin
 
 #: Initial terms of fits with a level.
 LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
+#: Mean of an output, in its standard deviations, from which on it shows a level.
+LEVEL_DEVIATIONS = 3.0
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
@@ -72,8 +75,13 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
         if fit.task.structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
             return fit
+        shown = _shows_level(fit)
+        level = _fit_with_level(fit, structure, estimate) if shown else None
+        if level is not None:
+            return level
         said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
-        level = _fit_with_level(fit, structure, estimate) if said and structure.initial == "auto" else None
+        moved = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
+        level = _fit_with_level(fit, structure, estimate) if said and moved and not shown else None
         return level or replace(fit, findings=[*fit.findings, *said])
     try:
         asked = replace(structure, offset="constant")
@@ -97,25 +105,33 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
 def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit | None:
     """Return the best fit with a level of the outputs, from rest or in motion, if the runs prefer it; else None.
 
-    It is sought where a constant would explain much of runs that do not start at zero.
+    Two fits are compared by the color of the one that leaves more.
     """
-    if fit.joint is None or fit.joint.initial == "rest":
-        return None
-    best, chosen = fit_score(fit.joint, fit.joint), None
+    best, chosen, numbers = fit.joint, None, 0
     for initial in LEVEL_STARTS:
         try:
             level = estimate(replace(structure, initial=initial, offset="level"))
         except FtlmError:
             continue
-        levels = len(fit.task.runs) * len(fit.model.outputs)
-        score = math.inf if level.joint is None else fit_score(level.joint, fit.joint, levels)
-        if score < best:
-            best, chosen = score, level
+        if best is None or level.joint is None:
+            continue
+        more = len(fit.task.runs) * len(fit.model.outputs)
+        worse = max((best, level.joint), key=lambda joint: sum(map(math.log, joint.noise.values())))
+        if fit_score(level.joint, worse, more) < fit_score(best, worse, numbers):
+            best, chosen, numbers = level.joint, level, more
     if chosen is None or chosen.joint is None:
         return None
     was = "rested" if chosen.joint.initial == "rest" else "moved"
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
     return replace(chosen, findings=[*chosen.findings, make_finding("level_estimated", **about)])
+
+
+def _shows_level(fit: Fit) -> bool:
+    """Whether a fit took runs for motion whose outputs lie far from zero, compared with how they move."""
+    if fit.joint is None or fit.joint.initial == "rest" or fit.task.structure.initial != "auto":
+        return False
+    values = [drop_missing(run[o]) for run in fit.task.runs for o in fit.model.outputs]
+    return any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values)
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:
