@@ -505,12 +505,15 @@ def test_an_offset_is_found_whichever_side_of_one_the_order_ends(seed):
         assert abs(value - true) < 3.5 * found.standard_errors[name]
 
 
-def test_where_a_constant_does_what_a_past_was_taken_for_it_is_said():
+def test_a_level_is_not_taken_for_a_past():
+    # The speed is read 5 rad/s too high, and the motor rested: a history of powers of t would do as well.
     found = ftlm.identify(raised_motor(0), ftlm.equation(FIRST_ORDER))
-    assert found.settings["initial"].startswith("history")
-    (said,) = [w for w in found.warnings if "unknown constant" in w]
-    assert "numbers fewer" in said
-    assert "offset='auto'" in said
+    assert (found.settings["initial"], found.settings["offset"]) == ("rest", "level")
+    assert found.comparison.offsets[0]["y"]["level"] == pytest.approx(5.0, abs=0.01)
+    assert any("a level that is added to it explains the runs better" in w for w in found.warnings)
+    for name, true in {"alpha": 1.0, "a": -1 / 0.15, "b": 8 / 0.15}.items():
+        value = {**found.orders, **found.coefficients}[name]
+        assert abs(value - true) < 3.5 * found.standard_errors[name]
 
 
 @pytest.mark.parametrize(("alpha", "left"), [(1.0003, [0.0]), (1.04, [0.0]), (1.2, [0.0, 1.0]), (1.98, [0.0, 1.0])])

@@ -44,6 +44,7 @@ from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
+from ftlm.simulation.initial_conditions import HISTORY_MARGIN
 from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
@@ -108,6 +109,7 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
     Two fits are compared by the color of the one that leaves more.
     """
     best, chosen, numbers = fit.joint, None, 0
+    margin = HISTORY_MARGIN if best is not None and isinstance(best.initial, History) else 0.0
     for initial in LEVEL_STARTS:
         try:
             level = estimate(replace(structure, initial=initial, offset="level"))
@@ -117,13 +119,15 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
             continue
         more = len(fit.task.runs) * len(fit.model.outputs)
         worse = max((best, level.joint), key=lambda joint: sum(map(math.log, joint.noise.values())))
-        if fit_score(level.joint, worse, more) < fit_score(best, worse, numbers):
-            best, chosen, numbers = level.joint, level, more
+        if fit_score(level.joint, worse, more) < fit_score(best, worse, numbers) + margin:
+            best, chosen, numbers, margin = level.joint, level, more, 0.0
     if chosen is None or chosen.joint is None:
         return None
     was = "rested" if chosen.joint.initial == "rest" else "moved"
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
-    return replace(chosen, findings=[*chosen.findings, make_finding("level_estimated", **about)])
+    # Another run may start otherwise.
+    model = replace(chosen.model, structure=replace(chosen.model.structure, initial=structure.initial))
+    return replace(chosen, model=model, findings=[*chosen.findings, make_finding("level_estimated", **about)])
 
 
 def _shows_level(fit: Fit) -> bool:

@@ -40,6 +40,9 @@ SIGNAL_RATIO_PER_QUARTER = 2.5
 MIN_QUARTERS, MAX_QUARTERS = 2, 12
 #: Inflation of the variance of a mean above which residuals are those of a structure that leaves something out.
 MAX_WHITE_INFLATION = 2.0
+#: Difference of :func:`start_score` from which on a history is believed where residuals have a color (chosen on
+#: simulated records of three plants with one lag too few).
+HISTORY_MARGIN = 30.0
 #: Minimum number of samples of a run per quarter.
 MIN_SAMPLES_PER_QUARTER = 16
 #: Integer powers below this are always included, so that the list is the same for any order up to 3.
@@ -326,7 +329,7 @@ def needs_history(
     more = terms[1] - terms[0]
     finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few, *many))
     if finite and more > 0 and max(variance_inflation(drop_missing(r)) for r in many) > MAX_WHITE_INFLATION:
-        return start_score(many, terms[1], few) < start_score(few, terms[0], few)
+        return start_score(many, terms[1], few) + HISTORY_MARGIN < start_score(few, terms[0], few)
     doubt = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
     return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, doubt)
 
