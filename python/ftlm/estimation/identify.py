@@ -118,7 +118,7 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
         if best is None or level.joint is None:
             continue
         more = len(fit.task.runs) * len(fit.model.outputs)
-        worse = max((best, level.joint), key=lambda joint: sum(map(math.log, joint.noise.values())))
+        worse = max((best, level.joint), key=lambda joint: math.prod(joint.noise.values()))
         if fit_score(level.joint, worse, more) < fit_score(best, worse, numbers) + margin:
             best, chosen, numbers, margin = level.joint, level, more, 0.0
     if chosen is None or chosen.joint is None:

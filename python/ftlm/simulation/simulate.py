@@ -187,7 +187,7 @@ def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
     D^nu y of y = y_i t^i / i! + ... is integrated by alpha to I^(alpha - nu) (y - y_i t^i / i! ...).
     """
     alpha = item.order.constant
-    values = {round(e): v for e, v in terms.items() if v and e == round(e) and e < alpha}
+    values = {round(e): v for e, v in terms.items() if v and e == round(e) and 0.0 <= e < alpha}
     needed: dict[float, float] = {}
     for i, value in values.items():
         needed[float(i)] = needed.get(float(i), 0.0) + value
