@@ -247,6 +247,27 @@ def test_runs_that_differ_by_a_row_of_delay_are_named(late):
         assert "r0 differs by a delay: with its inputs 1 row later the model of r1 leaves" in said[0]
 
 
+@pytest.mark.parametrize("row", [0, 7])
+def test_an_outlier_in_quiet_rows_is_left_out(row):
+    u = step_input(200, 20)
+    y = 12.0 + plant([1.7], [12.0, 1.0], u) + 0.01 * np.random.default_rng(1).standard_normal(200)
+    y[row] = 9.0
+    found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS))
+    assert (found.settings["initial"], found.settings["offset"]) == ("rest", "level")
+    assert gain_of(found) == pytest.approx(1.7, rel=0.05)
+
+
+def test_runs_that_never_move_are_refused_or_dead():
+    still = run_of(np.zeros(100), np.full(100, 20.0))
+    with pytest.raises(ftlm.FtlmError):
+        ftlm.identify(still, ftlm.equation(WORDS))
+    # A free decay without an input is motion, not rest at a level.
+    decay = run_of(np.zeros(100), 5.0 * np.exp(-0.05 * np.arange(100)))
+    found = ftlm.identify(decay, ftlm.equation("D y = a y"))
+    assert found.settings["initial"] == "caputo"
+    assert found.coefficients["a"] == pytest.approx(-0.1, rel=1e-3)
+
+
 ROWS, BEFORE, FINE = 300, 400, 4
 TWO_POLES, FRACTIONAL = "D^2 y = -p D y - q y + b u", "D^alpha y = -q y + b u"
 #: Plants of gain 2, the structure of each, and whether it is right or lacks a lag.

@@ -20,6 +20,7 @@ from ftlm.utils.statistics import (
     NEGLIGIBLE_RESIDUAL_SHARE,
     NOISE_SAMPLES,
     REST_SHARE,
+    REST_SIGMAS,
     chi_squared,
     estimate_noise,
     huber_excess,
@@ -67,6 +68,8 @@ NOISE_SHARE = 1e-6
 #: Standard error of a drift in quiet rows, over the whole run and as a share of the output's standard deviation, up to
 #: which they show rest under a command that is held at a value other than 0 and changes often.
 MAX_DRIFT_SHARE = 0.1
+#: Largest share of quiet rows that may be outliers; one may always be.
+MAX_OUTLIER_SHARE = 0.1
 #: Change of a constant input, relative to its largest value, that is rounding.
 CONSTANT_SHARE = 1e-9
 
@@ -127,8 +130,8 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
         # A command that is held and changed again and again may have been so before: quiet rows must be long then.
         held = visible and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
         for name in outputs:
-            rows = drop_missing(run[name][:quiet])
             noise = noise_at_start(run[name])
+            rows = _without_outliers(drop_missing(run[name][:quiet]), noise)
             if rows.size < MIN_QUIET_ROWS or not _stands_still(rows, noise):
                 return None
             if held and noise * run.length / _slope_weight(rows.size) > MAX_DRIFT_SHARE * float(np.nanstd(run[name])):
@@ -162,6 +165,13 @@ def _stands_still(rows: Floats, noise: float) -> bool:
     slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
     limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
     return abs(slope) <= QUIET_SIGMAS * limits[0] and scatter <= noise + QUIET_SIGMAS * limits[1]
+
+
+def _without_outliers(rows: Floats, noise: float) -> Floats:
+    """Return rows without values far from their median, if these are single ones."""
+    near = np.abs(rows - np.median(rows)) <= REST_SIGMAS * noise if rows.size else np.ones(0, dtype=bool)
+    few = max(1.0, MAX_OUTLIER_SHARE * rows.size)
+    return rows[near] if np.count_nonzero(~near) <= few else rows
 
 
 def _slope_weight(rows: int) -> float:
