@@ -60,6 +60,14 @@ pub enum Initial {
         /// Whether the constant includes a ramp.
         ramp: bool,
     },
+    /// Output level: an unknown constant that is added to the simulated output, one a record and equation.
+    ///
+    /// It is no term of the equation, so that it is one number whatever the orders. The record holds deviations from a
+    /// reference; an equation error has no term for the level.
+    Level {
+        /// Other initial conditions, not an offset.
+        under: Box<Initial>,
+    },
     /// Sensor filter with nonzero initial conditions.
     ///
     /// Filtered signals lack the response of the filter to inputs before the record. That transient is a sum of the
@@ -106,7 +114,8 @@ impl Equation {
 }
 
 impl Initial {
-    /// Add an unknown constant on the right-hand side (1), or a constant and a ramp (2). 0 adds nothing.
+    /// Add an unknown constant on the right-hand side (1), a constant and a ramp (2), or an output level (3). 0 adds
+    /// nothing.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for another number.
@@ -121,11 +130,12 @@ impl Initial {
         match offset {
             0 => Ok(self),
             1 | 2 => Ok(Self::Offset { under: Box::new(self.under().clone()), ramp: offset == 2 }),
+            3 => Ok(Self::Level { under: Box::new(self.under().clone()) }),
             _ => Err(Error::OutOfRange {
                 name: "offset".into(),
                 value: f64::from(offset),
-                range: "{0, 1, 2}".into(),
-                remedy: "0 is none, 1 a constant, 2 a constant and a ramp".into(),
+                range: "{0, 1, 2, 3}".into(),
+                remedy: "0 is none, 1 a constant, 2 a constant and a ramp, 3 an output level".into(),
             }),
         }
     }
@@ -150,8 +160,18 @@ impl Initial {
     #[must_use]
     pub fn under(&self) -> &Self {
         match self {
-            Self::Offset { under, .. } | Self::Filtered { under, .. } => under.under(),
+            Self::Offset { under, .. } | Self::Level { under } | Self::Filtered { under, .. } => under.under(),
             other => other,
+        }
+    }
+
+    /// Whether an output level is unknown.
+    #[must_use]
+    pub fn has_level(&self) -> bool {
+        match self {
+            Self::Level { .. } => true,
+            Self::Filtered { under, .. } => under.has_level(),
+            _ => false,
         }
     }
 
@@ -167,6 +187,7 @@ impl Initial {
     pub fn with_under(&self, start: Self) -> Self {
         match self {
             Self::Offset { ramp, .. } => Self::Offset { under: Box::new(start), ramp: *ramp },
+            Self::Level { .. } => Self::Level { under: Box::new(start) },
             Self::Filtered { under, states } => {
                 Self::Filtered { under: Box::new(under.with_under(start)), states: *states }
             }
@@ -212,7 +233,7 @@ impl Initial {
     #[must_use]
     pub fn follows_orders(&self) -> bool {
         match self {
-            Self::Filtered { under, .. } => under.follows_orders(),
+            Self::Filtered { under, .. } | Self::Level { under } => under.follows_orders(),
             other => matches!(other, Self::Caputo | Self::Offset { .. }),
         }
     }
@@ -311,7 +332,7 @@ impl Structure {
     #[must_use]
     pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
         let mut exponents = match initial.under() {
-            Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => Vec::new(),
+            Initial::Rest | Initial::Offset { .. } | Initial::Level { .. } | Initial::Filtered { .. } => Vec::new(),
             Initial::Powers(powers) => powers.clone(),
             Initial::Caputo => {
                 let mut all: Vec<f64> = whole_below(self.order).collect();

@@ -432,6 +432,40 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_WITH_CARE,
         "the offset of {shown} is not told apart from what a run did before its start",
     ),
+    "rests_at_level": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "{shown} ({rows} quiet rows before an input moves)|; the run starts from rest there, and the level is "
+        "estimated with the model: {ask[initial]} overrules it",
+        prefix="{run}: ",
+    ),
+    "level_estimated": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "{output} does not start at zero, and a level that is added to it explains the runs better than what came "
+        "before them alone|: the plant {was} about a level of its own before the start; {ask[offset]} and "
+        "{ask[initial]} overrule it",
+        prefix="{run}: ",
+    ),
+    "rest_assumed": FindingKind(
+        "history",
+        LEVEL_WITH_CARE,
+        "{input} is constant from row {row} on, so nothing tells whether the plant rested before|: the gain assumes "
+        "that it rested at {shown}; if it was moving, the gain is not determined",
+        "{input} is constant from row {row} on: the gain assumes that the plant rested at {shown} before",
+        "record some rows before the step, or a second step",
+        prefix="{run}: ",
+    ),
+    "moves_before_input": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output} moves before its input: in row {row}, in which {input} first changes, it is already {size:.3g} "
+        "standard deviations from where it rested, about {rows:.2g} rows early|; the input was logged after it acted, "
+        "or one of the two signals is late",
+        "{output} moves before its input {input}, by about {rows:.2g} rows",
+        "log the input before it acts, or shift its rows",
+        prefix="{run}: ",
+    ),
     "looked_like_rest": FindingKind(
         "history",
         LEVEL_FACT,
@@ -705,6 +739,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     ),
     "not_told_by_part": FindingKind(
         "untold", LEVEL_FACT, "{parameter}: not told by some part, so any other agrees with it"
+    ),
+    "parts_differ_by_delay": _rule(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{run} differs by a delay: with its inputs {shown} the model of {other} leaves {after:.3g} % of {output} "
+        "instead of {before:.3g} %",
+        "shift the rows of that run, or give its input a delay",
     ),
     "part_not_converged": FindingKind(
         "provisional", LEVEL_WITH_CARE, "the fit ended before it stood still", prefix="{run}: "

@@ -71,7 +71,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         step: float = 1.0,
         orders: Mapping[str, Values] | None = None,
         method: str | EstimationMethod = "output-error",
-        offset: Literal["none", "constant", "ramp", "auto"] | None = None,
+        offset: Literal["none", "level", "constant", "ramp", "auto"] | None = None,
         continues: bool = False,
         threads: int = 1,
     ) -> None:

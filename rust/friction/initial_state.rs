@@ -201,7 +201,7 @@ impl State {
         let mut all: Vec<Self> = Vec::new();
         for (i, Equation { structure, .. }) in equations.iter().enumerate() {
             match initial.under() {
-                Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => {}
+                Initial::Rest | Initial::Offset { .. } | Initial::Level { .. } | Initial::Filtered { .. } => {}
                 Initial::Powers(powers) => all.extend(powers.iter().map(|&e| Self::Power(i, e))),
                 Initial::Caputo => {
                     all.push(Self::Level(i));

@@ -37,7 +37,7 @@ pub type EquationArg = (StructureArg, List<f64>);
 pub enum InitialArg {
     /// With offset and the number of impulses of a filter transient.
     Filtered(bool, List<f64>, u8, u8),
-    /// With offset: 0 none, 1 a constant, 2 a constant and a ramp.
+    /// With offset: 0 none, 1 a constant, 2 a constant and a ramp, 3 an output level.
     Offset(bool, List<f64>, u8),
     Plain(bool, List<f64>),
 }

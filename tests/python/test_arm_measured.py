@@ -90,10 +90,11 @@ def test_a_filtered_equation_starts_where_its_filter_does(runs) -> None:
     # The filter was in motion when the run starts: its state is estimated, and the first sample is no step.
     found = ftlm.identify(runs["psf"], stock(LINK), method="output-error").model.compare(runs["psf"])
     simulated = found.simulated["theta12"][0]
-    assert sorted(found.initial[0]["theta12"]) == [-2.0, -1.0, 0.0, 1.0]
+    # The last is the level at which the gauge rests, which psf asks for and which predicts lqr better, too.
+    assert sorted(found.initial[0]["theta12"]) == [-2.0, -1.0, 0.0, 1.0, np.inf]
     assert abs(simulated[1] - simulated[0]) < 2.0 * np.abs(np.diff(simulated[1:50])).max()
     # A link that feeds energy has 64.6: no more than chance.
-    assert found.fit_percent["theta12"] == pytest.approx(63.0, abs=0.5)
+    assert found.fit_percent["theta12"] == pytest.approx(65.0, abs=0.5)
 
 
 def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:
@@ -102,7 +103,8 @@ def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:
     link = link.with_orders({"beta4": 0.0, "gamma4": 2.0, "mu4": 1.0})
     assert link.sensor_filter.signals == ("theta12", "theta22")
     # On lqr a link that feeds energy, taken away by its initial terms, has 84.2 and 73.7: no more than chance.
-    for fitted, other, own, unseen in (("psf", "lqr", 91.0, 70.6), ("lqr", "psf", 83.6, 72.3)):
+    # On psf the gauge has a level of its own; without it the fit has 91.0, and 70.6 on lqr.
+    for fitted, other, own, unseen in (("psf", "lqr", 92.5, 70.8), ("lqr", "psf", 83.6, 72.3)):
         found = ftlm.identify(runs[fitted], link, method="output-error")
         assert found.fit_percent["theta22"] == pytest.approx(own, abs=0.5)
         assert found.model.compare(runs[other]).fit_percent["theta22"] == pytest.approx(unseen, abs=0.5)

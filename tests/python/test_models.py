@@ -726,8 +726,8 @@ HOSTILE = {
         lambda d: d.update(estimate={"method": "x", "runs": [], "values": {}, "covariance": [[1.0]]})
     ),
     "NaN": altered(lambda d: d["equations"][0].update(order=math.nan)),
-    "later schema": altered(lambda d: d.update(schema=10)),
-    "later schema with what is in it": altered(lambda d: d.update(schema=10, moons={"of": "a later version"})),
+    "later schema": altered(lambda d: d.update(schema=11)),
+    "later schema with what is in it": altered(lambda d: d.update(schema=11, moons={"of": "a later version"})),
     "later schema, and who wrote it": altered(lambda d: d.update(schema=10**30, written_by="ftlm 7.1", equations=4)),
     "schema of more than it holds": altered(lambda d: d.update(schema=3)),
     "schema 0": altered(lambda d: d.update(schema=0)),
@@ -767,7 +767,7 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
         ftlm.load_model(path)
     message = str(refused.value)
     assert message.startswith(str(path))
-    later = f"has schema 10, and this version, {ftlm.__version__}, reads up to 9; upgrade ftlm"
+    later = f"has schema 11, and this version, {ftlm.__version__}, reads up to 10; upgrade ftlm"
     expected = {
         "too large": "1048577 bytes",
         "later schema": later,

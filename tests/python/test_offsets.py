@@ -225,7 +225,7 @@ def test_words_say_an_offset_and_are_printed_back():
         (lambda: ftlm.equation("D y = -a y + c + c0"), "stands there twice"),
         (lambda: ftlm.equation("D x = a x + c; D y = b y"), "the equation of x has an offset, that of y has none"),
         (lambda: ftlm.equation("D y = -a y + c", offset="none"), "has an offset, but offset='none'"),
-        (lambda: ftlm.equation("D y = -a y", offset="some"), "use 'none', 'constant', 'ramp' or 'auto'"),
+        (lambda: ftlm.equation("D y = -a y", offset="some"), "use 'none', 'level', 'constant', 'ramp' or 'auto'"),
         (lambda: ftlm.equation("D^0.8 y = -a y + c", initial=(0.0, 0.8)), "leave 0.8 out of initial"),
         (lambda: ftlm.equation("D^0.8 y = -a y", initial=(1.8,), offset="ramp"), "leave 1.8 out of initial"),
     ],
@@ -240,7 +240,12 @@ def test_an_offset_that_is_the_input_or_that_a_method_lacks_is_refused():
     step = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.ones(200)}, outputs={"y": 1 - np.exp(-0.1 * np.arange(200))})
     for method in ("least-squares", "output-error"):
         with pytest.raises(ftlm.DataError, match=r"u is constant on every run, so b u and the offset .* of y"):
-            ftlm.identify(step, structure, method=method)
+            ftlm.identify(step, replace(structure, initial="caputo"), method=method)
+        # From rest it is a level, which is told from what u does.
+        c = ftlm.identify(
+            step, replace(structure, equations=ftlm.equation("D y = -a y + b u").equations), method=method
+        )
+        assert c.coefficients["b"] / c.coefficients["a"] == pytest.approx(1.0, rel=0.02)
     with pytest.raises(ftlm.ModelError, match="the genetic baseline knows no offset"):
         ftlm.identify(fractional_run(1, 0.5), structure, method=ftlm.GeneticAlgorithm(seeds=(1,)))
     with pytest.raises(ftlm.ModelError, match="cannot be followed in a stream"):
@@ -500,12 +505,15 @@ def test_an_offset_is_found_whichever_side_of_one_the_order_ends(seed):
         assert abs(value - true) < 3.5 * found.standard_errors[name]
 
 
-def test_where_a_constant_does_what_a_past_was_taken_for_it_is_said():
+def test_a_level_is_not_taken_for_a_past():
+    # The speed is read 5 rad/s too high, and the motor rested: a history of powers of t would do as well.
     found = ftlm.identify(raised_motor(0), ftlm.equation(FIRST_ORDER))
-    assert found.settings["initial"].startswith("history")
-    (said,) = [w for w in found.warnings if "unknown constant" in w]
-    assert "numbers fewer" in said
-    assert "offset='auto'" in said
+    assert (found.settings["initial"], found.settings["offset"]) == ("rest", "level")
+    assert found.comparison.offsets[0]["y"]["level"] == pytest.approx(5.0, abs=0.01)
+    assert any("a level that is added to it explains the runs better" in w for w in found.warnings)
+    for name, true in {"alpha": 1.0, "a": -1 / 0.15, "b": 8 / 0.15}.items():
+        value = {**found.orders, **found.coefficients}[name]
+        assert abs(value - true) < 3.5 * found.standard_errors[name]
 
 
 @pytest.mark.parametrize(("alpha", "left"), [(1.0003, [0.0]), (1.04, [0.0]), (1.2, [0.0, 1.0]), (1.98, [0.0, 1.0])])

@@ -33,7 +33,7 @@ NAMED_STRUCTURES: dict[str, Callable[[], Structure]] = {
 #: Origin of the structure: fit as given, selected inside one, selected among several, or automatic.
 SELECTION_MODES = ("fit", "inside", "offered", "auto")
 METHOD_NAMES = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
-OFFSET_KINDS = ("none", "constant", "ramp", "auto")
+OFFSET_KINDS = ("none", "level", "constant", "ramp", "auto")
 LOSS_NAMES = ("squares", "huber")
 #: Progress phase of a structure selection.
 SELECTION_PHASE = "choosing a structure"

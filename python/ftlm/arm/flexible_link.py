@@ -215,7 +215,7 @@ def flexible_link(
     laws: Sequence[Law] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
-    offset: Literal["none", "constant", "ramp"] = "none",
+    offset: Literal["none", "level", "constant", "ramp"] = "none",
 ) -> Structure:
     """Return the structure of a flexible link: two equations for each joint, of its hub and of its deflection.
 

@@ -265,7 +265,7 @@ class StructureOptions:
     )
     initial: Annotated[str, Option(help="auto, rest, caputo, history, or exponents of t: 0,1.")] = "auto"
     offset: Annotated[
-        Literal["none", "constant", "ramp", "auto"] | None,
+        Literal["none", "level", "constant", "ramp", "auto"] | None,
         Option(help="Offset of each equation and run; default the equation's."),
     ] = None
 

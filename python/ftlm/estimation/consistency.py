@@ -24,7 +24,7 @@ from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, format_bound
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
-from ftlm.utils.validation import whole_number
+from ftlm.utils.validation import Floats, whole_number
 from ftlm.validation.comparison import compare, finite
 
 #: Default number of segments of one run.
@@ -33,6 +33,9 @@ DEFAULT_SEGMENTS = 2
 DISJOINT_TEXT, OVERLAP_TEXT, NOT_IDENTIFIABLE_TEXT = "apart", "overlap", "not told"
 #: Largest ratio of an interval bound to the Wald bound for which the covariance is used.
 MAX_ASYMMETRY_RATIO = 2.0
+#: Runs differ by a delay if inputs shifted by at most so many rows leave less than this share of the residuals of
+#: another run's model, and little more than the run's own model leaves.
+MAX_SHIFT_ROWS, MAX_SHIFTED_SHARE, MAX_OWN_RATIO = 2, 0.5, 1.1
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,8 @@ class Consistency(ReportMixin):
         common model. None for a method without covariance.
     cross_validation
         Fit in percent of each segment's model (first) on each segment (second), by output.
+    delays
+        Findings on runs that the model of another one explains with their inputs shifted by some rows.
     """
 
     names: tuple[str, ...]
@@ -83,6 +88,7 @@ class Consistency(ReportMixin):
     distance: float | None
     degrees: int
     cross_validation: tuple[tuple[dict[str, float], ...], ...] = field(repr=False)
+    delays: tuple[Finding, ...] = field(default=(), repr=False)
 
     @property
     def consistent(self) -> bool | None:
@@ -153,6 +159,7 @@ class Consistency(ReportMixin):
         for name, result in zip(self.names, self.results, strict=True):
             if result.fit is not None and not result.fit.converged:
                 out.append(make_finding("part_not_converged", run=name))
+        out += self.delays
         if any(f.code == "residuals_not_white" for r in self.results for f in r.findings):
             out.append(make_finding("parts_not_white"))
         return tuple(out)
@@ -346,7 +353,40 @@ def consistency(
             progress(len(results), len(pieces))
     crossed = tuple(tuple(_cross_validated_fit(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results)
     distance, degrees = joint_distance(results)
-    return Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
+    found = Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
+    if found.consistent is not False or len(every) == 1:
+        return found
+    return replace(found, delays=tuple(_delay_findings(names, pieces, results)))
+
+
+def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequence[Identification]) -> list[Finding]:
+    """Return findings on runs whose inputs, shifted by some rows, make another run's model fit as well as their own."""
+    findings = []
+    for (k, piece), (j, result) in itertools.product(enumerate(pieces), enumerate(results)):
+        inputs = [n for n in result.model.structure.signals if n in piece.inputs]
+        if k == j or piece.sample_times is not None or piece.length <= 2 * MAX_SHIFT_ROWS:
+            continue
+        # A fit is 100 (1 - NR).
+        own = results[k].fit_percent
+        left: dict[int, dict[str, float]] = {}
+        for rows in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1):
+            shifted = piece.with_samples({n: _shift_rows(piece[n], rows) for n in inputs})
+            fits = _cross_validated_fit(result, shifted, results[k])
+            left[rows] = {o: 100.0 - fit for o, fit in fits.items()}
+        for output, before in left[0].items():
+            rows = min(left, key=lambda r: left[r].get(output, math.inf))
+            after = left[rows][output]
+            if rows and after < MAX_SHIFTED_SHARE * before and after <= MAX_OWN_RATIO * (100.0 - own[output]):
+                shown = f"{abs(rows)} row{'s' if abs(rows) > 1 else ''} {'later' if rows > 0 else 'earlier'}"
+                numbers = {"before": before, "after": after, "other": names[j], "shown": shown}
+                findings.append(make_finding("parts_differ_by_delay", run=names[k], output=output, **numbers))
+    return findings
+
+
+def _shift_rows(samples: Floats, rows: int) -> Floats:
+    """Return samples some rows later, or earlier if negative; the first or last value is repeated."""
+    at = np.clip(np.arange(samples.size) - rows, 0, samples.size - 1)
+    return np.asarray(samples[at])
 
 
 def split_run(run: Run, parts: int) -> list[Run]:

@@ -32,6 +32,7 @@ from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, make_job, run_job
 from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import prepare
+from ftlm.simulation.initial_conditions import resolve_start
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.linalg import orthonormal, projections, vector_norm
 from ftlm.utils.validation import Floats
@@ -175,7 +176,8 @@ def estimate_output_error(
     """
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
-    structure = task.structure.with_orders(known)
+    asked = task.structure.with_orders(known)
+    structure = resolve_start(task.runs, asked)
     record = prepare(task.runs, structure.without_input_nonlinearities(), m, power_of_two=False, gaps=True)[0]
     start = record.initial
     begins: list[dict[str, float]] = []
@@ -208,10 +210,11 @@ def estimate_output_error(
     findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
-        structure = replace(structure, initial="history")
+        structure = asked = replace(structure, initial="history")
         findings.append(make_finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
-    identified = structure.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))
+    # On another run the start is resolved anew.
+    identified = asked.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
     with np.errstate(invalid="ignore", over="ignore"):
         # Of directions that the runs do not see covariances are no numbers, or beyond them; then none is given.

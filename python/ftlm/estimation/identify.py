@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 from msgspec import UNSET
 
 from ftlm.data.run import Run, as_runs
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
@@ -24,11 +26,13 @@ from ftlm.estimation.model_checks import (
     excitation_findings,
     friction_direction_findings,
     stability_findings,
+    start_findings,
     stribeck_findings,
 )
 from ftlm.estimation.nuisance_parameters import (
     DEFAULT_PULSES_PER_SAMPLE,
     OffsetTest,
+    fit_score,
     fit_without_history,
     offset_test,
     unrequested_offset_findings,
@@ -40,6 +44,7 @@ from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
+from ftlm.simulation.initial_conditions import HISTORY_MARGIN
 from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
@@ -52,6 +57,10 @@ from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
 
+#: Initial terms of fits with a level.
+LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
+#: Mean of an output, in its standard deviations, from which on it shows a level.
+LEVEL_DEVIATIONS = 3.0
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
@@ -65,10 +74,16 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
     if structure.offset != "auto":
         fit = estimate(structure)
         # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
-        if structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
+        if fit.task.structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
             return fit
+        shown = _shows_level(fit)
+        level = _fit_with_level(fit, structure, estimate) if shown else None
+        if level is not None:
+            return level
         said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
-        return replace(fit, findings=[*fit.findings, *said])
+        moved = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
+        level = _fit_with_level(fit, structure, estimate) if said and moved and not shown else None
+        return level or replace(fit, findings=[*fit.findings, *said])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
@@ -79,11 +94,48 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         words = f"none: {twin} is constant on every run, which an offset cannot be told from"
         return _with_offset_decision(estimate(replace(structure, offset="none")), words)
     fit = estimate(asked)
+    if fit.task.structure.offset == "level":
+        return _with_offset_decision(fit, "level: the runs rest at their own level before an input moves")
     test = fit_offset_test(fit)
     if test is not None and test.exceeds():
         return _with_offset_decision(fit, test.decision)
     decision = "none: its test has no finite free run" if test is None else test.decision
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
+
+
+def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit | None:
+    """Return the best fit with a level of the outputs, from rest or in motion, if the runs prefer it; else None.
+
+    Two fits are compared by the color of the one that leaves more.
+    """
+    best, chosen, numbers = fit.joint, None, 0
+    margin = HISTORY_MARGIN if best is not None and isinstance(best.initial, History) else 0.0
+    for initial in LEVEL_STARTS:
+        try:
+            level = estimate(replace(structure, initial=initial, offset="level"))
+        except FtlmError:
+            continue
+        if best is None or level.joint is None:
+            continue
+        more = len(fit.task.runs) * len(fit.model.outputs)
+        worse = max((best, level.joint), key=lambda joint: math.prod(joint.noise.values()))
+        if fit_score(level.joint, worse, more) < fit_score(best, worse, numbers) + margin:
+            best, chosen, numbers, margin = level.joint, level, more, 0.0
+    if chosen is None or chosen.joint is None:
+        return None
+    was = "rested" if chosen.joint.initial == "rest" else "moved"
+    about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
+    # Another run may start otherwise.
+    model = replace(chosen.model, structure=replace(chosen.model.structure, initial=structure.initial))
+    return replace(chosen, model=model, findings=[*chosen.findings, make_finding("level_estimated", **about)])
+
+
+def _shows_level(fit: Fit) -> bool:
+    """Whether a fit took runs for motion whose outputs lie far from zero, compared with how they move."""
+    if fit.joint is None or fit.joint.initial == "rest" or fit.task.structure.initial != "auto":
+        return False
+    values = [drop_missing(run[o]) for run in fit.task.runs for o in fit.model.outputs]
+    return any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values)
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:
@@ -163,9 +215,10 @@ def identify(
         ``"genetic"``.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
-        friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
-        ``.comparison.offsets``, estimated anew on any run that the model is judged on; beside a history (a run that
-        starts in motion) it is estimated, but cannot be told from it. ``"auto"``: a constant where the
+        friction that the model lacks; ``"level"``: a constant that is added to each output; ``"ramp"``: a constant and
+        a drift in proportion to time. One each run, in ``.comparison.offsets``, estimated anew on any run that the
+        model is judged on; beside a history (a run that starts in motion) it is estimated, but cannot be told from it.
+        A run that rests at its own level before an input moves has a level by default. ``"auto"``: a constant where the
         runs ask for one at 99 %, none where they do not, with the statistic in ``.settings["offset_test"]``; it fits
         once with the constant and, where none is asked for, once without. Default what the structure says. Where it
         says none and a constant would explain much, a warning does.
@@ -238,6 +291,7 @@ def assess_fit(fit: Fit) -> Identification:
     comparison = compare_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
     findings = [*comparison.findings, *fit.findings]
     findings += [note for run in runs for note in data_notes(run)]
+    findings += start_findings(runs, model.structure)
     findings += dead_channel_findings(runs, fit.task.structure) + excitation_findings(runs, fit.task.structure)
     findings += (
         discretization_findings(model, comparison)

@@ -12,7 +12,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.analysis.poles import modes
 from ftlm.data.run import Run
-from ftlm.data.sampling import drop_missing
+from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing
 from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
@@ -20,6 +20,7 @@ from ftlm.estimation.result import Identification
 from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import compared_values, has_nonuniform_samples
+from ftlm.simulation.initial_conditions import RestEvidence, noise_at_start, resolve_start, rest_evidence
 from ftlm.simulation.output_samples import OutputSamples
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
@@ -33,6 +34,8 @@ MAX_PARAMETER_CORRELATION = 0.995
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
 #: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
 MAX_RELATIVE_STANDARD_ERROR = 0.1
+#: An output is early if it leaves its level by so many standard deviations of its noise before its input can act.
+EARLY_SIGMAS = 4.0
 #: Outliers are reported from this number and this fraction of all residuals, or if they hold this fraction of the
 #: squares, which doubles the variance of every parameter.
 MIN_OUTLIERS = 3
@@ -145,6 +148,56 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
     ]
     if kept:
         findings.append(make_finding("times_not_honoured", run=", ".join(kept)))
+    return findings
+
+
+def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
+    """Return findings on runs that were taken to rest before their first row, and on what tells that they did."""
+    resolved = resolve_start(runs, structure)
+    findings = []
+    for run in runs if resolved.initial == "rest" or resolved.offset == "level" else ():
+        evidence = rest_evidence(run, structure)
+        if evidence is None:
+            continue
+        known = [o for o in structure.outputs if o in evidence.levels]
+        levels = join_names([f"{o} = {evidence.levels[o]:.4g}" for o in known])
+        if evidence.rows == 0 and structure.initial == "auto":
+            moved = {n: int(run[n][0] != run[n][1]) for n in structure.signals if n in run.inputs}
+            row = max(moved.values())
+            inputs = join_names([n for n in moved if np.any(run[n])])
+            findings.append(make_finding("rest_assumed", run=run.name, input=inputs, row=row, shown=levels))
+        elif evidence.rows and resolved.offset == "level":
+            driven = [f"{n} = {v:.4g}" for n, v in evidence.inputs.items() if v]
+            beside = f" with {join_names(driven)}" if driven else ""
+            shown = f"the run rests at {levels}{beside}"
+            findings.append(make_finding("rests_at_level", run=run.name, rows=evidence.rows, shown=shown))
+        findings += _early_output_findings(run, structure, evidence)
+    return findings
+
+
+def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidence) -> list[Finding]:
+    """Return findings on outputs that leave their level in the row in which an input first changes.
+
+    The change of a held input acts from that row on, and a strictly proper equation answers in the next one.
+    """
+    row = evidence.rows
+    if not 0 < row < run.length - 1 or run.sample_times is not None:
+        return []
+    moved = [n for n in evidence.inputs if run[n][row] != run[n][row - 1]]
+    findings = []
+    for item in structure.equations:
+        driven = [t for t in item.terms if t.signal in moved]
+        direct = any(t.order == item.order for t in driven)
+        if not driven or direct or any(run.intersample[t.signal] != ZERO_ORDER_HOLD for t in driven):
+            continue
+        y, level = run[item.output], evidence.levels[item.output]
+        noise = noise_at_start(y)
+        early, slope = float(y[row]) - level, float(y[row + 1] - y[row])
+        if abs(early) > EARLY_SIGMAS * noise and early * slope > 0:
+            numbers = {"row": row, "size": abs(early) / noise, "rows": early / slope}
+            inputs = join_names([t.signal for t in driven])
+            about = {"run": run.name, "output": item.output, "input": inputs}
+            findings.append(make_finding("moves_before_input", **about, **numbers))
     return findings
 
 

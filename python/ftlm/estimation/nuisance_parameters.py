@@ -29,16 +29,22 @@ from ftlm.simulation.initial_conditions import (
     common_initial_conditions,
     has_memory,
     history,
-    misfit_of_fits,
     needs_history,
     resolve_common_initial_conditions,
+    resolve_start,
+    start_score,
 )
 from ftlm.simulation.output_samples import initial_exponents, is_in_motion
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Structure, offset_exponents
 from ftlm.utils.linalg import column_norms, dot, orthonormal, projections, thin_svd
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, SIGNIFICANCE_LEVEL, autoregression, chi_squared
+from ftlm.utils.statistics import (
+    NEGLIGIBLE_RESIDUAL_SHARE,
+    SIGNIFICANCE_LEVEL,
+    autoregression,
+    chi_squared,
+)
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
 
@@ -99,6 +105,7 @@ def evaluate_at_point(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
 ) -> tuple[Objective, Iterate]:
     """Evaluate the output error at given parameters, with output weights from the residuals."""
+    structure = resolve_start(runs, structure)
     problem = FreeProblem.of(replace(structure, initial=resolve_common_initial_conditions(runs, structure)))
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     start = Iterate(orders, coefficients, "given", {}, inputs)
@@ -302,9 +309,21 @@ def fit_with_initial_conditions(
     joint = fit_initial_terms(start)
     if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
         return joint
-    return fit_initial_terms(
+    past = fit_initial_terms(
         common_initial_conditions([history(run, structure) for run in runs]) or history(runs[0], structure)
     )
+    return past if fit_score(past, joint) < fit_score(joint, joint) else joint
+
+
+def fit_score(joint: JointFit, reference: JointFit, levels: int = 0) -> float:
+    """Return the criterion of a fit's start (:func:`start_score`); `levels` are numbers beside its initial terms."""
+    own, others = _pooled_residuals(joint), _pooled_residuals(reference)
+    return start_score(own, joint.initial_terms + levels, others)
+
+
+def _pooled_residuals(joint: JointFit) -> list[Floats]:
+    """Return the residuals of each output in its unit, all runs together."""
+    return [noise * np.concatenate([part[o] for part in joint.residuals]) for o, noise in joint.noise.items()]
 
 
 def _simplify_initial_terms(
@@ -343,12 +362,9 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
 
 def _fit_needs_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether a fit with few initial terms has significantly larger residuals than one with a history."""
-    outputs = structure.outputs
-    ours, theirs = (
-        [fit.noise[o] * np.concatenate([part[o] for part in fit.residuals]) for o in outputs] for fit in (few, many)
-    )
-    sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in outputs]
-    return needs_history(structure, misfit_of_fits(ours, theirs, sizes), many.initial_terms - few.initial_terms)
+    ours, theirs = _pooled_residuals(few), _pooled_residuals(many)
+    sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in structure.outputs]
+    return needs_history(structure, ours, theirs, sizes, (few.initial_terms, many.initial_terms))
 
 
 def _has_nonzero_start(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:

@@ -23,6 +23,7 @@ from ftlm.simulation.discretization import (
     sensor_series,
     with_effective_inputs,
 )
+from ftlm.simulation.initial_conditions import deviations
 from ftlm.structure.structure import Structure
 from ftlm.utils.resources import stop_flag
 from ftlm.utils.validation import Floats
@@ -46,6 +47,8 @@ def sample_run(
     """
     # What is free of inputs is the core's to apply, to inputs as they were given.
     structure = problem.structure.without_input_nonlinearities()
+    if structure.offset == "level":
+        run = deviations(run, structure)[0]
     rows = (run.length - 1) // decimation * decimation + 1
     if rows != run.length:
         run = run.window(None, rows * run.step - run.step / 2)
@@ -329,7 +332,9 @@ class RunSampler:
 
     def read(self, signal: int) -> list[Floats]:
         """Return one signal of each run at regular sample times; missing samples are NaN."""
-        name = self.problem.structure.signals[signal]
+        name, structure = self.problem.structure.signals[signal], self.problem.structure
+        if structure.offset == "level":
+            return [np.ascontiguousarray(deviations(run, structure)[0][name]) for run in self.runs]
         return [np.ascontiguousarray(run[name]) for run in self.runs]
 
     def core_arguments(self, told: Callable[[int, int], None] | None = None) -> tuple[Any, ...]:

@@ -212,7 +212,7 @@ class Sensitivities:
 def _offset_responses(laid: ModelFit, step: float, rows: int) -> Floats:
     """Responses, over the noise, to unknown constants (and ramps) in the equations of one run."""
     structure = laid.problem.structure
-    drives = {"none": 0, "constant": 1, "ramp": 2}.get(structure.offset)
+    drives = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
         raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not decided; identify it again")
     if not drives:

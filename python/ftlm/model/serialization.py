@@ -24,7 +24,7 @@ from ftlm.utils.validation import error_text
 #: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are no outputs,
 #: friction, input nonlinearities, Stribeck friction, free parameters of the fit, findings as records.
 BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
-STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA = 7, 8, 9
+STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA = 7, 8, 9, 10
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -229,7 +229,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 #: Model files have a few kilobytes; the default size limit suffices.
-MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, FINDING_SCHEMA)
+MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, LEVEL_SCHEMA)
 
 
 def schema_of(
@@ -245,7 +245,7 @@ def schema_of(
     named = sensor is not None and not isinstance(sensor.signals, UnsetType)
     known = estimate is not None and estimate.free is not UNSET
     return max(
-        BASE_SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA,
+        BASE_SCHEMA if isinstance(offset, UnsetType) else LEVEL_SCHEMA if offset == "level" else OFFSET_SCHEMA,
         PROFILE_SCHEMA if profiled or named else BASE_SCHEMA,
         BASE_SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA,
         *(e.friction_schema for e in equations),

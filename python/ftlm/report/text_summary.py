@@ -59,11 +59,14 @@ def _readable(item: Equation) -> Equation:
 
 
 def _offset(output: str, comparison: Comparison | None) -> str | None:
-    """Return the offset of the only run as terms of an equation; None without one, or with several runs."""
+    """Return the offset of the only run as terms of an equation; None without one, or with several runs.
+
+    A level is added to the output, and is no term of its equation.
+    """
     if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
         return None
     parts = comparison.offsets[0][output]
-    written = [(parts["constant"], ""), *([(parts["ramp"], " t")] if "ramp" in parts else [])]
+    written = [(parts[name], tail) for name, tail in (("constant", ""), ("ramp", " t")) if name in parts]
     return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
 
 
@@ -162,7 +165,7 @@ def _starts(result: Identification) -> list[str]:
     """Return lines on offsets outside the equations, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     shown = {o for o in result.output_error if _offset(o, comparison) is not None}
-    hidden = any(o not in shown for run in comparison.offsets for o in run)
+    hidden = any(o not in shown or "level" in run[o] for run in comparison.offsets for o in run)
     lines = describe_offsets(comparison) if hidden else []
     moving = [
         f"{name} ({sum(map(len, terms.values()))})"

@@ -93,7 +93,13 @@ def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, flo
     structure = model.structure
     own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
     return [
-        equation_html(e, structure.delay, structure.limits, own.get(e.output) or structure.offset_in_words)
+        equation_html(
+            e,
+            structure.delay,
+            structure.limits,
+            # A level is added to the output, and is no term of its equation.
+            "" if "level" in own.get(e.output, {}) else own.get(e.output) or structure.offset_in_words,
+        )
         for e in model.equations
     ]
 

@@ -17,10 +17,12 @@ from ftlm.data.sampling import ZERO_ORDER_HOLD, NonuniformSamples, interpolate_g
 from ftlm.errors import DataError, ModelError
 from ftlm.simulation.initial_conditions import (
     common_initial_conditions,
+    deviations,
     filter_impulse_responses,
     has_memory,
     remove_filter_transient,
     resolve_initial_conditions,
+    resolve_start,
 )
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
@@ -152,6 +154,9 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     """
     _check_missing(run, structure)
     check_zero_order_hold(run, structure)
+    if structure.offset == "level":
+        # Deviations rest at 0, where an equation has no term for the level.
+        run, structure = deviations(run, structure)[0], replace(structure, offset="none")
     initial = resolve_initial_conditions(run, structure)
     sensor = None
     if filtered and structure.sensor_filter is not None:
@@ -239,7 +244,7 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
     """
 
     def build() -> list[Record]:
-        return [record(run, structure, m, filtered=filtered) for run in runs]
+        return [record(run, resolve_start([run], structure), m, filtered=filtered) for run in runs]
 
     if not isinstance(runs, Runs) or m >= min(run.length for run in runs):
         return build()
@@ -413,8 +418,8 @@ def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) ->
     powers = [] if isinstance(initial, str) else list(initial)
     decided = (initial == "caputo", powers)
     if states:
-        return (*decided, ("none", "constant", "ramp").index(offset), states)
-    return decided if offset == "none" else (*decided, 1 if offset == "constant" else 2)
+        return (*decided, ("none", "constant", "ramp", "level").index(offset), states)
+    return decided if offset == "none" else (*decided, ("none", "constant", "ramp", "level").index(offset))
 
 
 def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
@@ -432,6 +437,7 @@ def prepare(
     check_offset_resolved(structure.offset)
     if not gaps:
         check_no_missing(runs, "an estimator on the equation error")
+    structure = resolve_start(runs, structure)
     m = check_m(default_m(runs, power_of_two=power_of_two) if m is None else m, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])
@@ -447,7 +453,7 @@ def prepare(
                     f"{term.signal} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
                     "identified; leave the term out, fix its coefficient, or add a run in which it moves"
                 )
-            if structure.offset != "none" and _is_offset(term, item, prepared):
+            if structure.offset in ("constant", "ramp") and _is_offset(term, item, prepared):
                 raise DataError(
                     f"{term.signal} is constant on every run, so {term} and the offset in the equation of "
                     f"{item.output} cannot be told apart; add a run in which it changes, fix its coefficient, "

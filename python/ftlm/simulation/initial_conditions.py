@@ -4,16 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, make_read_only
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import History, Initial, Structure
 from ftlm.utils.linalg import vector_norm
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared, estimate_noise, huber_excess, is_rest
+from ftlm.utils.statistics import (
+    NEGLIGIBLE_RESIDUAL_SHARE,
+    NOISE_SAMPLES,
+    REST_SHARE,
+    REST_SIGMAS,
+    chi_squared,
+    estimate_noise,
+    huber_excess,
+    is_rest,
+    variance_inflation,
+    white_noise,
+)
 from ftlm.utils.validation import Floats
 
 #: Increment of the powers of time.
@@ -25,6 +39,11 @@ REFERENCE_SIGNAL_RATIO, REFERENCE_QUARTERS = 2500.0, 6
 SIGNAL_RATIO_PER_QUARTER = 2.5
 #: Minimum and maximum number of quarters.
 MIN_QUARTERS, MAX_QUARTERS = 2, 12
+#: Inflation of the variance of a mean above which residuals are those of a structure that leaves something out.
+MAX_WHITE_INFLATION = 2.0
+#: Difference of :func:`start_score` from which on a history is believed where residuals have a color (chosen on
+#: simulated records of three plants with one lag too few).
+HISTORY_MARGIN = 30.0
 #: Minimum number of samples of a run per quarter.
 MIN_SAMPLES_PER_QUARTER = 16
 #: Integer powers below this are always included, so that the list is the same for any order up to 3.
@@ -36,6 +55,164 @@ HISTORY_TEST_LEVEL, HISTORY_TEST_LEVEL_WITH_OFFSET = 0.25, 0.02
 #: Weight of the excess in the residual sum of squares, as an alternative to the robust excess. Few outliers must not
 #: require a history, but a least-squares fit must not be worse than one with a history and fewer parameters.
 SQUARES_WEIGHT = 0.25
+
+
+#: Least number of rows before the inputs move that can show rest.
+MIN_QUIET_ROWS = 5
+#: Standard errors within which slope, scatter and level of quiet rows are those of noise.
+QUIET_SIGMAS = 3.3
+#: Relative standard error of the noise, times the root of the number of samples (300 records of 30 to 4000 samples).
+NOISE_ERROR = 1.5
+#: Noise of a signal without noise, as a share of its standard deviation.
+NOISE_SHARE = 1e-6
+#: Standard error of a drift in quiet rows, over the whole run and as a share of the output's standard deviation, up to
+#: which they show rest under a command that is held at a value other than 0 and changes often.
+MAX_DRIFT_SHARE = 0.1
+#: Largest share of quiet rows that may be outliers; one may always be.
+MAX_OUTLIER_SHARE = 0.1
+#: Change of a constant input, relative to its largest value, that is rounding.
+CONSTANT_SHARE = 1e-9
+
+
+@dataclass(frozen=True)
+class RestEvidence:
+    """Evidence of the first rows that the plant rested before the run.
+
+    Parameters
+    ----------
+    rows
+        Number of rows in which inputs and outputs stand still before an input moves; 0 if the inputs are constant from
+        the first or second row on, so that rest is an assumption.
+    levels
+        Level of each output before the run.
+    inputs
+        Value of each input before the run.
+    shows_level
+        Whether outputs or inputs rest at values other than 0.
+    """
+
+    rows: int
+    levels: dict[str, float]
+    inputs: dict[str, float]
+    shows_level: bool
+
+
+_EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, ...]], RestEvidence | None]] = (
+    WeakKeyDictionary()
+)
+
+
+def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
+    """Return the evidence that the plant rested before the run, or None if it may have been in motion."""
+    found = _EVIDENCE_BY_RUN.setdefault(run, {})
+    key = structure.outputs, structure.signals
+    if key not in found:
+        found[key] = _rest_evidence(run, structure)
+    return found[key]
+
+
+def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
+    """Return the evidence of quiet rows, or of inputs that are constant from the first or second row on."""
+    inputs = [n for n in structure.signals if n in run.inputs]
+    outputs = [n for n in structure.signals if n in run.outputs]
+    if not inputs or not outputs or any(n not in run for n in structure.signals):
+        return None
+    if run.sample_times is not None and run.missing_samples:
+        return None
+    if any(np.nanstd(run[n]) == 0.0 for n in outputs):
+        # An output that never moves shows nothing, such as that of a run which is to be simulated.
+        return None
+    moves = [_rows_of_change(run[n]) for n in inputs]
+    quiet = min((int(rows[0]) for rows in moves if rows.size), default=0)
+    if quiet >= MIN_QUIET_ROWS:
+        levels = {}
+        visible = any(run[n][0] != 0.0 for n in inputs)
+        # A command that is held and changed again and again may have been so before: quiet rows must be long then.
+        held = visible and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
+        for name in outputs:
+            noise = noise_at_start(run[name])
+            rows = _without_outliers(drop_missing(run[name][:quiet]), noise)
+            if rows.size < MIN_QUIET_ROWS or not _stands_still(rows, noise):
+                return None
+            if held and noise * run.length / _slope_weight(rows.size) > MAX_DRIFT_SHARE * float(np.nanstd(run[name])):
+                return None
+            levels[name] = float(np.mean(rows))
+            size = QUIET_SIGMAS * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
+            visible |= abs(levels[name]) > size
+        return RestEvidence(quiet, levels, {n: float(run[n][0]) for n in inputs}, visible)
+    constant = all(_rows_of_change(run[n][1:]).size == 0 for n in inputs)
+    if not constant or not any(np.any(run[n][1:]) for n in inputs):
+        return None
+    first = {n: float(drop_missing(run[n])[0]) for n in outputs}
+    return RestEvidence(0, first, dict.fromkeys(inputs, 0.0), not starts_at_rest(run, structure))
+
+
+def noise_at_start(samples: Floats) -> float:
+    """Return the largest likely standard deviation of the noise: two standard errors above its estimate."""
+    count = min(samples.size, NOISE_SAMPLES)
+    noise = white_noise(samples) * (1.0 + 2.0 * NOISE_ERROR / math.sqrt(count))
+    return max(noise, NOISE_SHARE * float(np.nanstd(samples)))
+
+
+def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
+    """Return the rows in which a signal differs from its first value."""
+    return np.flatnonzero(np.abs(samples - samples[0]) > CONSTANT_SHARE * float(np.max(np.abs(samples))))
+
+
+def _stands_still(rows: Floats, noise: float) -> bool:
+    """Whether slope and scatter of rows are those of noise."""
+    t = np.arange(rows.size) - 0.5 * (rows.size - 1)
+    slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
+    limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
+    return abs(slope) <= QUIET_SIGMAS * limits[0] and scatter <= noise + QUIET_SIGMAS * limits[1]
+
+
+def _without_outliers(rows: Floats, noise: float) -> Floats:
+    """Return rows without values far from their median, if these are single ones."""
+    near = np.abs(rows - np.median(rows)) <= REST_SIGMAS * noise if rows.size else np.ones(0, dtype=bool)
+    few = max(1.0, MAX_OUTLIER_SHARE * rows.size)
+    return rows[near] if np.count_nonzero(~near) <= few else rows
+
+
+def _slope_weight(rows: int) -> float:
+    """Return the ratio of the noise of rows to the standard error of their slope a row."""
+    return math.sqrt(rows * (rows**2 - 1) / 12.0)
+
+
+def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
+    """Return the structure with the start of runs that rested before their first row: from rest, with its level.
+
+    Initial terms and offset that are given stay, and ``"auto"`` stays if a run may have been in motion. A constant in
+    the equations is a level where the plant rested under it.
+    """
+    automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
+    if structure.has_friction or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
+        return structure
+    found = [rest_evidence(run, structure) for run in runs]
+    known = [f for f in found if f is not None]
+    constant = structure.offset == "constant" and any(f.rows == 0 for f in known)
+    offset = "level" if constant or any(f.shows_level for f in known) else structure.offset
+    initial = "rest" if automatic and len(known) == len(found) else structure.initial
+    return replace(structure, initial=initial, offset=offset)
+
+
+def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
+    """Return a run as deviations from its level before the first row, and the levels of its outputs.
+
+    Inputs deviate from their values in quiet rows, unless they have a saturation or a dead zone.
+    """
+    evidence = rest_evidence(run, structure)
+    limited = {limit.signal for limit in structure.limits}
+    outputs = [n for n in structure.signals if n in run.outputs]
+    levels = {n: float(drop_missing(run[n])[0]) for n in outputs} if evidence is None else evidence.levels
+    inputs = {} if evidence is None else {n: v for n, v in evidence.inputs.items() if n not in limited}
+    moved = {n: v for n, v in {**levels, **inputs}.items() if v != 0.0}
+    if not moved:
+        return run, levels
+    samples = {n: run[n] - v for n, v in moved.items()}
+    read = run.sample_times
+    own = None if read is None else {n: read.data[n] - v for n, v in moved.items()}
+    return run.with_samples(samples, own), levels
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
@@ -70,9 +247,10 @@ def history(run: Run, structure: Structure) -> History:
 
 def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
     """Return the initial conditions of a structure on a run, resolving ``"auto"``."""
+    structure = resolve_start([run], structure)
     initial = structure.initial
     if initial == "auto":
-        if starts_at_rest(run, structure):
+        if structure.offset != "level" and starts_at_rest(run, structure):
             return "rest"
         # A body with friction has no velocities but its own, so that only level and velocity are asked for.
         initial = "history" if has_memory(structure) and not structure.has_friction else "caputo"
@@ -132,10 +310,38 @@ def output_residuals(measured: Floats, simulated: Floats) -> Floats:
     return rows
 
 
-def needs_history(structure: Structure, excess: float, terms: int) -> bool:
-    """Whether an excess over residuals with additional terms requires a history instead of Caputo's terms."""
+def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Floats]) -> float:
+    """Return the Bayesian information criterion of a start with so many terms, from the residuals of each output.
+
+    The residuals count as white ones by the color of `reference`: all starts are allowed the same smooth misfit, so
+    that none wins by what the structure lacks.
+    """
+    score, total = 0.0, 0
+    for own, other in zip(residuals, reference, strict=True):
+        there, known = drop_missing(own), drop_missing(other)
+        total += there.size
+        score += there.size / variance_inflation(known) * math.log(max(float(np.mean(there**2)), 1e-300))
+    return score + math.log(max(total, 1)) * terms
+
+
+def needs_history(
+    structure: Structure,
+    few: Sequence[Floats],
+    many: Sequence[Floats],
+    sizes: Sequence[float],
+    terms: tuple[int, int],
+) -> bool:
+    """Whether residuals with Caputo's terms require a history instead, by the number of terms of both.
+
+    Powers of t follow what a structure leaves out in any run, so colored residuals do not require them at the same
+    level as white ones.
+    """
+    more = terms[1] - terms[0]
+    finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few, *many))
+    if finite and more > 0 and max(variance_inflation(drop_missing(r)) for r in many) > MAX_WHITE_INFLATION:
+        return start_score(many, terms[1], few) + HISTORY_MARGIN < start_score(few, terms[0], few)
     doubt = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
-    return terms > 0 and excess > chi_squared(terms, doubt)
+    return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, doubt)
 
 
 #: Length of the fit of the transient, in time constants of the fastest pole, over which the filter's input is nearly a

@@ -30,10 +30,11 @@ from ftlm.simulation.initial_conditions import (
     has_memory,
     history,
     misfit,
-    misfit_of_fits,
     needs_history,
     output_residuals,
     resolve_initial_conditions,
+    resolve_start,
+    rest_evidence,
 )
 from ftlm.structure.equation import Equation, Friction
 from ftlm.structure.sensor_filter import SensorFilter
@@ -160,6 +161,8 @@ SMOOTH_INTEGRATION_ORDER = 2.0
 COLLINEARITY_TOLERANCE = 1e-12
 
 Terms = Mapping[str, Mapping[float, float]]
+#: Exponent under which the level of an output stands among its initial terms: it follows them, and is no power of t.
+LEVEL_EXPONENT = math.inf
 
 
 @dataclass(frozen=True)
@@ -212,6 +215,7 @@ def nonuniform_sample_times(model: Model, run: Run) -> Floats | None:
 
 def with_initial_conditions(model: Model, run: Run) -> Model:
     """Return the model with initial conditions resolved on a run: Caputo's unless the samples require a history."""
+    model = replace(model, structure=resolve_start([run], model.structure))
     start = resolve_initial_conditions(run, model.structure)
     long = replace(model, structure=replace(model.structure, initial=start))
     if model.structure.initial != "auto" or not isinstance(start, History):
@@ -226,10 +230,10 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
     except ModelError:
         # The coarse grid makes the equations unsolvable; finer ones need not.
         return long
-    more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
+    terms = sum(map(len, ours.values())), sum(map(len, theirs.values()))
+    residuals = [*output_residuals(measured, few)], [*output_residuals(measured, many)]
     sizes = np.nanstd(measured, axis=1).tolist()
-    excess = misfit_of_fits([*output_residuals(measured, few)], [*output_residuals(measured, many)], sizes)
-    return long if needs_history(model.structure, excess, more) else short
+    return long if needs_history(model.structure, *residuals, sizes, terms) else short
 
 
 def simulate_samples(
@@ -249,7 +253,7 @@ def simulate_samples(
         return _samples_from_pulses(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
     names = initial_names(model, rec.initial)
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
-    if not names:
+    if not names and model.structure.offset != "level":
         return _samples_from_pulses(model, run, rec, every, _responses(model, rec, none), none, at), none
     free, units = _free_and_units(model, rec, names)
     driven = _samples_from_pulses(model, run, rec, every, free, none, at)
@@ -310,7 +314,14 @@ def measured_samples(model: Model, run: Run, every: int, rec: Record | None = No
 def fit_initial_terms(
     model: Model, measured: Floats, driven: Floats, names: Sequence[tuple[str, float]], columns: Sequence[Floats]
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Fit initial terms to measured samples by least squares; return the simulation with them, and the terms."""
+    """Fit initial terms to measured samples by least squares; return the simulation with them, and the terms.
+
+    The level of an output, which no equation sees, is one more term.
+    """
+    if model.structure.offset == "level":
+        names = [*names, *((o, LEVEL_EXPONENT) for o in model.outputs)]
+        ones = np.ones(measured.shape[1])
+        columns = [*columns, *(np.outer(row, ones) for row in np.eye(len(model.outputs)))]
     deviation = np.nanstd(measured, axis=1, keepdims=True)
     # What was not read weighs nothing.
     unread = np.isnan(measured)
@@ -625,7 +636,7 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
     looked = (
         (run.name, _start_residuals(structure, run))
         for run in runs
-        if resolve_initial_conditions(run, structure) == "rest"
+        if rest_evidence(run, structure) is None and resolve_initial_conditions(run, structure) == "rest"
     )
     return [name for name, left in looked if left is not None and _is_reportable(left) and _requires_history([left])]
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -19,7 +21,10 @@ from ftlm.simulation.discretization import (
     records,
     sensor_series,
 )
+from ftlm.simulation.initial_conditions import deviations
+from ftlm.simulation.output_samples import LEVEL_EXPONENT
 from ftlm.simulation.step_refinement import simulate_refined
+from ftlm.structure.equation import Equation
 from ftlm.structure.structure import check_initial
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
@@ -99,7 +104,10 @@ def simulate(
     initial
         Coefficients of initial terms, by output and exponent; default at rest. They are valid for this record only.
         After a sensor filter, -1 and -2 are an impulse and its derivative, which represent the filter's initial state.
-        An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); default none.
+        An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); the level of an
+        output is the exponent infinity, and inputs then count from their values in quiet rows; default none. Initial
+        values y(0), y'(0) by Caputo's definition bring further powers of t where a term of the output has a fractional
+        order; a call that leaves these out is refused, and says them.
     max_m
         Maximum number of pulses; a larger remaining change raises ConvergenceError.
 
@@ -126,15 +134,30 @@ def simulate(
     for name, terms in (initial or {}).items():
         if name not in model.outputs:
             raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
-        check_initial([e for e in terms if not (model.structure.has_filter_transient(name) and e in impulses)])
+        check_initial(
+            [
+                e
+                for e in terms
+                if e != LEVEL_EXPONENT and not (model.structure.has_filter_transient(name) and e in impulses)
+            ]
+        )
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"{setting('tolerance')} {tolerance} is not positive; the default is 1e-6")
+    # The simulation is that of the equations, from rest; a level that is given is added to it.
+    levels = {name: terms.get(LEVEL_EXPONENT, 0.0) for name, terms in (initial or {}).items()}
+    initial = {n: {e: v for e, v in terms.items() if e != LEVEL_EXPONENT} for n, terms in (initial or {}).items()}
+    if any(levels.values()):
+        run = deviations(run, model.structure)[0]
+    if model.structure.offset == "level":
+        model = replace(model, structure=replace(model.structure, offset="none"))
+    for item in model.equations:
+        _check_initial_values(item, initial.get(item.output, {}))
     own = run.length - 1
     max_m = min(max_m, MAX_M)
     if own > max_m:
         raise ModelError(f"run {run.name!r} has {own} intervals, more than {max_m}; slice it")
     free = simulate_refined(
-        model, _with_missing_outputs(run, model), initial or {}, tolerance=tolerance, max_m=max_m, on_grid=True
+        model, _with_missing_outputs(run, model), initial, tolerance=tolerance, max_m=max_m, on_grid=True
     )
     for name, samples in zip(model.outputs, free.outputs, strict=True):
         if not np.all(np.isfinite(samples)):
@@ -151,11 +174,36 @@ def simulate(
     return Run.from_arrays(
         step=run.step,
         inputs={n: run[n] for n in run.inputs},
-        outputs={n: free.outputs[i] for i, n in enumerate(model.outputs)},
+        outputs={n: free.outputs[i] + levels.get(n, 0.0) for i, n in enumerate(model.outputs)},
         units={n: u for n, u in _units(model, run).items() if u},
         intersample=run.intersample,
         name=f"{run.name}, simulated",
     )
+
+
+def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
+    """Raise ModelError for initial values without the powers that Caputo derivatives of own terms bring along.
+
+    D^nu y of y = y_i t^i / i! + ... is integrated by alpha to I^(alpha - nu) (y - y_i t^i / i! ...).
+    """
+    alpha = item.order.constant
+    values = {round(e): v for e, v in terms.items() if v and e == round(e) and 0.0 <= e < alpha}
+    needed: dict[float, float] = {}
+    for i, value in values.items():
+        needed[float(i)] = needed.get(float(i), 0.0) + value
+        for term in item.terms:
+            order, power = term.order.constant, round(alpha - term.order.constant + i, 9)
+            if term.signal == item.output and i < math.ceil(order - 1e-9):
+                share = float(term.fixed or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
+                needed[power] = needed.get(power, 0.0) - share * value
+    lacking = [e for e in needed if e != round(e) and not any(abs(e - given) < 1e-6 for given in terms)]
+    if lacking:
+        shown = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(needed.items()))
+        raise ModelError(
+            f"initial terms of {item.output}: powers of t {', '.join(map(str, sorted(values)))}, and the equation has "
+            f"a term of fractional order: initial values by Caputo's definition are {{{shown}}} in the "
+            f"equation that is integrated; give all of these, or t^{lacking[0]:g} as 0 if only the powers are meant"
+        )
 
 
 def _units(model: Model, run: Run) -> dict[str, str]:

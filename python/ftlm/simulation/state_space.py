@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -132,6 +132,7 @@ def simulate_state_space(model: Model, run: Run, initial: Terms | None) -> Outpu
         start = resolve_initial_conditions(run, model.structure)
         if isinstance(start, History) or model.structure.offset == "auto":
             return None
+        model = replace(model, structure=replace(model.structure, initial=start))
         names = initial_names(model, start)
         terms = none
     else:
@@ -143,7 +144,7 @@ def simulate_state_space(model: Model, run: Run, initial: Terms | None) -> Outpu
     samples = system.respond(terms)
     if samples is None:
         return None
-    if names and np.all(np.isfinite(samples)):
+    if (names or (initial is None and model.structure.offset == "level")) and np.all(np.isfinite(samples)):
         columns = [system.respond({**none, output: {power: 1.0}}, driven=False) for output, power in names]
         known = [c for c in columns if c is not None]
         if len(known) < len(columns):

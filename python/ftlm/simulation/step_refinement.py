@@ -15,10 +15,11 @@ from ftlm.data.sampling import ZERO_ORDER_HOLD, interpolate_gaps
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, apply_input_nonlinearity, has_nonuniform_samples, record
-from ftlm.simulation.initial_conditions import resolve_initial_conditions
+from ftlm.simulation.initial_conditions import deviations, resolve_initial_conditions, resolve_start, start_score
 from ftlm.simulation.output_samples import (
     FIRST_REFINEMENT,
     FRICTION_REFINEMENT,
+    LEVEL_EXPONENT,
     ORDER_TOLERANCE,
     OutputSamples,
     Terms,
@@ -360,7 +361,7 @@ def simulate_long(
 
     def superpose_with_terms(rows: Floats) -> tuple[Floats, dict[str, dict[float, float]]]:
         driven, units = answers.split(rows)
-        if initial is None and names:
+        if initial is None and (names or model.structure.offset == "level"):
             return fit_initial_terms(
                 model, measured_samples(model, run, FULL_GRID_REFINEMENTS[-1]), driven, names, units
             )
@@ -456,6 +457,39 @@ def simulate_refined(
     on_grid
         Whether to use the uniform grid of a run with nonuniform samples.
     """
+    if initial is not None:
+        return _simulate_refined(model, run, initial, tolerance, max_m, on_grid)
+    model = replace(model, structure=resolve_start([run], model.structure))
+    if model.structure.offset != "level":
+        return _simulate_refined(model, run, None, tolerance, max_m, on_grid)
+    moved, levels = deviations(run, model.structure)
+    free = _simulate_refined(model, moved, None, tolerance, max_m, on_grid)
+    if model.structure.initial == "auto":
+        # A run that may have been in motion may as well have rested at its level.
+        rest = replace(model, structure=replace(model.structure, initial="rest"))
+        still = _simulate_refined(rest, moved, None, tolerance, max_m, on_grid)
+        free = still if _explains_as_well(model, moved, still, free) else free
+    terms = {o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in t.items()} for o, t in free.initial.items()}
+    reference = np.array([levels[o] for o in model.outputs])
+    return replace(free, outputs=free.outputs + reference[:, None], initial=terms)
+
+
+def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSamples) -> bool:
+    """Whether a simulation with few initial terms is preferred to one with more by :func:`start_score`."""
+    if not (np.all(np.isfinite(few.outputs)) and np.all(np.isfinite(many.outputs))):
+        return False
+    residuals = [[*(measured_samples(model, run, s.refinement) - s.outputs)] for s in (few, many)]
+    scores = [
+        start_score(own, sum(map(len, s.initial.values())), residuals[0])
+        for own, s in zip(residuals, (few, many), strict=True)
+    ]
+    return scores[0] <= scores[1]
+
+
+def _simulate_refined(
+    model: Model, run: Run, initial: Terms | None, tolerance: float, max_m: int, on_grid: bool
+) -> OutputSamples:
+    """Simulate as :func:`simulate_refined`, with a start that is resolved, and deviations for a level."""
     exact = simulate_state_space(model, run, initial)
     if exact is not None:
         return exact

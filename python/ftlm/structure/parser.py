@@ -70,13 +70,17 @@ def equation(
     initial
         Initial conditions as powers of t: ``"rest"`` (zero), ``"caputo"`` (constant before the start), ``"history"``
         (unknown past: exponents in quarters, as many as are significant), or given exponents. ``"auto"``: rest if the
-        outputs start at zero, else Caputo for integer orders or if the data need no more, else history.
+        outputs start at zero, or stand still in five rows or more before an input moves, or if the inputs are constant
+        over the run (said in a finding); then the level of the outputs is estimated where it is not zero, and the
+        inputs count from their first value. Else Caputo for integer orders or if the data need no more, else history.
     sensor_filter
         Known filter of some measured signals, inputs or outputs; see :class:`ftlm.SensorFilter`.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, the same as ``+ c`` in the text;
-        ``"ramp"``: a constant and a constant times t; ``"none"``. Offsets are estimated per run with the coefficients
-        and never transferred to another run. Default: as in the text.
+        ``"ramp"``: a constant and a constant times t; ``"level"``: a constant that is added to the output, the value at
+        which the plant rests, one number whatever the orders; ``"none"``. From rest a constant is a load that acts from
+        the first row on, or, if the outputs stand still elsewhere than at zero, the level at which it rests. Offsets
+        are estimated per run with the coefficients and never transferred to another run. Default: as in the text.
     coupling
         Coupling of several equations. ``"measured"``: the measured other outputs are inputs (default).
         ``"simulated"``: all outputs are simulated together (default if an equation has friction).

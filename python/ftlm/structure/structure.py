@@ -34,7 +34,7 @@ class History(tuple[float, ...]):
 
 
 Initial: TypeAlias = Literal["auto", "rest", "caputo", "history"] | tuple[float, ...]
-Offset: TypeAlias = Literal["none", "constant", "ramp", "auto"]
+Offset: TypeAlias = Literal["none", "level", "constant", "ramp", "auto"]
 #: Accepted words for the initial terms.
 INITIAL_CHOICES = ("auto", "rest", "caputo", "history")
 
@@ -57,10 +57,10 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
 
 
 def check_offset(offset: str) -> Offset:
-    """Validate an offset: ``"none"``, ``"constant"``, ``"ramp"`` or ``"auto"``."""
-    if offset in ("none", "constant", "ramp", "auto"):
+    """Validate an offset: ``"none"``, ``"level"``, ``"constant"``, ``"ramp"`` or ``"auto"``."""
+    if offset in ("none", "level", "constant", "ramp", "auto"):
         return offset  # type: ignore[return-value]
-    raise ModelError(f"{setting('offset')} {offset!r} is not known; use 'none', 'constant', 'ramp' or 'auto'")
+    raise ModelError(f"{setting('offset')} {offset!r} is not known; use 'none', 'level', 'constant', 'ramp' or 'auto'")
 
 
 def check_offset_resolved(offset: str) -> None:
@@ -137,7 +137,9 @@ class Structure:
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation. ``"ramp"``: a constant and a
         constant times t. Offsets are estimated per run, like initial terms, and never transferred to another run.
-        ``"auto"``: identification decides between none and a constant.
+        ``"level"``: a constant that is added to each output, the value at which the plant rests. ``"auto"``:
+        identification decides between none and a constant. With ``"none"`` and ``"constant"`` a run that rests at its
+        own level before an input moves has a level (see `initial`).
 
     Raises
     ------
@@ -528,7 +530,9 @@ class Structure:
         taken = {*self.coefficient_names, *self.order_names, *self.signals}
         name = next(n for n in ("c", *(f"c{k}" for k in range(len(taken) + 1))) if n not in taken)
         asked = f" + ({name} if the runs ask for it)"
-        return {"none": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)", "auto": asked}[self.offset]
+        return {"none": "", "level": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)", "auto": asked}[
+            self.offset
+        ]
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
@@ -541,7 +545,7 @@ def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, .
 
 def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
     """Exponents of t of the integrated offset, by name: c t^alpha / Gamma(alpha + 1)."""
-    names = {"none": (), "auto": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
+    names = {"none": (), "level": (), "auto": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
     return {name: round(alpha + i, 9) for i, name in enumerate(names)}
 
 

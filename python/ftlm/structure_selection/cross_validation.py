@@ -412,7 +412,7 @@ def insignificant_coefficients(joint: JointFit) -> tuple[str, ...]:
 
 def parameter_count(structure: Structure, joint: JointFit, folds: Folds) -> int:
     """Number of estimated parameters."""
-    each = {"none": 0, "auto": 0, "constant": 1, "ramp": 2}[structure.offset]
+    each = {"none": 0, "auto": 0, "level": 1, "constant": 1, "ramp": 2}[structure.offset]
     return len(joint.names) + each * len(structure.equations) * len(folds.runs)
 
 

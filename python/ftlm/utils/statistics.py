@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from statistics import NormalDist
 
@@ -33,7 +34,7 @@ def is_rest(samples: Floats) -> bool:
     Only the first sample is tested, because a machine at rest may respond within a few samples.
     """
     there = samples[~np.isnan(samples)]
-    noise = estimate_noise(samples)
+    noise = white_noise(samples)
     return bool(abs(there[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(there)))
 
 
@@ -45,6 +46,28 @@ def estimate_noise(samples: Floats) -> float:
         # No three neighbours were read: those that were stand closest.
         bends = np.diff(samples[~np.isnan(samples)], 2)
     return robust_deviation(bends) / float(np.sqrt(6.0))
+
+
+#: Orders of the differences from which :func:`white_noise` is estimated, and the least number of differences.
+DIFFERENCE_ORDERS, MIN_DIFFERENCES = range(2, 9), 8
+#: Samples from which the noise of the start of a run is estimated; more would tell no more and cost time.
+NOISE_SAMPLES = 4096
+
+
+def white_noise(samples: Floats) -> float:
+    """Standard deviation of white noise on a signal that may swing: the least of differences of several orders.
+
+    White noise is in the differences of every order. A swing of few samples a period, which second differences take
+    for noise, is in the low orders alone (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521).
+    """
+    least = estimate_noise(samples)
+    for order in DIFFERENCE_ORDERS:
+        bends = np.diff(samples[:NOISE_SAMPLES], order)
+        bends = bends[~np.isnan(bends)]
+        if bends.size < MIN_DIFFERENCES:
+            break
+        least = min(least, robust_deviation(bends) / math.sqrt(math.comb(2 * order, order)))
+    return least
 
 
 def robust_deviation(values: Floats) -> float:

@@ -26,7 +26,13 @@ from ftlm.simulation.discretization import (
     equation_tuple,
     records,
 )
-from ftlm.simulation.output_samples import OutputSamples, initial_exponents, measured_samples, runs_in_motion
+from ftlm.simulation.output_samples import (
+    LEVEL_EXPONENT,
+    OutputSamples,
+    initial_exponents,
+    measured_samples,
+    runs_in_motion,
+)
 from ftlm.simulation.simulate import comparison_records, respond
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import Structure, offset_exponents
@@ -355,6 +361,9 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
     """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
+        if LEVEL_EXPONENT in initial[item.output]:
+            out[item.output] = {"level": initial[item.output][LEVEL_EXPONENT]}
+            continue
         alone = initial_exponents(item, "caputo", model.structure.offset)
         found = {round(e, 9) for e in initial[item.output] if e > -1}
         if not found or (isinstance(model.structure.initial, str) and not found <= set(alone)):
@@ -376,6 +385,9 @@ def describe_offsets(comparison: Comparison) -> list[str]:
             if not values:
                 note = HIDDEN_OFFSET_NOTE if initial[output] else "not estimated, since the free run diverges"
                 lines.append(f"offset in the equation of {output} in {run}: {note}")
+                continue
+            if "level" in values:
+                lines.append(f"level of {output} in {run} (estimated on that run, for it alone): {values['level']:.6g}")
                 continue
             ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
             lines.append(
@@ -432,6 +444,9 @@ def _pooled_comparison(
         for o, f in equation_error.items()
         if f is UNKNOWN_METRICS
     }
+    offsets = tuple(offset_values(model, p.initial) for p in parts)
+    if model.structure.offset == "none":
+        offsets = tuple({o: values for o, values in run.items() if values} for run in offsets)
     return Comparison(
         output_error,
         equation_error,
@@ -444,7 +459,7 @@ def _pooled_comparison(
         tuple(near_identity_findings(model.structure, equation_error, output_error)),
         times,
         sampled,
-        tuple(offset_values(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
+        offsets if model.structure.offset != "none" or any(offsets) else (),
         unequated,
     )
 

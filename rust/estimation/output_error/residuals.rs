@@ -43,9 +43,10 @@ pub(crate) struct Evaluation {
 
 /// Response of an experiment to an initial term: equation, weighted samples, pulse means.
 ///
-/// The pulse means are empty for a term that affects only the sensor filter.
+/// The pulse means are empty for a term that affects only the sensor filter, and for a level of the output, which no
+/// term of the equation sees. Of the latter the equation is None.
 struct InitialTermResponse {
-    equation: usize,
+    equation: Option<usize>,
     samples: Vec<f64>,
     means: Rc<PulseMeans>,
 }
@@ -115,7 +116,8 @@ impl FreeModel {
             .collect::<Result<Vec<_>>>()?;
         let operators = self.term_operators(experiment, shelf, structures)?;
         out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
-        let asked = out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
+        let has_level = self.initial.has_level();
+        let asked = has_level || out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
         let (response, solved) = self.rest_response(experiment, shelf, &operators, point, &acted)?;
         let mut residuals = experiment.measured_samples();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
@@ -158,8 +160,15 @@ impl FreeModel {
                     }
                 };
                 extend_orthonormal(&mut basis, samples.clone(), RANK_TOLERANCE);
-                free.push(InitialTermResponse { equation: i, samples, means });
+                free.push(InitialTermResponse { equation: Some(i), samples, means });
             }
+        }
+        for i in 0..if has_level { structures.len() } else { 0 } {
+            let samples: Vec<f64> = (0..structures.len())
+                .flat_map(|j| experiment.weights_of(j).map(move |w| if i == j { w } else { 0.0 }))
+                .collect();
+            extend_orthonormal(&mut basis, samples.clone(), RANK_TOLERANCE);
+            free.push(InitialTermResponse { equation: None, samples, means: Rc::default() });
         }
         let mut part = Linearization {
             system: solved,
@@ -316,7 +325,9 @@ impl FreeModel {
                 .unzip();
             let (values, _) = least_squares::solve(&columns, &residuals, 0)?;
             for (((i, means), column), x) in places.iter().zip(&columns).zip(&values) {
-                initial[*i].push(*x);
+                if let Some(i) = i {
+                    initial[*i].push(*x);
+                }
                 residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
                 for (total, more) in part.response.iter_mut().zip(means.iter()) {
                     total.iter_mut().zip(more).for_each(|(y, v)| *y += x * v);

@@ -28,7 +28,7 @@ impl<'a> RequiredRegressors<'a> {
             self.index.insert(Key::initial(exponent));
         }
         match self.initial.under() {
-            Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => {}
+            Initial::Rest | Initial::Offset { .. } | Initial::Level { .. } | Initial::Filtered { .. } => {}
             Initial::Powers(powers) => powers.iter().for_each(|&e| {
                 self.index.insert(Key::initial(e));
             }),
