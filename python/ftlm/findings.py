@@ -83,6 +83,7 @@ FINDING_TOPICS: dict[str, Topic] = {
     ),
     "law": Topic("it breaks the law of its coefficients", "", "use {ask[method is output-error]}", "output-error"),
     "edge": Topic("an order or a number is on its bound", "widen the bound"),
+    "search": Topic("the table of orders", "record a longer run, or fix an order"),
     "history": Topic("what the run did before its start counts", "begin the run at rest"),
     "samples": Topic("the samples harm the figures", "see the warning"),
     "same": Topic("a validation run is one of its own", "give another run"),
@@ -262,6 +263,45 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
     "genetic_on_bound": FindingKind(
         "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
+    ),
+    "rows_repeat": FindingKind(
+        "search",
+        LEVEL_FACT,
+        "{rows} rows hold {models} model{plural}: one number added to all free orders leaves an equation from rest as "
+        "it is; give one order as a number, such as the lowest as 0",
+        remedy="give one order as a number, such as the lowest as 0",
+    ),
+    "ranks_alike": FindingKind(
+        "search",
+        LEVEL_FACT,
+        "ranks 1 to {last}{every} are alike within noise at 99 % ({shown})",
+    ),
+    "noise_decides": FindingKind(
+        "search",
+        LEVEL_WITH_CARE,
+        "noise decides: ranks 1 to {last}{every} are alike at 99 % ({shown}), so the run does not tell these orders",
+        "noise decides: ranks 1 to {last} are alike ({shown})",
+    ),
+    "certified_run_grows": FindingKind(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "the free run of these orders grows without bound ({poles} poles with a positive real part, NR {nr:.3g}): the "
+        "certificate bounds the equation error, not the error of a simulation",
+        remedy="use {ask[method is output-error]}",
+    ),
+    "certified_run_fails": FindingKind(
+        "useless",
+        LEVEL_DO_NOT_USE,
+        "the free run of these orders explains little of the output (NR {nr:.3g}): the certificate bounds the equation "
+        "error, not the error of a simulation",
+        remedy="use {ask[method is output-error]}",
+    ),
+    "rank_not_judged": FindingKind(
+        "search",
+        LEVEL_WITH_CARE,
+        "rank 1 cannot be judged: {text}",
+        "rank 1 cannot be judged: {text}",
+        "identify at these orders",
     ),
     "on_edge": FindingKind(
         "edge", LEVEL_WITH_CARE, "order {parameter} = {value:g} is on the edge of its interval|; widen it"

@@ -248,10 +248,17 @@ def estimate_order_search(
     executor: Executor | None,
 ) -> Fit:
     """Search the orders on the order grid, then estimate the coefficients by the same linear method."""
-    method, structure = settings.coefficients, task.structure
     searches = (
-        run_order_searches(task, settings, m, threads, progress, store, executor) if structure.order_names else {}
+        run_order_searches(task, settings, m, threads, progress, store, executor) if task.structure.order_names else {}
     )
+    return fit_at_best_orders(task, settings, m, searches)
+
+
+def fit_at_best_orders(
+    task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
+) -> Fit:
+    """Estimate the coefficients at the best orders of searches by the linear method of the settings."""
+    method, structure = settings.coefficients, task.structure
     orders = {n: v for search in searches.values() for n, v in search.orders.items()}
     rank = 1
     if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
@@ -287,7 +294,7 @@ def estimate_order_search(
             *coefficient_law_findings(model),
             *(make_finding("on_edge", parameter=n, value=v) for n, v in edges),
         ],
-        searches,
+        dict(searches),
         errors,
     )
 

@@ -17,7 +17,7 @@ from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.result import Identification
 from ftlm.order_search.result import SearchResult
-from ftlm.order_search.search import search_orders
+from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import INNOVATION_LENGTHS
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
@@ -91,7 +91,7 @@ def compare_optimizers(
     # Reference values of a structure would inform the bounds.
     blind = replace(single, reference={})
     searches = {
-        prior: search_orders(
+        prior: rank_orders(
             run,
             blind,
             order_grid,
@@ -294,7 +294,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
         single = structure.equation(output)
         for prior in PRIOR_COVARIANCES:
             best = {
-                p: search_orders(
+                p: rank_orders(
                     run,
                     single,
                     OrderGrid(increment=PANEL_STEP),
