@@ -150,6 +150,32 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "the model is {stability}: its free run grows without bound, however well it fits a run of this length",
         "the free run grows without bound ({poles})",
     ),
+    "plant_unstable": FindingKind(
+        "unstable",
+        LEVEL_FACT,
+        "the model is unstable, and so is the plant: free runs that start anew every {seconds:.2g} s explain "
+        "{fit:.3g} % of the outputs, and the outputs stay bounded as a controller holds them",
+        remedy="record how the controller moves it, and validate on short pieces",
+    ),
+    "plant_unstable_in_pieces": FindingKind(
+        "loop",
+        LEVEL_WITH_CARE,
+        "the model is unstable, and so is the plant, which a controller holds: free runs that start anew every "
+        "{seconds:.2g} s explain {fit:.3g} % of the outputs, though that of a whole run grows; noise that the "
+        "controller feeds back biases this method",
+        "the plant is unstable, as the model is: free runs that start anew every {seconds:.2g} s explain {fit:.3g} %",
+        "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, which "
+        "noise does not bias",
+    ),
+    "plant_needs_pieces": FindingKind(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "no free run of a whole run follows this plant, which is unstable and held by a controller: least squares at "
+        "these orders gives an unstable model whose free runs, started anew every {seconds:.2g} s, explain {fit:.3g} %",
+        "the plant is unstable and held by a controller, and no free run of a whole run follows it",
+        "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, or use "
+        "{ask[method is least-squares]}, which noise in the loop biases",
+    ),
     "growth_not_told": FindingKind(
         "unstable",
         LEVEL_FACT,
@@ -365,6 +391,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_WITH_CARE,
         "none of {starts} starts led to this optimum, but the search for intervals did| (residuals {before} before, "
         "{after} now): there may be others",
+    ),
+    "second_optimum": FindingKind(
+        "provisional",
+        LEVEL_WITH_CARE,
+        "a second optimum explains the data as well (log likelihood smaller by {difference:.2g}): {shown}",
+        "a second optimum explains the data as well: {shown}",
+        "fix or bound one of these, or record what tells the two apart",
     ),
     "seeds_disagree": FindingKind(
         "provisional",

@@ -19,7 +19,12 @@ from ftlm.estimation.confidence_intervals import Intervals, with_intervals
 from ftlm.estimation.fit import Fit, ProgressCallback, initial_terms_text, make_model, offset_setting
 from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_starts
 from ftlm.estimation.linear import estimate_coefficients, step_bias_findings
-from ftlm.estimation.model_checks import coefficient_law_findings, identifiability_findings, sample_findings
+from ftlm.estimation.model_checks import (
+    coefficient_law_findings,
+    identifiability_findings,
+    multistart_findings,
+    sample_findings,
+)
 from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_initial_conditions
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, Loss
@@ -206,6 +211,8 @@ def estimate_output_error(
         )
     course.advance_to(1.0)
     findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
+    if answers is None:
+        findings += multistart_findings(joint, problem, task.runs)
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = replace(structure, initial="history")

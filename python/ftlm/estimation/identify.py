@@ -35,6 +35,7 @@ from ftlm.estimation.nuisance_parameters import (
 )
 from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification
+from ftlm.estimation.unstable_plants import WHOLE_RUN_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import result_findings
 from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Estimate
@@ -252,6 +253,14 @@ def assess_fit(fit: Fit) -> Identification:
     except DataError:
         # A run that is too short for correlations; everything else can be told.
         pass
+    plant = unstable_plant_findings(
+        fit, replace(model, estimate=_estimate(fit, comparison, None, ())), runs, comparison
+    )
+    if plant:
+        findings = [*plant, *(f for f in findings if f.code not in WHOLE_RUN_CODES)]
+    if any(f.code == "plant_unstable_in_pieces" for f in plant):
+        # The residuals of free runs that grow say nothing of the model.
+        tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is not None:
         findings = [_noise_finding(f, tests) for f in findings] + _residual_findings(fit, tests)

@@ -30,6 +30,8 @@ MAX_COEFFICIENT_ERROR_RATIO, MAX_ORDER_ERROR = 0.5, 0.25
 #: Limits of the validation loss: ratio to the estimation loss, and percentage below which the ratio does not matter.
 VALIDATION_LOSS_LIMITS = ((3.0, 10.0), (5.0, 5.0))
 UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
+#: Findings on an unstable plant: simulations of whole runs do not judge its model.
+UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 #: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by
 #: rounding alone, and a parameter may be uncertain, but not by much.
 RULED_TOPICS = ("residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
@@ -114,8 +116,9 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
 
     Findings of weight that no rule covers count in the order of :data:`ftlm.findings.FINDING_TOPICS`.
     """
-    runs = () if validation is None else (validation,)
-    tried = validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
+    unstable = any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
+    runs = () if validation is None or unstable else (validation,)
+    tried = bool(runs) and validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
     against = _combined_verdict([*result_findings(result)], result.fit_percent, runs, tried)
     if against is not None:
         return against
@@ -146,7 +149,10 @@ def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Return the verdict on a saved model, from its file and from comparisons with runs."""
-    known, own = model.estimate, [*_unstable_poles(model)]
+    known = model.estimate
+    unstable = known is not None and any(f.code in UNSTABLE_PLANT_CODES for f in known.findings or ())
+    own = [] if unstable else [*_unstable_poles(model)]
+    validation = () if unstable else validation
     if known is None:
         own.append(make_finding("origin_unknown"))
         judged = _combined_verdict(own, {}, validation, True)
@@ -212,7 +218,11 @@ def _against_result(result: Identification) -> Iterator[Finding]:
 
 
 def _free_runs(result: Identification) -> Iterator[Finding]:
-    """Yield findings about simulations: overflow, instability and poor fit."""
+    """Yield findings about simulations: overflow, instability, poor fit, an unstable plant."""
+    plant = [f for f in result.findings if f.code in UNSTABLE_PLANT_CODES]
+    yield from plant
+    if plant and plant[0].code != "plant_needs_pieces":
+        return
     lost = [o for o, f in result.output_error.items() if not math.isfinite(f.nr)]
     if lost:
         yield make_finding("out_of_range", output=", ".join(lost))
@@ -289,7 +299,8 @@ def _validation_losses(before: Mapping[str, float], validation: Comparison) -> I
 def _residuals(result: Identification) -> Iterator[Finding]:
     """Yield findings of residual tests: feedback, dependence on an input, color."""
     if result.residuals is None:
-        yield make_finding("too_short_for_tests")
+        if not any(f.code == "plant_unstable_in_pieces" for f in result.findings):
+            yield make_finding("too_short_for_tests")
         return
     looped = "reference" in result.settings
     judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
