@@ -650,9 +650,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "loop_in_data": FindingKind(
         "loop",
         LEVEL_FACT,
-        "input {input} answers what is new in output {output} {lag} row{plural} later (correlation {correlation:.2g}): "
-        "a closed loop, in which equation-error estimates are biased; use the output error, and if you can a reference "
-        "that moves the machine well",
+        "input {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
+        "noise: a closed loop, in which equation-error estimates are biased; use the output error, and if you can a "
+        "reference that moves the machine well",
+    ),
+    "loop_not_told": FindingKind(
+        "loop",
+        LEVEL_FACT,
+        "whether input {input} answers output {output} cannot be told: {reason}; if a controller made it, name what "
+        "drives the loop with {ask[reference]}",
     ),
     "drift": FindingKind(
         "samples",
