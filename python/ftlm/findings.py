@@ -20,6 +20,8 @@ FINDING_LEVELS = (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT, LEVEL_NOTE)
 MAX_SUMMARY_FINDINGS = 3
 #: Codes of residuals that are not white.
 NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "noise_coloured", "response_not_white")
+#: Codes of residuals that show what a model leaves out.
+LEFT_OUT_CODES = ("residuals_follow_input", "coupling_missing", "residuals_not_white", "output_not_white")
 #: Fields of the subject of a finding.
 SUBJECT_FIELDS = ("run", "output", "input", "parameter", "method")
 #: Role of findings on runs that a model was not identified from.
@@ -240,6 +242,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "explains_little": FindingKind(
         "useless", LEVEL_DO_NOT_USE, "{output}: the free run explains little of the output| (NR {nr:.3g})"
     ),
+    "buried_in_noise": FindingKind(
+        "useless",
+        LEVEL_WITH_CARE,
+        "{output}: the noise is larger than what the input moves (NR {nr:.3g}): nothing of the input is left in the "
+        "residuals, so the model misses nothing that this run shows",
+        "{output} is buried in noise (NR {nr:.3g}), and nothing of the input is left in the residuals",
+        "move the input more, record longer, or average repeated runs",
+    ),
     "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the free run explains little of {where}{shown}"),
     "fit_falls": FindingKind(
         "lost",
@@ -443,6 +453,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{output}: residuals still follow {input}| (correlation {value:.2g} at lag {lag}, 99 % limit {limit:.2g}): not "
         "all of what {input} does is in the model",
         f"residuals of {{shown}}: {_LEFT_OUT}",
+    ),
+    "coupling_missing": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output}: residuals follow {input} (correlation {value:.2g} at lag {lag}, 99 % limit {limit:.2g}), which no "
+        "equation reads: what it drives acts on {output} too",
+        "{output} follows {input}, which no equation reads",
+        "add a term of {input}; of the flexible link {ask[cross_stage is torques]} adds the other link, and "
+        "{ask[friction]} the dry friction of the hubs",
     ),
     "follow_undecided": FindingKind(
         "other",
@@ -793,6 +812,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_WITH_CARE,
         "residuals are not white: the structure leaves something out, which parts that are excited in other ways may "
         "answer with other numbers; then it is the structure and not the machine that changes",
+    ),
+    "prediction_in_doubt": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "the standard errors are predicted for a model that is right, and of this one it is said: {text}",
+        "the standard errors are predicted for a model that leaves something out",
+        "add what it leaves out, identify again, and design on that model",
     ),
     "designed_for_white_noise": FindingKind(
         "residuals", LEVEL_FACT, "predicted for white noise, and of the model it is said: {text}"
