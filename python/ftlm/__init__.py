@@ -39,6 +39,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.estimation.methods import LeastSquares as LeastSquares
     from ftlm.estimation.methods import MultiInnovation as MultiInnovation
     from ftlm.estimation.methods import OutputError as OutputError
+    from ftlm.estimation.order_ranking import search_orders as search_orders
     from ftlm.estimation.output_error import ProfileInterval as ProfileInterval
     from ftlm.estimation.physical_parameters import PhysicalParameter as PhysicalParameter
     from ftlm.estimation.physical_parameters import physical_parameters as physical_parameters
@@ -71,7 +72,6 @@ if _typing.TYPE_CHECKING:
     from ftlm.order_search.result import SearchRow as SearchRow
     from ftlm.order_search.result import StoreStatus as StoreStatus
     from ftlm.order_search.search import resume_search as resume_search
-    from ftlm.order_search.search import search_orders as search_orders
     from ftlm.order_search.search import search_status as search_status
     from ftlm.reproduction.reproduction import Reproduction as Reproduction
     from ftlm.reproduction.reproduction import reproduce as reproduce
@@ -119,6 +119,7 @@ _MODULE_BY_NAME = {
         "estimation.identify": "BatchResult identify identify_many",
         "estimation.linear": "MultiInnovationTrace multi_innovation_trace",
         "estimation.methods": "InstrumentalVariables LeastSquares MultiInnovation OutputError",
+        "estimation.order_ranking": "search_orders",
         "estimation.output_error": "ProfileInterval",
         "estimation.physical_parameters": "PhysicalParameter physical_parameters",
         "estimation.result": "Identification",
@@ -136,7 +137,7 @@ _MODULE_BY_NAME = {
         "model.serialization": "load_model",
         "order_search.certificate": "certify_orders",
         "order_search.result": "OrderCertificate SearchResult SearchRow StoreStatus",
-        "order_search.search": "resume_search search_orders search_status",
+        "order_search.search": "resume_search search_status",
         "reproduction.reproduction": "Reproduction reproduce",
         "simulation.simulate": "explicit_euler simulate",
         "structure.equation": "Equation Friction Stribeck Term",

@@ -378,6 +378,8 @@ class _JointFit(TypedDict):
     initial_terms: int
     #: cost per residual and origin
     starts: list[tuple[float, str]]
+    #: cost per residual and parameters of the distinct best candidates
+    survivors: list[tuple[float, list[float]]]
     #: whether it is kept, by what share the other one leaves more, whether that is at a limit
     growth: tuple[bool, float, bool] | None
 

@@ -20,6 +20,8 @@ FINDING_LEVELS = (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT, LEVEL_NOTE)
 MAX_SUMMARY_FINDINGS = 3
 #: Codes of residuals that are not white.
 NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "noise_coloured", "response_not_white")
+#: Codes of residuals that show what a model leaves out.
+LEFT_OUT_CODES = ("residuals_follow_input", "coupling_missing", "residuals_not_white", "output_not_white")
 #: Fields of the subject of a finding.
 SUBJECT_FIELDS = ("run", "output", "input", "parameter", "method")
 #: Role of findings on runs that a model was not identified from.
@@ -83,6 +85,7 @@ FINDING_TOPICS: dict[str, Topic] = {
     ),
     "law": Topic("it breaks the law of its coefficients", "", "use {ask[method is output-error]}", "output-error"),
     "edge": Topic("an order or a number is on its bound", "widen the bound"),
+    "search": Topic("the table of orders", "record a longer run, or fix an order"),
     "history": Topic("what the run did before its start counts", "begin the run at rest"),
     "samples": Topic("the samples harm the figures", "see the warning"),
     "same": Topic("a validation run is one of its own", "give another run"),
@@ -149,6 +152,32 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "the model is {stability}: its free run grows without bound, however well it fits a run of this length",
         "the free run grows without bound ({poles})",
     ),
+    "plant_unstable": FindingKind(
+        "unstable",
+        LEVEL_FACT,
+        "the model is unstable, and so is the plant: free runs that start anew every {seconds:.2g} s explain "
+        "{fit:.3g} % of the outputs, and the outputs stay bounded as a controller holds them",
+        remedy="record how the controller moves it, and validate on short pieces",
+    ),
+    "plant_unstable_in_pieces": FindingKind(
+        "loop",
+        LEVEL_WITH_CARE,
+        "the model is unstable, and so is the plant, which a controller holds: free runs that start anew every "
+        "{seconds:.2g} s explain {fit:.3g} % of the outputs, though that of a whole run grows; noise that the "
+        "controller feeds back biases this method",
+        "the plant is unstable, as the model is: free runs that start anew every {seconds:.2g} s explain {fit:.3g} %",
+        "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, which "
+        "noise does not bias",
+    ),
+    "plant_needs_pieces": FindingKind(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "no free run of a whole run follows this plant, which is unstable and held by a controller: least squares at "
+        "these orders gives an unstable model whose free runs, started anew every {seconds:.2g} s, explain {fit:.3g} %",
+        "the plant is unstable and held by a controller, and no free run of a whole run follows it",
+        "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, or use "
+        "{ask[method is least-squares]}, which noise in the loop biases",
+    ),
     "growth_not_told": FindingKind(
         "unstable",
         LEVEL_FACT,
@@ -213,6 +242,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "explains_little": FindingKind(
         "useless", LEVEL_DO_NOT_USE, "{output}: the free run explains little of the output| (NR {nr:.3g})"
     ),
+    "buried_in_noise": FindingKind(
+        "useless",
+        LEVEL_WITH_CARE,
+        "{output}: the noise is larger than what the input moves (NR {nr:.3g}): nothing of the input is left in the "
+        "residuals, so the model misses nothing that this run shows",
+        "{output} is buried in noise (NR {nr:.3g}), and nothing of the input is left in the residuals",
+        "move the input more, record longer, or average repeated runs",
+    ),
     "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the free run explains little of {where}{shown}"),
     "fit_falls": FindingKind(
         "lost",
@@ -262,6 +299,45 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
     "genetic_on_bound": FindingKind(
         "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
+    ),
+    "rows_repeat": FindingKind(
+        "search",
+        LEVEL_FACT,
+        "{rows} rows hold {models} model{plural}: one number added to all free orders leaves an equation from rest as "
+        "it is; give one order as a number, such as the lowest as 0",
+        remedy="give one order as a number, such as the lowest as 0",
+    ),
+    "ranks_alike": FindingKind(
+        "search",
+        LEVEL_FACT,
+        "ranks 1 to {last}{every} are alike within noise at 99 % ({shown})",
+    ),
+    "noise_decides": FindingKind(
+        "search",
+        LEVEL_WITH_CARE,
+        "noise decides: ranks 1 to {last}{every} are alike at 99 % ({shown}), so the run does not tell these orders",
+        "noise decides: ranks 1 to {last} are alike ({shown})",
+    ),
+    "certified_run_grows": FindingKind(
+        "unstable",
+        LEVEL_DO_NOT_USE,
+        "the free run of these orders grows without bound ({poles} poles with a positive real part, NR {nr:.3g}): the "
+        "certificate bounds the equation error, not the error of a simulation",
+        remedy="use {ask[method is output-error]}",
+    ),
+    "certified_run_fails": FindingKind(
+        "useless",
+        LEVEL_DO_NOT_USE,
+        "the free run of these orders explains little of the output (NR {nr:.3g}): the certificate bounds the equation "
+        "error, not the error of a simulation",
+        remedy="use {ask[method is output-error]}",
+    ),
+    "rank_not_judged": FindingKind(
+        "search",
+        LEVEL_WITH_CARE,
+        "rank 1 cannot be judged: {text}",
+        "rank 1 cannot be judged: {text}",
+        "identify at these orders",
     ),
     "on_edge": FindingKind(
         "edge", LEVEL_WITH_CARE, "order {parameter} = {value:g} is on the edge of its interval|; widen it"
@@ -326,6 +402,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "none of {starts} starts led to this optimum, but the search for intervals did| (residuals {before} before, "
         "{after} now): there may be others",
     ),
+    "second_optimum": FindingKind(
+        "provisional",
+        LEVEL_WITH_CARE,
+        "a second optimum explains the data as well (log likelihood smaller by {difference:.2g}): {shown}",
+        "a second optimum explains the data as well: {shown}",
+        "fix or bound one of these, or record what tells the two apart",
+    ),
     "seeds_disagree": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
@@ -370,6 +453,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{output}: residuals still follow {input}| (correlation {value:.2g} at lag {lag}, 99 % limit {limit:.2g}): not "
         "all of what {input} does is in the model",
         f"residuals of {{shown}}: {_LEFT_OUT}",
+    ),
+    "coupling_missing": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output}: residuals follow {input} (correlation {value:.2g} at lag {lag}, 99 % limit {limit:.2g}), which no "
+        "equation reads: what it drives acts on {output} too",
+        "{output} follows {input}, which no equation reads",
+        "add a term of {input}; of the flexible link {ask[cross_stage is torques]} adds the other link, and "
+        "{ask[friction]} the dry friction of the hubs",
     ),
     "follow_undecided": FindingKind(
         "other",
@@ -611,9 +703,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "loop_in_data": FindingKind(
         "loop",
         LEVEL_FACT,
-        "input {input} answers what is new in output {output} {lag} row{plural} later (correlation {correlation:.2g}): "
-        "a closed loop, in which equation-error estimates are biased; use the output error, and if you can a reference "
-        "that moves the machine well",
+        "input {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
+        "noise: a closed loop, in which equation-error estimates are biased; use the output error, and if you can a "
+        "reference that moves the machine well",
+    ),
+    "loop_not_told": FindingKind(
+        "loop",
+        LEVEL_FACT,
+        "whether input {input} answers output {output} cannot be told: {reason}; if a controller made it, name what "
+        "drives the loop with {ask[reference]}",
     ),
     "drift": FindingKind(
         "samples",
@@ -755,6 +853,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_WITH_CARE,
         "residuals are not white: the structure leaves something out, which parts that are excited in other ways may "
         "answer with other numbers; then it is the structure and not the machine that changes",
+    ),
+    "prediction_in_doubt": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "the standard errors are predicted for a model that is right, and of this one it is said: {text}",
+        "the standard errors are predicted for a model that leaves something out",
+        "add what it leaves out, identify again, and design on that model",
     ),
     "designed_for_white_noise": FindingKind(
         "residuals", LEVEL_FACT, "predicted for white noise, and of the model it is said: {text}"

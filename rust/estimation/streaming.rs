@@ -36,6 +36,8 @@ struct RunningIntegral {
 
 impl RunningIntegral {
     fn new(signal: usize, eta: f64, step: f64, rates: &Rates) -> Result<Self> {
+        // The sum of orders may exceed 2 by rounding alone.
+        let eta = if (eta - 2.0).abs() < 1e-9 { 2.0 } else { eta };
         if eta == 0.0 {
             return Ok(Self { signal, recent_weights: [1.0, 0.0], history_weights: Vec::new(), inner: None, step });
         }
@@ -87,6 +89,8 @@ impl RunningIntegral {
 #[derive(Debug, Clone)]
 struct EquationRecursion {
     output: usize,
+    /// Integral of the output: of order 0 unless a term is differentiated more often than the output.
+    target: RunningIntegral,
     integrals: Vec<RunningIntegral>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
@@ -149,15 +153,19 @@ impl Streaming {
             check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
             let known: Vec<f64> = fixed.iter().flatten().copied().collect();
             check_finite("fixed coefficients", &known)?;
+            // A stream integrates only. The whole equation is integrated by the excess order of an improper term.
+            let orders: Vec<f64> = (0..structure.terms.len()).map(|k| structure.integration(k)).collect();
+            let excess = orders.iter().fold(0.0, |most: f64, order| most.max(-order));
             let integrals = structure
                 .terms
                 .iter()
-                .enumerate()
-                .map(|(k, term)| RunningIntegral::new(term.signal, structure.integration(k), step, &rates))
+                .zip(&orders)
+                .map(|(term, order)| RunningIntegral::new(term.signal, order + excess, step, &rates))
                 .collect::<Result<Vec<_>>>()?;
             let free = fixed.iter().filter(|f| f.is_none()).count();
             fits.push(EquationRecursion {
                 output: structure.output,
+                target: RunningIntegral::new(structure.output, excess, step, &rates)?,
                 integrals,
                 fixed: fixed.clone(),
                 recursion: Recursion::new(&vec![0.0; free], prior)?,
@@ -230,7 +238,7 @@ impl Streaming {
 
 impl EquationRecursion {
     fn step(&mut self, means: &[f64], pasts: &[SignalHistory], length: usize, pulse: usize) -> Result<()> {
-        let mut target = means[self.output];
+        let mut target = self.target.next(means[self.output], &pasts[self.output]);
         let mut row = Vec::with_capacity(self.integrals.len());
         for (integral, fixed) in self.integrals.iter_mut().zip(&self.fixed) {
             let value = integral.next(means[integral.signal], &pasts[integral.signal]);

@@ -104,7 +104,9 @@ def test_feedback_is_told_from_a_command(closed, seed):
         # The command is computed from the last row's measurement, as by a controller of its own.
         u[k] = 0.0 if k == 0 else (gain * (reference[k] - y[k - 1]) if closed else error)
         x = decay * x + (1 - decay) / a * b * u[k]
-    assert ("loop_in_data" in made(h, u, y).advice().codes) == closed
+    # A loop near its limit of stability has a tone of its own, which a command may have too.
+    said = {"loop_in_data", "loop_not_told"} & set(made(h, u, y).advice().codes)
+    assert bool(said) == closed
 
 
 def test_one_sine_excites_little_and_its_lines_are_counted():
@@ -231,23 +233,28 @@ def test_advice_changes_nothing_and_takes_hostile_runs():
 # ------------------------------------------------------------------------------------------------ the real arm
 
 
+#: A loop in the data, or one that a tone of its own hides.
+LOOP_CODES = {"loop_in_data", "loop_not_told"}
+
+
 @needs_data
 def test_the_arms_record_of_2011():
     advice = ftlm.load(DATA / "two_link_psf" / "psf.csv", **ARM).advice()
     text = str(advice)
     assert "theta12 is exactly 0 rad from 0 s to 1.004 s" in text
     assert "theta22 is exactly 0 rad from 0 s to 0.204 s" in text
-    assert [f.input for f in advice if f.code == "loop_in_data"]
-    assert set(advice.codes) <= {"channel_off", "loop_in_data", "starts_off_zero"}
+    assert {f.input for f in advice if f.code in LOOP_CODES} == {"I1", "I2"}
+    assert set(advice.codes) <= {"channel_off", *LOOP_CODES, "starts_off_zero"}
     later = ftlm.load(DATA / "two_link_psf" / "psf.csv", window=(1.1, 19.5), **ARM).advice()
-    assert set(later.codes) == {"loop_in_data", "starts_off_zero"}
+    assert set(later.codes) - LOOP_CODES == {"starts_off_zero"}
+    assert LOOP_CODES & set(later.codes)
 
 
 @needs_data
 def test_the_arm_under_lqr():
     advice = ftlm.load(DATA / "two_link_lqr" / "lqr.csv", window=(0.1, 19.9), **ARM).advice()
-    assert {f.input for f in advice if f.code == "loop_in_data"} == {"I1", "I2"}
-    assert set(advice.codes) == {"loop_in_data", "starts_off_zero"}
+    assert {f.input for f in advice if f.code in LOOP_CODES} == {"I1", "I2"}
+    assert set(advice.codes) - LOOP_CODES == {"starts_off_zero"}
 
 
 @needs_data

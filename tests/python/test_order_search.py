@@ -442,7 +442,7 @@ def test_orders_on_the_edge_of_their_interval_are_named(run):
     assert edges(alpha=(1.4, 1.8), beta=(0.3, 0.9))[0] == {}
     found, text = edges(alpha=(1.2, 1.6), beta=(0.3, 0.9))
     assert found == {"alpha": 1.6}
-    assert "warning: order alpha = 1.6 is on the edge of its interval; widen it" in text
+    assert "! order alpha = 1.6 is on the edge of its interval; widen it" in text
     assert edges(alpha=(1.4, 1.8), beta=(0.6, 0.9))[0] == {"beta": 0.6}
     # Two values are a question, not an interval.
     assert edges(alpha=(1.5, 1.6), beta=(0.3, 0.9))[0] == {}
@@ -520,7 +520,9 @@ def test_the_model_is_that_of_the_first_row(run):
 
 def test_the_table_prints_and_is_json(run):
     found = search(run, top=2, coefficients="least-squares", norm="l2")
-    head, first, second_row, last = str(found).splitlines()
+    head, first, second_row, last, judged, *_, then = str(found).splitlines()
+    assert judged == f"rank 1: {found.verdict}"
+    assert then.startswith("next: ")
     assert head.split() == ["rank", "RMSE", "alpha", "beta", "mu", "nu", "a", "c", "b"]
     assert first.split()[0] == "1"
     assert second_row.split()[0] == "2"

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +16,8 @@ from ftlm import DataError
 from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import claims, table_3_coefficients
-from ftlm.reproduction.optimizer_comparison import Panel, compare_optimizers
+from ftlm.reproduction.claims import _claim_of_orders, claims, table_3_coefficients
+from ftlm.reproduction.optimizer_comparison import OrderComparison, Panel, compare_optimizers
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
 from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
@@ -244,13 +245,38 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
     assert by_words(claims(measured), "closer to the run than the manual's").verdict == "cannot be told"
 
 
+def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
+    orders = {"gamma1": (0.9, 0.85, 0.95), "mu2": (1.0, 0.9, 1.1)}
+    better = OrderComparison("own", 1, {"y": 0.4}, {"y": 0.1}, orders, {"y": 3.0})
+    assert better.earns("y") is True
+    # However much better it is on its own run: unseen it is not, or nothing says so.
+    assert replace(better, gains={"y": 0.1}).earns("y") is False
+    assert replace(better, gains={"y": -3.0}).earns("y") is False
+    assert replace(better, gains={}).earns("y") is None
+    assert replace(better, is_degenerate=True).earns("y") is None
+    # An order that the run does not tell from a whole one is none, if it predicts no better.
+    whole = replace(better, orders={"gamma1": (0.98, 0.9, 1.1)}, gains={"y": 0.2})
+    assert whole.earns("y") is False
+    assert replace(whole, gains={"y": 3.0}).earns("y") is None
+    data = SimpleNamespace(panel=Panel((), (), (replace(better, is_degenerate=True),)), simulated=False)
+    claim = _claim_of_orders(data)
+    assert claim.verdict == "cannot be told"
+    assert "not told in 1 cases" in claim.evidence
+
+
 def test_verdicts_turn_when_the_numbers_do(reproduction):
     panel = reproduction.panel
     falling = {1: 4.0, 3: 3.0, 5: 2.0, 7: 1.0}
     trials = tuple(replace(t, errors=falling, convergence_steps=falling, nr=0.1, manual=0.2) for t in panel.trials)
     contests = tuple(replace(c, order_grid=dict.fromkeys(c.order_grid, 1e-9)) for c in panel.contests)
     freed = tuple(
-        replace(f, free_nr={o: 0.1 * v for o, v in f.integer_nr.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
+        replace(
+            f,
+            free_nr={o: 0.1 * v for o, v in f.integer_nr.items()},
+            orders={"gamma1": (0.9, 0.8, 0.95)},
+            gains=dict.fromkeys(f.integer_nr, 5.0),
+            is_degenerate=False,
+        )
         for f in panel.order_comparisons
     )
     stage = reproduction.stages[1]

@@ -66,6 +66,19 @@ def test_one_integral_of_any_order_is_the_batch_one(order):
     assert stream.coefficients["b"] == pytest.approx(truth["b"], rel=1e-12)
 
 
+def test_a_term_of_higher_order_than_the_output_is_streamed():
+    """Link 1 of the arm in Lagrange's form, as identify takes it: the truth comes out of a noise-free run."""
+    structure = ftlm.flexible_link(stage=1, laws=("orders",), coupling="measured")
+    structure = structure.with_orders({n: v for n, v in ORDERS.items() if n in structure.order_names})
+    run = rig.record(duration=5.0, parameters="linear", input="prbs", seed=5)
+    stream = Streaming(structure, step=run.step, longest=6.0, prior_covariance=1e10)
+    stream.push(samples(stream, run))
+    found, batched = stream.coefficients, batch(run, structure, prior_covariance=1e10)
+    for name in ("a1", "b1", "g1", "a2", "b2"):
+        assert found[name] == pytest.approx(structure.reference.get(name, -1.0), rel=0.01), name
+        assert found[name] == pytest.approx(batched[name], rel=0.01), name
+
+
 def test_fixed_coefficients_are_kept(run, stage):
     fixed = stage.equation("theta11").with_coefficients({"b1": -62.956})
     stream = Streaming(fixed, step=run.step, longest=5.0)

@@ -7,7 +7,7 @@ import math
 import platform
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Annotated, Any, Literal
 
@@ -18,8 +18,11 @@ from ftlm import _core
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.cli.framework import command, numbers, parse_numbers, print_text, show
 from ftlm.cli.options import Files, Force, Json, Number, ReadingOptions, Text, Texts, given_fields
-from ftlm.errors import ModelError
-from ftlm.estimation.linear import Streaming
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError, ModelError
+from ftlm.estimation.linear import Streaming, estimate_coefficients
+from ftlm.findings import Finding
+from ftlm.order_search.options import SearchSettings
 from ftlm.progress import Progress
 from ftlm.rig import recording as experiment
 from ftlm.rig.arm_parameters import ArmParameters
@@ -118,20 +121,37 @@ class LiveOptions:
                 raise ModelError(
                     f"--live {self.live!r} is not known; use flexible-link:1, flexible-link:2 or an equation"
                 )
-            # A stream integrates what passes; (15) would differentiate the hub angle more often than the deflection.
-            structure = flexible_link(stage=stage, form="published", laws=("orders",), coupling="measured")
+            structure = flexible_link(stage=stage, laws=("orders",), coupling="measured")
             if rig == "virtual":
                 arm = ArmParameters.of(parameters)
-                free = (arm.stage1 if stage == 1 else arm.stage2).orders(stage) | free
+                usual = (arm.stage1 if stage == 1 else arm.stage2).orders(stage)
+                free = {n: v for n, v in usual.items() if n in structure.order_names} | free
         else:
             structure = equation(self.live)
         return Streaming(
             structure.with_orders(free),
             step=1.0 / rate,
             longest=limit + 1.0,
-            innovation_length=7 if self.innovation_length is None else self.innovation_length,
-            prior_covariance=1.0 if self.prior_covariance is None else self.prior_covariance,
+            innovation_length=self.settings.innovation_length,
+            prior_covariance=self.settings.prior_covariance,
         )
+
+    @property
+    def settings(self) -> SearchSettings:
+        """Settings of the estimate after the last sample."""
+        given = {
+            n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance") and v is not None
+        }
+        return SearchSettings(row_basis="time", **given)
+
+    def findings(self, run: Run, stream: Streaming) -> list[Finding]:
+        """Return the findings on the estimate of a stream after a recorded run."""
+        try:
+            fit = estimate_coefficients([run], replace(stream.structure, initial="rest"), self.settings, stream.pulses)
+        except FtlmError:
+            # A run that was stopped early.
+            return []
+        return fit.findings
 
 
 @command
@@ -174,6 +194,8 @@ def record(
     low, high = parse_numbers("--band", band, 2)
     shift = None if offset is None else parse_numbers("--offset", offset, 2)
     stream = live.stream(rig, parameters, rate, limit)
+    if stream is not None:
+        print(f"live: {stream.structure}", file=sys.stderr)
     signals = SignalHandlers()
     try:
         signals.install()
@@ -213,6 +235,8 @@ def record(
         signals.restore()
     if stream is not None:
         print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
+        for finding in live.findings(run, stream):
+            print(f"! {finding}", file=sys.stderr)
     if as_json:
         told = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}
         print(json.dumps(told, indent=1, ensure_ascii=False))

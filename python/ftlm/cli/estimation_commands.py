@@ -58,6 +58,7 @@ from ftlm.estimation import consistency as parts_of_runs
 from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
 from ftlm.estimation.methods import OutputError, method_with_options
+from ftlm.estimation.order_ranking import with_verdict
 from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
@@ -199,7 +200,8 @@ def search(
         announce_time(Progress("", quiet=as_json), list(jobs.values()), kept)
         for number, (name, job) in enumerate(jobs.items()):
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
-                results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
+                found = run_job(replace(job, progress=progress), store=kept, number=number)
+            results[name] = with_verdict(found, runs, parts[name], settings, restrict_grid(every, parts[name]), m=m)
     show_searches(results, as_json=as_json)
 
 

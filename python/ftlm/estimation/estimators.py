@@ -19,7 +19,12 @@ from ftlm.estimation.confidence_intervals import Intervals, with_intervals
 from ftlm.estimation.fit import Fit, ProgressCallback, initial_terms_text, make_model, offset_setting
 from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_starts
 from ftlm.estimation.linear import estimate_coefficients, step_bias_findings
-from ftlm.estimation.model_checks import coefficient_law_findings, identifiability_findings, sample_findings
+from ftlm.estimation.model_checks import (
+    coefficient_law_findings,
+    identifiability_findings,
+    multistart_findings,
+    sample_findings,
+)
 from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_initial_conditions
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, Loss
@@ -208,6 +213,8 @@ def estimate_output_error(
         )
     course.advance_to(1.0)
     findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
+    if answers is None:
+        findings += multistart_findings(joint, problem, task.runs)
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = asked = replace(structure, initial="history")
@@ -251,10 +258,17 @@ def estimate_order_search(
     executor: Executor | None,
 ) -> Fit:
     """Search the orders on the order grid, then estimate the coefficients by the same linear method."""
-    method, structure = settings.coefficients, task.structure
     searches = (
-        run_order_searches(task, settings, m, threads, progress, store, executor) if structure.order_names else {}
+        run_order_searches(task, settings, m, threads, progress, store, executor) if task.structure.order_names else {}
     )
+    return fit_at_best_orders(task, settings, m, searches)
+
+
+def fit_at_best_orders(
+    task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
+) -> Fit:
+    """Estimate the coefficients at the best orders of searches by the linear method of the settings."""
+    method, structure = settings.coefficients, task.structure
     orders = {n: v for search in searches.values() for n, v in search.orders.items()}
     rank = 1
     if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
@@ -290,7 +304,7 @@ def estimate_order_search(
             *coefficient_law_findings(model),
             *(make_finding("on_edge", parameter=n, value=v) for n, v in edges),
         ],
-        searches,
+        dict(searches),
         errors,
     )
 

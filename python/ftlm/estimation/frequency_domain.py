@@ -17,6 +17,11 @@ from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.frequency_result import FrequencyIdentification
 from ftlm.estimation.levenberg_marquardt import LeastSquaresResult, constrained_least_squares
+from ftlm.estimation.model_checks import (
+    SAME_MODEL_POWER,
+    SECOND_OPTIMUM_LOG_LIKELIHOOD,
+    second_optimum_findings,
+)
 from ftlm.estimation.objective import covariance_of
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
@@ -34,6 +39,19 @@ from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 
 #: Smallest highest order of an equation, and smallest gap between it and the order of an own term.
 MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
+
+
+#: Largest exponent of a constant-phase element: that of a capacitor.
+MAX_EXPONENT = 1.0
+
+
+def exponent_bound(name: str) -> str:
+    """Description of the upper bound of an exponent in an impedance."""
+    return f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
+
+
+def _is_impedance(records: Sequence[FrequencyData]) -> bool:
+    return all(record.unit.endswith("Ω") for record in records)
 
 
 @dataclass(frozen=True)
@@ -54,12 +72,24 @@ class ResponseProblem:
     delays.
     """
 
-    def __init__(self, structure: Structure, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> None:
+    def __init__(
+        self,
+        structure: Structure,
+        records: Sequence[FrequencyData],
+        weights: Sequence[Floats],
+        *,
+        bound_exponents: bool = True,
+    ) -> None:
         self.structure = structure
         self.orders = structure.order_names
         self.coefficients = tuple(dict.fromkeys(structure.coefficient_names))
         self.delays = tuple(item.signal for item in structure.free_inputs)
         self.names = (*self.orders, *self.coefficients, *(item.name for item in structure.free_inputs))
+        #: Free orders of an impedance that the user gives no values. As exponents of constant-phase elements they are
+        #: at most 1; an order such as alpha + 0.5 may exceed it.
+        self.exponents = tuple(
+            n for n in self.orders if bound_exponents and n not in structure.order_values and _is_impedance(records)
+        )
         every = np.concatenate([r.frequency for r in records])
         self.unit = float(np.exp(np.mean(np.log(every))))
         self.records = [
@@ -227,6 +257,8 @@ class ResponseProblem:
             if name in self._place:
                 keep(Order(0.0, ((name, 1.0),)), values[-1], f"{name} is at most {values[-1]:g}")
                 keep(Order(0.0, ((name, 1.0),)), -values[0], f"{name} is from {values[0]:g} on", -1.0)
+        for name in self.exponents:
+            keep(Order(0.0, ((name, 1.0),)), MAX_EXPONENT, exponent_bound(name))
         for free in self.structure.free_inputs:
             for sign, end in ((1.0, free.bounds[1]), (-1.0, free.bounds[0])):
                 row = np.zeros(len(self.names))
@@ -245,7 +277,8 @@ class ResponseProblem:
                 out[name] = tuple(self.structure.order_values[name])
                 continue
             own = [e.order for e in self.structure.equations if name in e.order.names]
-            out[name] = (0.1, self._highest()) if own else (0.0, self._highest())
+            highest = MAX_EXPONENT if name in self.exponents else self._highest()
+            out[name] = (0.1, highest) if own else (0.0, highest)
         return out
 
     def _highest(self) -> float:
@@ -576,7 +609,7 @@ def identify_frequency(
             *duration_bounds(estimate_duration(0.007 * numbers**2 + 2e-6 * numbers * count, 1), DURATION_FACTOR_RANGE),
         )
     course = ShareTracker(progress)
-    rows, limits, words = problem.constraints()
+    words = problem.constraints()[2]
     PACKAGE_LOGGER.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
     # Starts race on no more frequencies than tell them apart; the best goes on with all.
@@ -601,17 +634,15 @@ def identify_frequency(
         f.cost <= first.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
     )
     # A last race from where the best ended, so that what a wall had cut goes on.
-    best = _fit(
-        problem,
-        problem.in_problem_units(racing.in_seconds(first.values)),
-        rows,
-        limits,
-        RESIDUAL_FLOOR_RATIO**2 * total,
-    )
+    best = _fit_again(problem, racing, first, total)
     if racing is problem and first.cost < best.cost:
         best = first
     course.advance_to(1.0)
     held = [words[k] for k in best.active_constraints]
+    at_limit = [n for n in problem.exponents if exponent_bound(n) in held]
+    if at_limit and not _is_bound_significant(problem, records, best, kind, RESIDUAL_FLOOR_RATIO**2 * total):
+        held = [text for text in held if text not in map(exponent_bound, at_limit)]
+    ends = [f if racing is problem else _fit_again(problem, racing, f, total) for f in _near_optima(fits, racing, kind)]
     result = _result(
         problem,
         records,
@@ -620,6 +651,7 @@ def identify_frequency(
         (reached, len(fits)),
         held,
         exact=best.cost <= NEGLIGIBLE_RESIDUAL_SHARE**2 * total,
+        ends=ends,
     )
     PACKAGE_LOGGER.info("identified: %s", result.verdict())
     for item in result.findings:
@@ -775,6 +807,47 @@ def _fit(problem: ResponseProblem, values: Floats, rows: Floats, limits: Floats,
     return constrained_least_squares(problem.residuals, cost, values, rows, limits, floor=floor)
 
 
+def _fit_again(
+    problem: ResponseProblem, other: ResponseProblem, end: LeastSquaresResult, total: float
+) -> LeastSquaresResult:
+    """Fit from the end of a fit of another problem with the same parameters."""
+    values = problem.in_problem_units(other.in_seconds(end.values))
+    return _fit(problem, values, *problem.constraints()[:2], RESIDUAL_FLOOR_RATIO**2 * total)
+
+
+def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) -> float:
+    """Return by how much the log likelihood falls from one sum of squares to a larger one."""
+    if kind == "deviation":
+        return (cost - best) / 2.0
+    return 0.5 * count * math.log(max(cost, 1e-300) / max(best, 1e-300))
+
+
+def _near_optima(fits: Sequence[LeastSquaresResult], problem: ResponseProblem, kind: str) -> list[LeastSquaresResult]:
+    """Return ends of the multistart that are nearly as likely as the best, one for each response."""
+    ranked = sorted(fits, key=lambda f: f.cost)
+    kept, seen = [], [problem.residuals(ranked[0].values, slopes=False)[0]]
+    for fit in ranked[1:]:
+        left = problem.residuals(fit.values, slopes=False)[0]
+        if _log_likelihood_difference(fit.cost, ranked[0].cost, kind, left.size) > SECOND_OPTIMUM_LOG_LIKELIHOOD:
+            break
+        # Elements that change places are one and the same model.
+        noise = ranked[0].cost / left.size
+        if all(float(np.sum((left - other) ** 2)) > SAME_MODEL_POWER * noise for other in seen):
+            kept.append(fit)
+            seen.append(left)
+    return kept
+
+
+def _is_bound_significant(
+    problem: ResponseProblem, records: Sequence[FrequencyData], best: LeastSquaresResult, kind: str, floor: float
+) -> bool:
+    """Whether exponents above their bound explain an impedance better than chance does, at 99 %."""
+    free = ResponseProblem(problem.structure, records, [r.weight for r in problem.records], bound_exponents=False)
+    beyond = _fit(free, best.values, *free.constraints()[:2], floor)
+    count = 2 * sum(r.frequency.size for r in problem.records)
+    return 2.0 * _log_likelihood_difference(best.cost, beyond.cost, kind, count) > chi_squared_99(1)
+
+
 def _result(
     problem: ResponseProblem,
     records: list[FrequencyData],
@@ -784,6 +857,7 @@ def _result(
     held: list[str],
     *,
     exact: bool,
+    ends: Sequence[LeastSquaresResult] = (),
 ) -> FrequencyIdentification:
     left, slopes = problem.residuals(best.values)
     steep = problem.slopes_in_seconds(best.values, slopes)
@@ -811,6 +885,11 @@ def _result(
     if not best.converged:
         findings.append(make_finding("response_not_converged"))
     findings += [make_finding("response_on_bound", bound=bound) for bound in held]
+    optima = [
+        (problem.in_seconds(end.values), _log_likelihood_difference(end.cost, best.cost, kind, left.size))
+        for end in ends
+    ]
+    findings += second_optimum_findings(problem.names, values, standard, optima)
     findings += _identifiability_findings(problem, values, standard)
     named = dict(zip(names, values.tolist(), strict=True))
     model = _model(problem, records, named, values, covariance, standard, findings)

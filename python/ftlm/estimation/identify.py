@@ -39,7 +39,8 @@ from ftlm.estimation.nuisance_parameters import (
 )
 from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification
-from ftlm.estimation.verdict import result_findings
+from ftlm.estimation.unstable_plants import WHOLE_RUN_CODES, unstable_plant_findings
+from ftlm.estimation.verdict import is_buried, result_findings
 from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
@@ -306,9 +307,18 @@ def assess_fit(fit: Fit) -> Identification:
     except DataError:
         # A run that is too short for correlations; everything else can be told.
         pass
+    plant = unstable_plant_findings(
+        fit, replace(model, estimate=_estimate(fit, comparison, None, ())), runs, comparison
+    )
+    if plant:
+        findings = [*plant, *(f for f in findings if f.code not in WHOLE_RUN_CODES)]
+    if any(f.code == "plant_unstable_in_pieces" for f in plant):
+        # The residuals of free runs that grow say nothing of the model.
+        tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is not None:
         findings = [_noise_finding(f, tests) for f in findings] + _residual_findings(fit, tests)
+        findings = [_coupling_finding(f, fit.task.structure) for f in findings]
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
     result = Identification(
@@ -331,9 +341,18 @@ def assess_fit(fit: Fit) -> Identification:
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
-    """Return residuals that are not white as colored noise, where they follow no input."""
+    """Return residuals that are not white as colored noise, and a poor fit as noise, where they follow no input."""
+    if item.code == "explains_little" and is_buried(tests.outputs[item.output]):
+        return make_finding("buried_in_noise", output=item.output, **item.numbers)
     colored = item.code == "residuals_not_white" and tests.outputs[item.output].is_noise
     return make_finding("noise_coloured", output=item.output) if colored else item
+
+
+def _coupling_finding(item: Finding, structure: Structure) -> Finding:
+    """Return residuals that follow an input that no equation reads as a coupling that the structure lacks."""
+    if item.code != "residuals_follow_input" or item.input in structure.signals:
+        return item
+    return msgspec.structs.replace(item, code="coupling_missing")
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from statistics import NormalDist
 
@@ -15,6 +15,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing
 from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
 from ftlm.estimation.result import Identification
 from ftlm.findings import Finding, make_finding, unique
@@ -53,6 +54,15 @@ MIN_MOTION_RANGE_FRACTION = 1e-6
 GROWTH_SIGMAS = NormalDist().inv_cdf(0.99)
 #: Fewest intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
 MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
+#: An end of the multistart is a second optimum if its log likelihood is smaller by no more than this, and a value
+#: differs by more than so many standard errors.
+SECOND_OPTIMUM_LOG_LIKELIHOOD, SECOND_OPTIMUM_ERRORS = 2.0, 3.0
+#: Largest sum of squared differences of the residuals of one and the same model, in units of their variance.
+SAME_MODEL_POWER = 1e-2
+#: Largest coarse cost of a candidate that may end in a second optimum, relative to the best.
+MAX_SECOND_COST_RATIO = 1.05
+#: Largest number of evaluations from a candidate to its optimum.
+MAX_SECOND_EVALUATIONS = 60
 #: Largest relative deviation of two coefficients from the coefficient law.
 MAX_LAW_DEVIATION = 0.05
 
@@ -96,6 +106,63 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
     findings += correlation_findings(joint) + unbounded_interval_findings(joint, unseen)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
     return [*findings, *(make_finding("residuals_not_white", output=output) for output in coloured)]
+
+
+def second_optimum_findings(
+    names: Sequence[str], values: Floats, errors: Mapping[str, float], optima: Sequence[tuple[Floats, float]]
+) -> list[Finding]:
+    """Return a finding on the most likely other optimum at values over three standard errors apart.
+
+    Each optimum comes with the fall of the log likelihood.
+    """
+    for other, fall in sorted(optima, key=lambda pair: pair[1]):
+        if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:
+            break
+        apart = [
+            f"{n} = {there:.4g} for {here:.4g}"
+            for n, here, there in zip(names, values.tolist(), other.tolist(), strict=True)
+            if math.isfinite(errors[n]) and abs(there - here) > SECOND_OPTIMUM_ERRORS * errors[n]
+        ]
+        if apart:
+            moved = ", ".join(text.partition(" = ")[0] for text in apart)
+            return [make_finding("second_optimum", parameter=moved, shown=", ".join(apart), difference=max(fall, 0.0))]
+    return []
+
+
+def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> list[Finding]:
+    """Return a finding on a second optimum among the best candidates of the multistart, fitted to all samples."""
+    errors = [joint.standard_errors[n] for n in joint.names]
+    best_cost = min((cost for cost, _ in joint.survivors), default=0.0)
+    far = [
+        np.array(values)
+        for cost, values in joint.survivors
+        if cost <= MAX_SECOND_COST_RATIO * best_cost
+        and any(
+            math.isfinite(e) and abs(b - a) > SECOND_OPTIMUM_ERRORS * e
+            for a, b, e in zip(joint.values.tolist(), values, errors, strict=True)
+        )
+    ]
+    if not far or joint.robust is not None or problem.structure.has_friction:
+        return []
+    weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
+    grid = Objective(problem, runs, weights, every=joint.refinement)
+
+    def fit(values: Floats) -> tuple[Floats, float, Floats]:
+        orders, coefficients, inputs = problem.split(values.tolist())
+        end = grid.minimize(Iterate(orders, coefficients, "second optimum", {}, inputs), MAX_SECOND_EVALUATIONS)
+        return end.values, float(end.outcome["cost"]), np.asarray(end.outcome["residuals"])
+
+    optima = []
+    try:
+        _, cost, residuals = fit(joint.values)
+        for values in far:
+            other, there, left = fit(values)
+            if float(np.sum((left - residuals) ** 2)) > SAME_MODEL_POWER:
+                optima.append((other, there - cost))
+    except FtlmError:
+        # No finite simulation on the way.
+        return []
+    return second_optimum_findings(joint.names, joint.values, joint.standard_errors, optima)
 
 
 def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:

@@ -151,6 +151,8 @@ class JointFit:
         cost, or the path left the range that the grid can represent.
     starts
         Coarse cost (per residual) and origin of every initial guess, best first.
+    survivors
+        Coarse cost (per residual) and parameters of the distinct best candidates of the multistart.
     residuals
         Residuals in noise standard deviations by run and output; NaN for missing samples.
     products
@@ -193,6 +195,7 @@ class JointFit:
     robust_weights: Sequence[Floats] | None = field(default=None, repr=False)
     finest_grid_values: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     origin: str = "the start that was given"
+    survivors: Sequence[tuple[float, Sequence[float]]] = field(default=(), repr=False)
     profiles: Mapping[str, ProfileInterval] = field(default_factory=dict)
     unstable_optimum: UnstableOptimum | None = None
 
@@ -367,6 +370,7 @@ def fit_output_error(
         step_converged=found["settled"],
         converged=found["status"] == "converged",
         starts=found["starts"],
+        survivors=found["survivors"],
         initial=structure.initial,
         initial_terms=found["initial_terms"],
         unstable_optimum=None if found["growth"] is None else UnstableOptimum(*found["growth"]),

@@ -21,7 +21,7 @@ from ftlm.model.model import Estimate, Model
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import MAX_FIT_DROP_POINTS, MAX_NORMALIZED_RESIDUAL, Comparison, Metrics
-from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO
+from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO, OutputResiduals
 
 TRUST_LEVEL = "trust"
 #: Largest relative standard error of a well-determined coefficient, and largest standard error of an order. Half the 95
@@ -29,7 +29,11 @@ TRUST_LEVEL = "trust"
 MAX_COEFFICIENT_ERROR_RATIO, MAX_ORDER_ERROR = 0.5, 0.25
 #: Limits of the validation loss: ratio to the estimation loss, and percentage below which the ratio does not matter.
 VALIDATION_LOSS_LIMITS = ((3.0, 10.0), (5.0, 5.0))
+#: NR below which a model explains something of an output that noise buries.
+MAX_BURIED_RESIDUAL = 0.99
 UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
+#: Findings on an unstable plant: simulations of whole runs do not judge its model.
+UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 #: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by
 #: rounding alone, and a parameter may be uncertain, but not by much.
 RULED_TOPICS = ("residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
@@ -114,8 +118,9 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
 
     Findings of weight that no rule covers count in the order of :data:`ftlm.findings.FINDING_TOPICS`.
     """
-    runs = () if validation is None else (validation,)
-    tried = validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
+    unstable = any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
+    runs = () if validation is None or unstable else (validation,)
+    tried = bool(runs) and validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
     against = _combined_verdict([*result_findings(result)], result.fit_percent, runs, tried)
     if against is not None:
         return against
@@ -129,7 +134,8 @@ def _combined_verdict(
     own: Sequence[Finding], before: Mapping[str, float], runs: Sequence[Comparison], tried: bool
 ) -> Verdict | None:
     """Return the verdict from all findings, by itself and on other runs; None without findings."""
-    found = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison)]
+    buried = [f.output for f in own if f.code == "buried_in_noise"]
+    found = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
     found += [f for comparison in runs for f in _validation_losses(before, comparison)]
     own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
     return verdict_from([*own_first, *found, *own, *([] if tried else [make_finding("not_validated")])])
@@ -146,7 +152,10 @@ def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Return the verdict on a saved model, from its file and from comparisons with runs."""
-    known, own = model.estimate, [*_unstable_poles(model)]
+    known = model.estimate
+    unstable = known is not None and any(f.code in UNSTABLE_PLANT_CODES for f in known.findings or ())
+    own = [] if unstable else [*_unstable_poles(model)]
+    validation = () if unstable else validation
     if known is None:
         own.append(make_finding("origin_unknown"))
         judged = _combined_verdict(own, {}, validation, True)
@@ -212,12 +221,18 @@ def _against_result(result: Identification) -> Iterator[Finding]:
 
 
 def _free_runs(result: Identification) -> Iterator[Finding]:
-    """Yield findings about simulations: overflow, instability and poor fit."""
+    """Yield findings about simulations: overflow, instability, poor fit, an unstable plant."""
+    plant = [f for f in result.findings if f.code in UNSTABLE_PLANT_CODES]
+    yield from plant
+    if plant and plant[0].code != "plant_needs_pieces":
+        return
     lost = [o for o, f in result.output_error.items() if not math.isfinite(f.nr)]
     if lost:
         yield make_finding("out_of_range", output=", ".join(lost))
     yield from _unstable_poles(result.model)
-    yield from _poor_fits("", result.comparison)
+    buried = [f for f in result.findings if f.code == "buried_in_noise"]
+    yield from _poor_fits("", result.comparison, [f.output for f in buried])
+    yield from buried
 
 
 def _unstable_poles(model: Model) -> Iterator[Finding]:
@@ -245,13 +260,23 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
             return
 
 
-def _poor_fits(where: str, comparison: Comparison) -> Iterator[Finding]:
+def is_buried(residuals: OutputResiduals) -> bool:
+    """Whether the residuals of an output are white or colored noise in which nothing of the inputs is left.
+
+    A model that says nothing passes too where nothing of the input is in the output: it must explain something.
+    """
+    moving = [t for t in residuals.informative_tests.values() if t.conclusive]
+    explained = residuals.nr < MAX_BURIED_RESIDUAL
+    return explained and residuals.whiteness.passed and bool(moving) and all(t.passed for t in moving)
+
+
+def _poor_fits(where: str, comparison: Comparison, buried: Sequence[str] = ()) -> Iterator[Finding]:
     """Yield outputs that the simulation explains by less than half, over all runs or on one.
 
     Each run is tested too, because a large run hides a small one.
     """
     for run, errors in _each(comparison):
-        useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL]
+        useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in buried]
         if useless:
             shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in useless)
             yield make_finding("poor_fit", run=run, output=", ".join(useless), where=where, shown=shown)
@@ -289,17 +314,23 @@ def _validation_losses(before: Mapping[str, float], validation: Comparison) -> I
 def _residuals(result: Identification) -> Iterator[Finding]:
     """Yield findings of residual tests: feedback, dependence on an input, color."""
     if result.residuals is None:
-        yield make_finding("too_short_for_tests")
+        if not any(f.code == "plant_unstable_in_pieces" for f in result.findings):
+            yield make_finding("too_short_for_tests")
         return
     looped = "reference" in result.settings
     judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
     # A model that is wrong leaves what a periodic input repeats, which looks like a loop: first what it lacks.
-    following = {o: [s for s, t in r.informative_tests.items() if t.failed] for o, r in judged.items()}
+    coupled = [f for f in result.findings if f.code == "coupling_missing" and f.output in judged]
+    unread = {(f.output, f.input) for f in coupled}
+    following = {
+        o: [s for s, t in r.informative_tests.items() if t.failed and (o, s) not in unread] for o, r in judged.items()
+    }
     following = {o: signals for o, signals in following.items() if signals}
     if following:
         shown = ", ".join(f"{o} still follow {join_names(signals)}" for o, signals in following.items())
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
         yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
+    yield from coupled
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]

@@ -21,7 +21,7 @@ from ftlm.experiment_design.problem import Bounds, Criterion, Kind, per_signal_v
 from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
 from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
 from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
-from ftlm.findings import NOT_WHITE_CODES, Finding, make_finding
+from ftlm.findings import LEFT_OUT_CODES, NOT_WHITE_CODES, Finding, make_finding
 from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
@@ -396,12 +396,13 @@ def _check_arguments(
             f"{setting('period')} {period:g} s is not between two steps and twice the run; give another one"
         )
     said = () if solved.estimate is None or solved.estimate.findings is UNSET else solved.estimate.findings
+    doubt = next((f for f in said if f.code in LEFT_OUT_CODES), None)
     colour = next((f for f in said if f.code in NOT_WHITE_CODES), None)
-    words = (
-        ()
-        if colour is None or noise is not None
-        else (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
-    )
+    words: tuple[Finding, ...] = ()
+    if doubt is not None:
+        words = (make_finding("prediction_in_doubt", output=doubt.output, text=doubt.text),)
+    elif colour is not None and noise is None:
+        words = (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
     return DesignTask(
         laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words
     )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.errors import ModelError
+from ftlm.errors import FtlmError, ModelError
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import OrderCertificate
-from ftlm.order_search.search import Job, make_job
+from ftlm.order_search.search import Job, make_job, run_job
 from ftlm.simulation.discretization import named_signals
 from ftlm.structure.equation import Equation
 from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
@@ -48,7 +51,7 @@ def certify_orders(
     Branch and bound halves boxes of orders until each has a lower bound of the RMS equation error, with the best
     coefficients of each of its orders, of at least the best one found times ``1 - tolerance``. The certificate covers
     squared equation errors, equations at rest, and free coefficients only. No such certificate is known for
-    simulations.
+    simulations: a finding says where the free run of the best orders grows or explains little of the output.
 
     Parameters
     ----------
@@ -179,6 +182,7 @@ def certify_job(
     values = [found["alpha"], *found["orders"]] if found["orders"] else []
     names = [item.order, *(t.order for t in item.terms)]
     orders = {o.names[0]: v for o, v in zip(names, values, strict=False) if o.names}
+    nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)
     return OrderCertificate(
         found["at_least"],
         found["best"],
@@ -190,7 +194,23 @@ def certify_job(
         found["cells"],
         found["open"],
         record.m,
+        nr,
+        unstable,
     )
+
+
+def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
+    """Return NR of the free run of some orders, infinite if there is none, and the number of unstable poles."""
+    settings = SearchSettings(**{**CERTIFIED_SETTINGS, "criterion": "output-error", "pruning": False})
+    values = {name: (orders[name],) for name in job.values}
+    try:
+        found = run_job(replace(job, values=values, settings=settings, progress=None))
+    except FtlmError:
+        # No candidate has a finite score.
+        return math.inf, math.nan
+    with contextlib.suppress(FtlmError):
+        return found.score / job.standard_deviations()[0], found.model.stability().unstable_poles
+    return found.score / job.standard_deviations()[0], math.nan
 
 
 def _search_region(

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
-from ftlm.findings import Finding, make_finding
+from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding, unique
 from ftlm.model.model import Model
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, number, symbol, symbol_html
-from ftlm.utils.parameters import parameter
+from ftlm.utils.parameters import choose_text, parameter
+
+if TYPE_CHECKING:
+    from ftlm.estimation.verdict import Verdict
+
+#: NR of a free run above which it explains little of the output.
+MAX_FREE_RUN_NR = 0.5
+#: Relative difference below which scores and coefficients of two rows are those of one model.
+SAME_MODEL_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -42,6 +50,12 @@ class OrderCertificate:
         Number of boxes whose bound misses the requested tolerance, too small to be halved or beyond the maximum.
     m
         Block pulses per run.
+    free_run_nr
+        RMS of the output minus the free run of the best orders, relative to the standard deviation of the output, with
+        the coefficients of least equation error; infinite if the free run leaves the range of numbers. The certificate
+        bounds the equation error alone.
+    unstable_poles
+        Number of poles of that model with a positive real part; NaN if it is not known.
     """
 
     lower_bound: float
@@ -54,6 +68,17 @@ class OrderCertificate:
     cells: int
     open_cells: int
     m: int
+    free_run_nr: float = math.nan
+    unstable_poles: float = math.nan
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings on the free run of the best orders, which no certificate of the equation error bounds."""
+        if self.unstable_poles > 0:
+            return (make_finding("certified_run_grows", poles=int(self.unstable_poles), nr=self.free_run_nr),)
+        if self.free_run_nr > MAX_FREE_RUN_NR:
+            return (make_finding("certified_run_fails", nr=self.free_run_nr),)
+        return ()
 
     @property
     def proved_tolerance(self) -> float:
@@ -74,9 +99,15 @@ class OrderCertificate:
             "cells": self.cells,
             "open_cells": self.open_cells,
             "m": self.m,
+            "free_run_nr": self.free_run_nr if math.isfinite(self.free_run_nr) else None,
+            "findings": [f.to_dict() for f in self.findings],
         }
 
     def __str__(self) -> str:
+        return "\n".join([self._bound_text, *(f"! {f}; {f.remedy}" for f in self.findings)])
+
+    @property
+    def _bound_text(self) -> str:
         intervals = ", ".join(f"{n} from {low:g} to {high:g}" for n, (low, high) in self.intervals.items())
         separation = f"{self.min_separation:g}"
         apart = f"orders of the output {separation} below its highest, of one signal {separation} apart"
@@ -156,6 +187,9 @@ class SearchResult:
         Orders of the first row at an end of their interval, by name.
     excluded_by_box
         Number of candidates under "bound" that were excluded with a whole box of orders.
+    verdict, model_findings
+        Verdict and findings of :func:`ftlm.identify` at the orders of rank 1; None and empty for a search resumed from
+        a checkpoint file, which keeps no runs.
     """
 
     table: list[SearchRow]
@@ -167,6 +201,8 @@ class SearchResult:
     settings: dict[str, Any]
     at_grid_edge: dict[str, float]
     excluded_by_box: int = 0
+    verdict: Verdict | None = field(default=None, compare=False)
+    model_findings: tuple[Finding, ...] = field(default=(), compare=False)
 
     @property
     def orders(self) -> dict[str, float]:
@@ -210,25 +246,82 @@ class SearchResult:
             "table": [dict(vars(row)) for row in self.table],
             "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
             "at_grid_edge": self.at_grid_edge,
-        }
+        } | self._judgement_dict()
+
+    def _judgement_dict(self) -> dict[str, Any]:
+        """Return verdict and findings for JSON; empty for a search without a verdict."""
+        if self.verdict is None:
+            return {}
+        return {"verdict": self.verdict.to_dict(), "findings": [f.to_dict() for f in self.findings]}
+
+    @property
+    def distinct_rows(self) -> list[tuple[SearchRow, int]]:
+        """Rows that are different models, each with the number of kept rows that are the same model.
+
+        If all orders are free, adding one number to each leaves the equation of a run from rest as it is.
+        """
+        distinct: list[tuple[SearchRow, int]] = []
+        for row in self.table:
+            at = next((k for k, (other, _) in enumerate(distinct) if _is_same_model(row, other)), None)
+            if at is None:
+                distinct.append((row, 1))
+            else:
+                distinct[at] = (distinct[at][0], distinct[at][1] + 1)
+        return distinct
+
+    @property
+    def search_findings(self) -> tuple[Finding, ...]:
+        """Findings on the table: orders on the edge of their interval, and rows that are one model."""
+        edges = [make_finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
+        distinct, rows = len(self.distinct_rows), len(self.table)
+        if distinct == rows:
+            return tuple(edges)
+        return (*edges, make_finding("rows_repeat", rows=rows, models=distinct, plural="s" if distinct > 1 else ""))
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the best orders: those on the edge of their interval."""
-        return tuple(make_finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items())
+        """Findings on the table and on the model of rank 1."""
+        return unique([*self.search_findings, *(f for f in self.model_findings if f.code != "on_edge")])
 
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)
         what = "error" if self.settings["norm"] == "l1" else "RMSE"
         head = f"{'rank':>4}{what:>12}" + "".join(f"{n:>9}" for n in names) + "".join(f"{n:>12}" for n in coefficients)
         lines = [head]
-        for row in self.table:
+        for row, count in self.distinct_rows:
             orders = "".join(f"{row.orders[n]:>9.5g}" for n in names)
             values = "".join(f"{row.coefficients[n]:>12.5g}" for n in coefficients)
-            lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}")
+            more = f"  (and {count - 1} more row{'s' if count > 2 else ''})" if count > 1 else ""
+            lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}{more}")
         lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.excluded_summary}")
-        lines += [f"warning: {f}" for f in self.findings]
-        return "\n".join(lines)
+        if self.verdict is not None:
+            lines.append(f"rank 1: {self.verdict}")
+        of_table = [f for f in self.findings if f.kind.topic == "search"]
+        of_model = [f for f in self.findings if f.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) and f not in of_table]
+        lines += [f"! {g.first_finding}{g.count}" for g in group_findings(of_model)] + [f"! {f}" for f in of_table]
+        return "\n".join([*lines, f"next: {self.next_step}"])
+
+    @property
+    def next_step(self) -> str:
+        """Call or remedy that follows the search."""
+        if self.verdict is None:
+            return choose_text(
+                "search_orders(…) with the runs and this store, which judges rank 1",
+                "the ftlm search command with its files and this store, which judges rank 1",
+            )
+        if self.verdict.level == LEVEL_DO_NOT_USE and self.verdict.remedy:
+            return self.verdict.remedy
+        return choose_text(
+            "identify(runs, equation), which estimates orders between those of the grid with their intervals",
+            "ftlm identify with the same FILE and --structure, which estimates orders between those of the grid with "
+            "their intervals",
+        )
+
+
+def _is_same_model(row: SearchRow, other: SearchRow) -> bool:
+    """Whether score and coefficients of two rows are the same to rounding."""
+    pairs = [(row.score, other.score), *((v, other.coefficients[n]) for n, v in row.coefficients.items())]
+    return all(math.isclose(a, b, rel_tol=SAME_MODEL_TOLERANCE) for a, b in pairs)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from ftlm.order_search.batches import (
     search_equation,
 )
 from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
-from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import (
@@ -135,12 +135,12 @@ class Job:
             axes=[list(self.values[n]) for n in names],
             laws=laws,
             fixed=[[t.fixed for t in e.terms] for e in structure.equations],
-            scales=[s * points if self.settings.norm == "l1" else s for s in self._standard_deviations(points)],
+            scales=[s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()],
         )
 
-    def _standard_deviations(self, points: int) -> list[float]:
+    def standard_deviations(self) -> list[float]:
         """Standard deviation of each output, by which the scores of the equations are weighted."""
-        spreads = []
+        points, spreads = sum(r.m for r in self.records), []
         for output in self.structure.outputs:
             with np.errstate(over="ignore", invalid="ignore"):
                 squares = sum(float(((r.of(output) - r.of(output).mean()) ** 2).sum()) for r in self.records)
@@ -236,109 +236,23 @@ def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core.
     return SearchResult(table, model, counts["candidates"], pruned, failures, m, settings.to_dict(), edges, boxed)
 
 
-@check_arguments
-def search_orders(
+def rank_orders(
     runs: Run | Sequence[Run],
     equation: Structure,
     order_grid: OrderGrid | None = None,
     *,
-    criterion: Criterion = "output-error",
-    coefficients: Coefficients = "multi-innovation",
-    norm: Norm = "l1",
-    innovation_length: int = 7,
-    prior_covariance: float = 1.0,
-    row_basis: RowBasis = "haar",
     m: int | None = None,
-    top: int = 20,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    pruning: bool = True,
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
+    **settings: Any,
 ) -> SearchResult:
-    """Search the orders of an equation, or of coupled equations under an order law, exhaustively over a grid.
-
-    Each candidate gets coefficients from the equation error, then a score. The table equals that of a full evaluation
-    of every candidate, bit for bit for any number of threads on one kind of processor (paper Table 2, steps 5-7).
-
-    Parameters
-    ----------
-    runs
-        One run or several with the same names and units; scores add up.
-    equation
-        Structure with free orders; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
-    order_grid
-        Intervals and step; see :func:`ftlm.lattice`.
-    criterion
-        ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
-        measured signals on the right-hand side; it prefers near-identities.
-    coefficients
-        ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``:
-        refined instrumental variables for every candidate, which noise on the outputs does not bias. Measured outputs
-        that drive an equation are replaced by their projections on what the inputs excite, as instruments and in the
-        score.
-    norm
-        ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
-    innovation_length, prior_covariance, row_basis
-        p and K0 of paper (43)-(44), and whether rows come in Haar coordinates (``"haar"``) or in the order of time
-        (``"time"``). Of ``"multi-innovation"`` alone; with other coefficients a change of them is refused.
-    m
-        Block pulses a run; default 2 048, or what the runs carry.
-    top
-        Rows of the table.
-    threads
-        Threads; default all cores.
-    progress
-        Called about twenty times a second with (candidates done, candidates in all).
-    pruning
-        Whether to leave a candidate once it cannot be kept, by a proved bound of its score or by its partial sum;
-        False is brute force, with the same table.
-    store
-        File in which finished work is kept, on disk within a second; the same call goes on with it after a power cut,
-        and so does :func:`resume_search`.
-    executor
-        Any :class:`concurrent.futures.Executor` to work for this search: threads, processes, or a cluster's, such as
-        ``dask.distributed.Client(…).get_executor()``. The result is the same to the last bit on processors of one kind.
-        `threads` are those of one task then, one by default.
-
-    Returns
-    -------
-    SearchResult
-        Table, best model and counts.
-
-    Raises
-    ------
-    DataError
-        Runs that do not fit, or a constant output; a store of another search, in use, damaged, or that cannot be
-        written.
-    ModelError
-        Nothing to search, a lattice without or with too many candidates, settings out of range, an option that these
-        coefficients do not use; what needs more memory than the machine has left, or than ``FTLM_MEMORY`` allows.
-    ConvergenceError
-        An executor that has lost its workers.
-    KeyboardInterrupt
-        Ctrl-C, within half a second.
-
-    Notes
-    -----
-    One Gram matrix of distinct regressors serves all candidates. Each costs a k x k solve and a lower bound of its
-    score from a few inner products. Candidates that the bound does not exclude are simulated, likely ones first, until
-    their partial sum exceeds the threshold. Candidates are generated by index, so memory does not grow with their
-    number.
-    """
-    settings = SearchSettings(
-        criterion=criterion,
-        norm=norm,
-        coefficients=coefficients,
-        innovation_length=innovation_length,
-        prior_covariance=prior_covariance,
-        row_basis=row_basis,
-        top=top,
-        pruning=pruning,
-    )
+    """Return the table of an order search without a verdict; see :func:`ftlm.search_orders`."""
+    chosen = SearchSettings(**settings)
     check_executor(executor)
     job = make_job(
-        runs, equation, order_grid, settings, m=m, threads=threads_per_task(threads, executor), progress=progress
+        runs, equation, order_grid, chosen, m=m, threads=threads_per_task(threads, executor), progress=progress
     )
     if store is None:
         return run_job(job, executor=executor)
@@ -547,7 +461,7 @@ def landscape(
         raise ModelError(f"a landscape needs two different orders with several values each; this lattice has {free}")
     x, y = (np.array(axes[n]) for n in names)
     fixed = structure.with_orders({n: v for n, v in best.items() if n not in names})
-    table = search_orders(
+    table = rank_orders(
         runs,
         fixed,
         OrderGrid(orders={names[0]: x.tolist(), names[1]: y.tolist()}),

@@ -573,16 +573,11 @@ def _claim_of_the_manual(found: ReproductionData) -> Claim:
 
 def _claim_of_orders(found: ReproductionData) -> Claim:
     freed = found.panel.order_comparisons
-    cases = [
-        case(
-            f.free_nr[o] < (1 - MIN_RELATIVE_DIFFERENCE) * f.integer_nr[o] and bool(f.fractional_orders),
-            the_arm=f.arm,
-            the_angle=symbol(o),
-        )
-        for f in freed
-        for o in f.free_nr
-    ]
-    ruling = combine_cases(cases, of_the_machine=found.simulated)
+    known = [(f, o, earns) for f in freed for o in f.free_nr if (earns := f.earns(o)) is not None]
+    ruling = combine_cases(
+        [case(earns, the_arm=f.arm, the_angle=symbol(o)) for f, o, earns in known], of_the_machine=found.simulated
+    )
+    open_cases = sum(len(f.free_nr) for f in freed) - len(known)
     each = [f"{f.arm}: {numbers_by_angle({o: (f.integer_nr[o], f.free_nr[o]) for o in f.free_nr}, 3)}" for f in freed]
     rubbing = [
         f"{symbol(n)} = {f.orders[n][0]:.3g}"
@@ -596,7 +591,9 @@ def _claim_of_orders(found: ReproductionData) -> Claim:
         "Fractional orders describe the arm better than whole ones.",
         ruling,
         _case_counts(ruling),
-        "(14)–(15) with whole and with free orders, both by output error from the current alone; NR of both: "
+        "(14)–(15) with whole and with free orders, both by output error from the current alone, on runs that neither "
+        f"was fitted to, by the rule of ftlm orders; not told in {open_cases} cases, where a fit must not be used or "
+        "the rule is inconclusive. NR of both on their own run: "
         f"{'; '.join(each)}. Orders whose 95 % interval excludes the whole one: {'; '.join(away)}. {feigned}"
         "Measured runs decide: ftlm orders.",
     )

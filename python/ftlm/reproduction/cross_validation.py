@@ -13,6 +13,7 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.result import Identification
+from ftlm.findings import LEVEL_DO_NOT_USE
 from ftlm.progress import Progress
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run
 from ftlm.structure.structure import Structure
@@ -158,7 +159,9 @@ class Deflection:
         told = self.intervals(kind)
         whole = {name: WHOLE_ORDERS[name.rstrip("0123456789")] for name in told}
         worse = self.worse(kind)
-        complete = not worse and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
+        degenerate = [r for r, f in self.fits[kind].items() if is_degenerate(f.result)]
+        degenerate += [r for r, f in self.fits[INTEGER_KIND].items() if is_degenerate(f.result) and r not in degenerate]
+        complete = not worse and not degenerate and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
         earns = improves_prediction(list(self.gains(kind).values()), told, whole) if complete else None
         before, after = (
             {
@@ -177,7 +180,14 @@ class Deflection:
             words += " The runs contradict each other."
         if worse:
             words += f" On {', '.join(worse)} it fits worse than the whole orders that it contains: no optimum found."
+        if degenerate:
+            words += f" On {', '.join(degenerate)} one of the two fits must not be used, so nothing follows from it."
         return Verdict(kind, earns, words)
+
+
+def is_degenerate(result: Identification) -> bool:
+    """Whether a fit must not be used by itself, so that no comparison with it says anything."""
+    return result.verdict().level == LEVEL_DO_NOT_USE
 
 
 def have_common_value(intervals: Any) -> bool:

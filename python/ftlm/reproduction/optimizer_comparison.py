@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,9 @@ from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.result import Identification
 from ftlm.order_search.result import SearchResult
-from ftlm.order_search.search import search_orders
+from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.cross_validation import improves_prediction, is_degenerate
 from ftlm.reproduction.published_values import INNOVATION_LENGTHS
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
 from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, RIVAL_ALPHA, TRACE_EVERY, Stage
@@ -91,7 +92,7 @@ def compare_optimizers(
     # Reference values of a structure would inform the bounds.
     blind = replace(single, reference={})
     searches = {
-        prior: search_orders(
+        prior: rank_orders(
             run,
             blind,
             order_grid,
@@ -215,6 +216,10 @@ class OrderComparison:
         NR of the output error by angle, with integer and with free orders.
     orders
         Estimate and 95 % interval of every free order.
+    gains
+        Gain in fit of the free orders on a run that neither was fitted to, by angle [percentage points].
+    is_degenerate
+        Whether one of the two fits must not be used, so that nothing follows from the comparison.
     """
 
     arm: str
@@ -222,6 +227,15 @@ class OrderComparison:
     integer_nr: dict[str, float]
     free_nr: dict[str, float]
     orders: dict[str, tuple[float, float, float]]
+    gains: dict[str, float] = field(default_factory=dict)
+    is_degenerate: bool = False
+
+    def earns(self, output: str) -> bool | None:
+        """Whether free orders earn their place on an angle by the rule of ``ftlm orders``; None if it is not known."""
+        if self.is_degenerate or output not in self.gains:
+            return None
+        intervals = {n: {self.arm: (low, high)} for n, (_, low, high) in self.orders.items()}
+        return improves_prediction([self.gains[output]], intervals, {n: integer_order(n) for n in self.orders})
 
     @property
     def fractional_orders(self) -> list[str]:
@@ -237,6 +251,9 @@ class OrderComparison:
             "free nr": {n: finite(v) for n, v in self.free_nr.items()},
             "orders": {n: list(map(finite, v)) for n, v in self.orders.items()},
             "not whole": self.fractional_orders,
+            "gain on another run": {n: finite(v) for n, v in self.gains.items()},
+            "degenerate": self.is_degenerate,
+            "earns": {n: self.earns(n) for n in self.free_nr},
         }
 
 
@@ -294,7 +311,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
         single = structure.equation(output)
         for prior in PRIOR_COVARIANCES:
             best = {
-                p: search_orders(
+                p: rank_orders(
                     run,
                     single,
                     OrderGrid(increment=PANEL_STEP),
@@ -341,8 +358,12 @@ def compare_orders(
     arm: str,
     threads: int | None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    unseen: Run | None = None,
 ) -> OrderComparison:
     """Fit integer and free orders of one stage of a simulated arm, which starts at rest, on a decimated run.
+
+    Both are compared on an unseen run, if there is one.
 
     Raises
     ------
@@ -358,14 +379,31 @@ def compare_orders(
         fits = [identify(run, item, threads=threads, progress=progress) for item in (whole, structure)]
     m = default_m([own], power_of_two=True)
     coarse, fine = (compare_means(replace(fit.model, m=m), own) for fit in fits)
-    return _order_comparison(arm, stage, coarse, fine, fits[1])
+    others = None
+    if unseen is not None:
+        other = unseen.select(list(structure.signals))
+        others = tuple(compare_means(replace(fit.model, m=m), other) for fit in fits)
+    return _order_comparison(arm, stage, (coarse, fine), others, fits)
 
 
 def _order_comparison(
-    arm: str, stage: int, whole: Comparison, free: Comparison, fit: Identification
+    arm: str,
+    stage: int,
+    seen: tuple[Comparison, Comparison],
+    unseen: tuple[Comparison, ...] | None,
+    fits: Sequence[Identification | None],
 ) -> OrderComparison:
-    nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in (whole, free))
-    return OrderComparison(arm, stage, nr, free_nr, {n: (v, *fit.intervals[n]) for n, v in fit.orders.items()})
+    """Return the comparison of whole and free orders, in this order."""
+    nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in seen)
+    free = fits[1]
+    assert free is not None
+    gains = {}
+    if unseen is not None:
+        before, after = (c.fit_percent for c in unseen)
+        gains = {o: after[o] - before[o] for o in nr if math.isfinite(after[o] - before[o])}
+    degenerate = any(fit is None or is_degenerate(fit) for fit in fits)
+    orders = {n: (v, *free.intervals[n]) for n, v in free.orders.items()}
+    return OrderComparison(arm, stage, nr, free_nr, orders, gains, degenerate)
 
 
 def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads: int | None) -> Panel:
@@ -392,7 +430,10 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
             )
         whole, free = (stage.candidates[n] for n in ("integer, identified", "output error"))
         if free.result is not None and free.result.fit is not None:
-            freed.append(_order_comparison(arm, stage.number, whole.estimation, free.estimation, free.result))
+            both = (whole.validation, free.validation)
+            unseen = None if both[0] is None or both[1] is None else (both[0], both[1])
+            seen = (whole.estimation, free.estimation)
+            freed.append(_order_comparison(arm, stage.number, seen, unseen, (whole.result, free.result)))
     return Panel(tuple(trials), tuple(contests), tuple(freed))
 
 
@@ -432,5 +473,6 @@ def simulated_panel(
             )
             contests.append(contest(made, output, arm, order_grid.increment))
         begin("freed")
-        freed.append(compare_orders(stage, run, arm, threads, progress))
+        unseen = demo_run("sine", noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
+        freed.append(compare_orders(stage, run, arm, threads, progress, unseen=unseen))
     return Panel(tuple(trials), tuple(contests), tuple(freed))

@@ -13,7 +13,7 @@ from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
 from ftlm.model.model import Model
-from ftlm.order_search.search import search_orders
+from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import implied_spreads, papers_record
@@ -170,7 +170,7 @@ def _reidentify(
 
     def best(axes: dict[str, list[float]], prior: float) -> Model | None:
         try:
-            return search_orders(
+            return rank_orders(
                 run,
                 single,
                 OrderGrid(increment=SEARCH_INCREMENT, orders=axes),

@@ -23,7 +23,7 @@ from ftlm.estimation.methods import EstimationMethod, InstrumentalVariables, Out
 from ftlm.estimation.result import Identification, Task
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
-from ftlm.order_search.search import search_orders
+from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import ShareTracker, Stoppable
 from ftlm.reproduction import published_values as printed
@@ -389,7 +389,7 @@ class StageWork:
         """
 
         def run_search(order_grid: OrderGrid, top: int) -> SearchResult:
-            return search_orders(
+            return rank_orders(
                 self.on, single, order_grid, top=top, threads=self.threads, progress=self.progress, **options
             )
 

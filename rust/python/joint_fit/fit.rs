@@ -11,7 +11,7 @@ use super::resampler::{CallbackSource, PythonResampler, Request, RunProperties, 
 use crate::error::Result;
 use crate::estimation::joint_fit::fit;
 use crate::estimation::joint_fit::initial_guesses::OrderGrids;
-use crate::estimation::joint_fit::multistart::{self, MultistartContext};
+use crate::estimation::joint_fit::multistart::{self, select_survivors, MultistartContext};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::{
     Candidate, FitProblem, Initialization, Iterate, JointFit, Loss, Objective, OptimizationResult, OptimumStatistics,
@@ -208,6 +208,8 @@ fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'
             .map(|origin| (runner.cost_per_residual(), origin.clone()))
     });
     dict.set_item("starts", starts.collect::<Vec<_>>())?;
+    let survivors = select_survivors(&reached).into_iter().map(|c| (c.cost_per_residual(), c.result.values()));
+    dict.set_item("survivors", survivors.collect::<Vec<_>>())?;
     dict.set_item(
         "growth",
         growth.map(|growth| (growth.keeps_unstable, growth.residual_excess, growth.at_stability_limit)),

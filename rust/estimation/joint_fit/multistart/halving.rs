@@ -180,12 +180,15 @@ pub fn competitive_candidates(reached: &[Candidate]) -> Vec<Candidate> {
     reached.iter().filter(|runner| runner.cost_per_residual() <= limit).cloned().collect()
 }
 
-/// True if two candidates agree in cost and orders.
+/// True if two candidates agree in cost, orders and input parameters.
 #[must_use]
 pub fn is_same_optimum(one: &Candidate, other: &Candidate) -> bool {
     let orders = |runner: &Candidate| runner.result.iterate.point.orders.clone();
+    let inputs = |runner: &Candidate| runner.result.iterate.point.inputs.clone();
     (one.cost_per_residual() - other.cost_per_residual()).abs() <= SAME_COST_TOLERANCE * one.cost_per_residual()
         && are_all_close(&orders(other), &orders(one), SAME_ORDER_RELATIVE_TOLERANCE, SAME_PARAMETER_TOLERANCE)
+        // A delay of another period is another optimum.
+        && are_all_close(&inputs(other), &inputs(one), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
 /// True if two candidates agree in all parameters. Several order grids contain the same points.

@@ -1,0 +1,136 @@
+"""Evidence for an unstable plant that a controller stabilizes: simulations of short pieces of the runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm.analysis.poles import modes
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError
+from ftlm.estimation.fit import Fit
+from ftlm.estimation.linear import estimate_coefficients
+from ftlm.estimation.model_checks import stability_findings
+from ftlm.findings import Finding, make_finding
+from ftlm.model.model import Model
+from ftlm.order_search.options import SearchSettings
+from ftlm.simulation.output_samples import measured_samples
+from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, Comparison, simulate_runs
+
+#: Length of a piece in time constants of the fastest growing mode, that of shorter runs, and fewest samples. By
+#: its end an error of the model has grown by e^5, or e^2.5.
+PIECE_TIME_CONSTANTS, MIN_PIECE_TIME_CONSTANTS, MIN_PIECE_SAMPLES = 5.0, 2.5, 20
+#: Largest growth of a mode over the fewest samples of a piece, as an exponent.
+MAX_GROWTH_EXPONENT = 15.0
+#: Fewest pieces that are evidence, and most that are simulated, spread evenly.
+MIN_PIECES, MAX_PIECES = 5, 40
+#: Largest residual of the pieces, relative to the deviations of their outputs, of a model of the plant.
+MAX_PIECE_RESIDUAL = 0.3
+#: Findings on the simulation of a whole run, which an unstable plant does not allow.
+WHOLE_RUN_CODES = (
+    "free_run_grows",
+    "explains_little",
+    "flattered_by_equation_error",
+    "out_of_range",
+    "sampling_coarse",
+    "no_stable_optimum",
+    "instruments_unstable",
+    "unstable_optimum_kept",
+    "offset_missing",
+    "simulated_from_rest",
+)
+
+
+@dataclass(frozen=True)
+class PieceTest:
+    """Simulation of short pieces, each from its own start.
+
+    Parameters
+    ----------
+    seconds
+        Length of a piece [s].
+    residual
+        RMS of the residuals of all outputs, relative to the deviations from the mean of each piece.
+    """
+
+    seconds: float
+    residual: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the model explains the pieces."""
+        return self.residual <= MAX_PIECE_RESIDUAL
+
+    @property
+    def fit(self) -> float:
+        """Fit to the pieces in percent."""
+        return 100.0 * (1.0 - self.residual)
+
+
+def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
+    """Return the test of an unstable model on pieces of the runs; None without modes or enough pieces.
+
+    A model of a stable plant that grows by a wrong sign fails it: from no start does it follow the output over five
+    time constants. Whole runs of an unstable plant are bounded only because a controller answers the output.
+    """
+    try:
+        growing = [m.pole.real for m in modes(model, coupling=model.structure.coupling) if m.unstable]
+    except FtlmError:
+        return None
+    step = max(run.step for run in runs)
+    if not growing or max(growing) * MIN_PIECE_SAMPLES * step > MAX_GROWTH_EXPONENT:
+        return None
+    shortest = min(run.length * run.step for run in runs)
+    seconds = max(PIECE_TIME_CONSTANTS / max(growing), MIN_PIECE_SAMPLES * step)
+    if shortest < seconds and shortest * max(growing) >= MIN_PIECE_TIME_CONSTANTS:
+        seconds = shortest
+    pieces = [
+        run.window(k * seconds, min((k + 1) * seconds, run.length * run.step))
+        for run in runs
+        for k in range(int(run.length * run.step / seconds + 1e-9))
+    ]
+    if len(pieces) < MIN_PIECES or any(run.sample_times is not None for run in runs):
+        return None
+    kept = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, MAX_PIECES).astype(int))]
+    started = replace(model, structure=replace(model.structure, initial="caputo"))
+    try:
+        free = simulate_runs(started, kept)
+    except FtlmError:
+        return None
+    ratios = []
+    for k in range(len(model.outputs)):
+        measured = [measured_samples(started, run, f.refinement)[k] for run, f in zip(kept, free, strict=True)]
+        left = [y - there.outputs[k] for y, there in zip(measured, free, strict=True)]
+        power = sum(float(np.nansum((y - np.nanmean(y)) ** 2)) for y in measured)
+        with np.errstate(over="ignore", invalid="ignore"):
+            missed = sum(float(np.nansum(e**2)) for e in left)
+        ratios.append(math.sqrt(missed / power) if power > 0 and math.isfinite(missed) else math.inf)
+    return PieceTest(seconds, max(ratios))
+
+
+def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], comparison: Comparison) -> list[Finding]:
+    """Return a finding if the plant is unstable: as the model says, or unlike a joint fit that explains little."""
+    if model.structure.has_friction:
+        return []
+    explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
+    if any(f.code == "free_run_grows" for f in stability_findings(model)):
+        test = piece_test(model, runs)
+        if test is not None and test.passed:
+            code = "plant_unstable" if explained and fit.joint is not None else "plant_unstable_in_pieces"
+            return [make_finding(code, fit=test.fit, seconds=test.seconds)]
+    if explained or fit.joint is None:
+        return []
+    at_orders = fit.task.structure.with_orders(model.orders)
+    settings = SearchSettings(coefficients="least-squares")
+    try:
+        linear = estimate_coefficients(runs, at_orders, settings, None)
+        other = Model(at_orders.with_coefficients(linear.values), orders=model.orders, units=model.units, m=linear.m)
+        test = piece_test(other, runs) if stability_findings(other) else None
+    except FtlmError:
+        return []
+    if test is None or not test.passed:
+        return []
+    return [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]

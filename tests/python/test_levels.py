@@ -1,0 +1,63 @@
+"""Findings that weigh as much as they show: noise that buries, a coupling that is left out, a design in doubt."""
+
+import numpy as np
+import pytest
+from scipy.signal import lsim, lti
+
+import ftlm
+from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE
+
+STEP = 0.05
+
+
+def steps(g, rows, hold=10):
+    return np.repeat(g.choice([-1.0, 1.0], rows // hold), hold)
+
+
+def lag(u, gain=1.5, pole=2.0):
+    return lsim(lti([gain * pole], [1.0, pole]), u, STEP * np.arange(u.size), interp=False)[1]
+
+
+def codes(found):
+    return [f.code for f in found.findings]
+
+
+@pytest.mark.parametrize("seed", range(20, 28))
+def test_a_right_model_under_large_noise_is_buried_and_not_useless(seed):
+    g = np.random.default_rng(seed)
+    u = steps(g, 3000)
+    y = lag(u)
+    run = ftlm.Run.from_arrays(step=STEP, inputs={"u": u}, outputs={"y": y + 2 * np.std(y) * g.standard_normal(u.size)})
+    found = ftlm.identify(run, ftlm.equation("D y = a y + b u", initial="rest"))
+    assert "explains_little" not in codes(found)
+    assert "buried_in_noise" in codes(found)
+    assert found.verdict().level == LEVEL_WITH_CARE
+    assert "output-error" not in found.verdict().sentence
+
+
+def test_a_model_that_explains_nothing_stays_useless():
+    g = np.random.default_rng(3)
+    run = ftlm.Run.from_arrays(step=STEP, inputs={"u": steps(g, 3000)}, outputs={"y": g.standard_normal(3000)})
+    found = ftlm.identify(run, ftlm.equation("D y = a y + b u", initial="rest"))
+    assert "buried_in_noise" not in codes(found)
+    assert found.verdict().level == LEVEL_DO_NOT_USE
+
+
+@pytest.mark.parametrize("seed", range(30, 34))
+def test_an_input_that_no_equation_reads_is_named_with_the_option(seed):
+    g = np.random.default_rng(seed)
+    u, other = steps(g, 1500), steps(g, 1500, 15)
+    y = lag(u) + 0.3 * lag(other, pole=4.0)
+    run = ftlm.Run.from_arrays(
+        step=STEP, inputs={"u": u, "v": other}, outputs={"y": y + 0.02 * np.std(y) * g.standard_normal(u.size)}
+    )
+    found = ftlm.identify(run, ftlm.equation("D y = a y + b u", initial="rest"))
+    said = next(f for f in found.findings if f.code == "coupling_missing")
+    assert (said.output, said.input) == ("y", "v")
+    assert "cross_stage='torques'" in said.remedy
+    whole = ftlm.identify(run, ftlm.equation("D^2 y = a D y + c y + b u + d D u + e v + f D v", initial="rest"))
+    assert "coupling_missing" not in codes(whole)
+    # A prediction from the model that lacks it says so.
+    design = ftlm.design_input(found, duration=20.0)
+    assert [f.code for f in design.findings] == ["prediction_in_doubt"]
+    assert "v" in design.findings[0].text
