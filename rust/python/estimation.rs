@@ -186,6 +186,7 @@ pub struct ExperimentFields<'py> {
 
 /// Experiment that the core sampled, or one given by its fields.
 #[derive(FromPyObject)]
+#[allow(clippy::large_enum_variant)] // there are as many as runs
 pub enum ExperimentArg<'py> {
     Sampled(Py<Experiment>),
     Given(ExperimentFields<'py>),

@@ -34,6 +34,9 @@ pub struct ChannelArg<'py> {
     enters_others: bool,
 }
 
+/// (coefficient, order) pairs of numerator and denominator.
+type FilterArg = (List<(f64, f64)>, List<(f64, f64)>);
+
 /// Run from a dictionary with these keys. `free` has signal and law of each free delay or limit.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
@@ -43,7 +46,7 @@ pub struct RunArg<'py> {
     times: Option<PyReadonlyArray1<'py, f64>>,
     signals: List<ChannelArg<'py>>,
     outputs: List<usize>,
-    filter: Option<(List<(f64, f64)>, List<(f64, f64)>)>,
+    filter: Option<FilterArg>,
     filter_states: usize,
     at_rest: bool,
     coupled: bool,

@@ -357,12 +357,12 @@ impl Recording {
         if channel.role == Role::Derived {
             return pulse_means(&channel.samples, m, held);
         }
-        if let (Some(times), Some(samples)) = (&self.times, self.acting_nonuniform_samples(signal)) {
-            if channel.role != Role::Output || !channel.nonuniform.iter().flatten().any(|v| v.is_nan()) {
-                let before = self.value_before(&self.acting_samples(signal));
-                let line = NonuniformSignal::new_unchecked(times, &samples, held);
-                return line.with_delay(channel.lag(), before).means(m, self.duration() / m as f64);
-            }
+        if let (Some(times), Some(samples)) = (&self.times, self.acting_nonuniform_samples(signal))
+            && (channel.role != Role::Output || !channel.nonuniform.iter().flatten().any(|v| v.is_nan()))
+        {
+            let before = self.value_before(&self.acting_samples(signal));
+            let line = NonuniformSignal::new_unchecked(times, &samples, held);
+            return line.with_delay(channel.lag(), before).means(m, self.duration() / m as f64);
         }
         let acting = self.acting_samples(signal);
         let mut samples = interpolate_gaps(&acting);
@@ -370,7 +370,8 @@ impl Recording {
             let intervals = self.len() - 1;
             // On a finer grid the delayed command switches within an interval, so it is held on that grid before the
             // delay.
-            let every = if held == Intersample::Hold && m % intervals == 0 { (m / intervals).max(1) } else { 1 };
+            let every =
+                if held == Intersample::Hold && m.is_multiple_of(intervals) { (m / intervals).max(1) } else { 1 };
             let before = self.value_before(&samples);
             let repeated: Vec<f64> =
                 samples.iter().flat_map(|v| std::iter::repeat_n(*v, every)).take(intervals * every + 1).collect();
