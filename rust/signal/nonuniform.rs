@@ -55,8 +55,8 @@ impl<'a> NonuniformSignal<'a> {
     ///
     /// ```
     /// # use ftlm::signal::{block_pulse::Intersample, nonuniform::NonuniformSignal};
-    /// let held = NonuniformSignal::new(&[0.0, 0.5, 1.2], &[1.0, 3.0, 0.0], Intersample::Hold)?;
-    /// assert_eq!(held.means(2, 1.0)?, [2.0, 3.0 * (1.2 - 1.0)]);
+    /// let held = NonuniformSignal::new(&[0.0, 0.5, 1.25], &[1.0, 3.0, 0.0], Intersample::Hold)?;
+    /// assert_eq!(held.means(2, 1.0)?, [2.0, 0.75]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     #[allow(clippy::cast_precision_loss)]
@@ -186,7 +186,7 @@ pub fn interpolate(time: f64, times: &[f64], values: &[f64]) -> f64 {
 ///
 /// ```
 /// # use ftlm::signal::nonuniform::interpolate_gaps;
-/// assert_eq!(interpolate_gaps(&[f64::NAN, 1.0, f64::NAN, 2.0]), [1.0, 1.0, 1.5, 2.0]);
+/// assert_eq!(*interpolate_gaps(&[f64::NAN, 1.0, f64::NAN, 2.0]), [1.0, 1.0, 1.5, 2.0]);
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
