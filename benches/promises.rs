@@ -15,7 +15,7 @@ use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::structure::{
     Coefficient, Equation as FreeEquation, Order, Structure as FreeStructure, Term as FreeTerm,
 };
-use ftlm::estimation::joint_fit::{FitProblem, Initialization, Loss, OutputScale, SampledRuns, Settings, Signal};
+use ftlm::estimation::joint_fit::{FitProblem, Initialization, Loss, OutputScale, Settings};
 use ftlm::estimation::least_squares;
 use ftlm::fft::{self, Bin, Workspace};
 use ftlm::fractional::kernels::block_pulse_kernel;
@@ -26,6 +26,7 @@ use ftlm::order_search::control::Control;
 use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::parallel::{pool, Stop};
+use ftlm::recording::{Channel, Recording, Recordings, Role};
 use ftlm::regressors::Record;
 use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::signal::block_pulse::Intersample;
@@ -299,9 +300,8 @@ fn joint_fit(m: usize) -> Option<f64> {
     let mut y = simulate::respond(&[plant], &driven, &[]).ok()?.remove(0);
     y.iter_mut().zip(noise(m, 3)).for_each(|(y, e)| *y += 1e-3 * e);
     let sizes = [OutputScale::from_runs(&[y.clone()])];
-    let signal = |samples, between| Signal { samples, intersample: between };
-    let run = vec![signal(y, Intersample::Linear), signal(u, Intersample::Hold)];
-    let runs = SampledRuns::new(h, vec![0], vec![run]).ok()?;
+    let run = vec![Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold))];
+    let runs = Recordings::new(vec![Recording::new("run", h, None, run, vec![0]).ok()?]).ok()?;
     let free = |(signal, order, _): (usize, f64, f64), name: &str| FreeTerm {
         signal,
         order: Order::number(order),

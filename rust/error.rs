@@ -122,11 +122,13 @@ pub enum Error {
         /// Name of the output.
         output: String,
     },
-    /// Runs that cannot be sampled on the requested grid.
-    #[error("runs could not be sampled: {why}; give runs that can be")]
-    Source {
-        /// Message of the data source.
-        why: String,
+    /// Run that cannot be sampled on the requested grid.
+    #[error("{what}; {remedy}")]
+    Recording {
+        /// Cause.
+        what: String,
+        /// Remedy.
+        remedy: String,
     },
     /// The caller asked to stop.
     #[error("interrupted")]
@@ -167,7 +169,7 @@ impl Error {
     #[must_use]
     pub fn kind(&self) -> Kind {
         match self {
-            Self::NotFinite { .. } | Self::Length { .. } | Self::Source { .. } => Kind::Data,
+            Self::NotFinite { .. } | Self::Length { .. } | Self::Recording { .. } => Kind::Data,
             Self::Diverged { .. } | Self::Singular { .. } | Self::Beyond { .. } => Kind::Convergence,
             Self::Interrupted => Kind::Interrupted,
             Self::Internal { .. } => Kind::Internal,

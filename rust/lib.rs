@@ -10,8 +10,9 @@
 //! 5. [`estimation`]: coefficients at fixed orders by least squares, multi-innovation least squares and instrumental
 //!    variables; orders and coefficients together by joint output error; [`friction`]: simulation and output error
 //!    with dry friction;
-//! 6. [`order_search`]: orders by exhaustive search over an order grid;
-//! 7. [`simulate`], [`state_space`], [`signal::metrics`]: simulation, output and equation error, figures of merit;
+//! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, limits and sensor filters, sampled on any grid;
+//! 7. [`order_search`]: orders by exhaustive search over an order grid;
+//! 8. [`simulate`], [`state_space`], [`signal::metrics`]: simulation, output and equation error, figures of merit;
 //!    [`signal::statistics`]: residual analysis.
 //!
 //! ```
@@ -67,6 +68,7 @@ pub mod state_space;
 pub mod estimation;
 pub mod friction;
 pub mod order_search;
+pub mod recording;
 
 #[cfg(feature = "rig")]
 pub mod rig;

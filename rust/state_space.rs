@@ -341,6 +341,13 @@ impl Transition {
     }
 }
 
+/// e^M of a row-major n × n matrix; None if it overflows.
+pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
+    let mut found = Transition::new(matrix, n, 1.0)?.growth;
+    found.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
+    Some(found)
+}
+
 /// Input of a recursion.
 struct Channel<'a> {
     samples: Cow<'a, [f64]>,

@@ -314,44 +314,72 @@ class Sound:
         }
         return (told,)
 
+    def recording_new(self, inputs=()):
+        """A run of the structure of `joint_problem_new`."""
+        rows = 33
+        channel = {"nonuniform": None, "delay": None, "limits": [], "filtered": False, "enters_others": True}
+        limits = [(kind, None) for _, _, kind, _ in inputs]
+        given = {
+            "name": "run",
+            "step": 0.05,
+            "times": None,
+            "signals": [
+                {**channel, "name": "y", "samples": self.normal(rows), "role": "output"},
+                {**channel, "name": "u", "samples": self.normal(rows), "role": "zoh", "limits": limits},
+            ],
+            "outputs": [0],
+            "filter": None,
+            "filter_states": 0,
+            "at_rest": self.one(True, False),
+            "coupled": self.one(True, False),
+            "friction": False,
+            "free": [(signal, kind) for _, signal, kind, _ in inputs],
+        }
+        if not inputs and self.random.random() < 0.3:
+            given["times"] = np.append(0.0, 0.05 * np.arange(1, rows) + self.number(-0.02, 0.02))
+            for signal in given["signals"]:
+                signal["nonuniform"] = self.normal(rows)
+        if self.random.random() < 0.3:
+            signals = given["signals"]
+            signals[self.one(0, 1)]["filtered"] = True
+            given["filter"], given["filter_states"] = (
+                ([(9.0, 0.0)], [(1.0, 2.0), (3.0, 1.0), (9.0, 0.0)]),
+                self.one(0, 2),
+            )
+        return (given,)
+
+    def recording_pulses(self):
+        return self.one_of("Recording"), (self.one(8, 32, 96), self.one(True, False))
+
+    def recording_experiment(self):
+        return self.one_of("Recording"), (self.one(1, 2), self.one(1, 2), [1.0], None)
+
+    def recording_jumps(self):
+        return self.one_of("Recording"), (self.one(0, 1),)
+
+    recording_acting_samples = recording_jumps
+
+    def recording_values_at(self):
+        return self.one_of("Recording"), (self.one(0, 1), np.sort(np.abs(self.normal(5))))
+
+    def experiment_compared_count(self):
+        return self.one_of("Recording").experiment(1, 1, [1.0]), ()
+
+    experiment_robust_weights = experiment_compared_count
+
+    def nonuniform_means(self):
+        times = np.append(0.0, np.cumsum(0.05 + np.abs(self.normal(20))))
+        return times, self.normal(21), self.one(8, 30), 0.1, self.one(True, False)
+
     def sampled(self):
-        """A problem, its runs as the core asks for them, and values of everything free."""
+        """A problem, its runs, and values of everything free."""
         (told,) = self.joint_problem_new()
-        problem, step, rows = _core.JointProblem(told), 0.05, 33
-        drawn = [(self.normal(rows), self.normal(rows)) for _ in range(self.one(1, 2))]
+        problem = _core.JointProblem(told)
+        runs = [_core.Recording(*self.recording_new(told["inputs"])) for _ in range(self.one(1, 2))]
+        return problem, runs, [1.2, 1.5, 0.7, *(1.0 for _ in told["inputs"])]
 
-        class Runs:
-            def sample(self, every, decimation, first):
-                kept = (min(first or rows - 1, rows - 1)) // decimation
-                made = []
-                for run in drawn:
-                    signals = [np.ascontiguousarray(s[: kept * decimation + 1]) for s in run]
-                    means = np.stack([_core.pulse_means(s, kept * every, True) for s in signals])
-                    samples = signals[0][::decimation][None].copy()
-                    made.append(
-                        {
-                            "record": (step * decimation / every, means, None),
-                            "pulses_per_sample": every,
-                            "samples": samples,
-                            "filter": None,
-                            "weights": [1.0],
-                            "signals": [],
-                            "robust_weights": None,
-                            "sample_times": None,
-                        }
-                    )
-                return made
-
-            def records(self, m, inputs):
-                means = [np.stack([_core.pulse_means(s, m, True) for s in run]) for run in drawn]
-                return [(step * (rows - 1) / m, rows_of, None) for rows_of in means]
-
-            def read(self, signal):
-                return [run[signal] for run in drawn]
-
-        heard = self.one(None, lambda done, of: None)
-        values = [1.2, 1.5, 0.7, *(1.0 for _ in told["inputs"])]
-        return problem, (Runs(), [(step, rows * step)] * len(drawn), [None, "zoh"], heard), values
+    def heard(self):
+        return self.one(None, lambda done, of: None)
 
     def joint_problem_orders(self):
         return self.one_of("JointProblem"), ()
@@ -376,10 +404,10 @@ class Sound:
         return problem, (np.array(values), np.array(values) * self.one(1.0, 1.4))
 
     def joint_problem_minimize(self):
-        problem, (runs, *_), values = self.sampled()
+        problem, runs, values = self.sampled()
         held = self.one((), (0,), (1, 2))
         return problem, (
-            runs.sample(1, 1, None),
+            [run.experiment(1, 1, [1.0]) for run in runs],
             (values, []),
             self.one(True, False),
             held,
@@ -391,7 +419,7 @@ class Sound:
 
     def joint_multistart(self):
         problem, runs, _ = self.sampled()
-        return problem, runs, [1.0], 1.0, (self.one(1, 2), 1 << 30), self.one(None, _core.Stop())
+        return problem, runs, [1.0], 1.0, (self.one(1, 2), 1 << 30), self.heard(), self.one(None, _core.Stop())
 
     def refine_candidates(self):
         problem, runs, values = self.sampled()
@@ -412,6 +440,7 @@ class Sound:
             self.one(True, False),
             self.one(True, False),
             (self.one(1, 2), 1 << 30),
+            self.heard(),
             self.one(None, _core.Stop()),
         )
 
@@ -422,13 +451,12 @@ class Sound:
     joint_multistart_len = joint_multistart_origins = joint_multistart_values
 
     def joint_problem_time_scaling(self):
-        problem, (_, spans, *_), _ = self.sampled()
-        return problem, (spans,)
+        return self.one_of("JointProblem"), ([(0.05, 1.65)] * self.one(1, 2),)
 
     def clocked(self):
         """A clock, and values of what it tells."""
-        problem, (_, spans, *_), values = self.sampled()
-        return problem.time_scaling(spans), np.array(values)
+        problem, runs, values = self.sampled()
+        return problem.time_scaling([(0.05, 1.65)] * len(runs)), np.array(values)
 
     def joint_time_scaling_unit(self):
         return self.clocked()[0], ()

@@ -4,19 +4,21 @@ Arrays are float64. A signal is a vector of pulse means unless it says samples; 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal, Protocol, TypeAlias, TypedDict, final
+from typing import Any, Final, Literal, TypeAlias, TypedDict, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
     "SIMD",
+    "Experiment",
     "Guard",
     "JointMultistart",
     "JointProblem",
     "JointTimeScaling",
     "OrderSearch",
     "Points",
+    "Recording",
     "StageSearch",
     "Stop",
     "Streaming",
@@ -58,6 +60,7 @@ __all__ = [
     "metrics",
     "multi_innovation",
     "multi_innovation_estimate",
+    "nonuniform_means",
     "nyquist_margin",
     "operational_matrix",
     "order_grid_size",
@@ -145,6 +148,59 @@ class _Experiment(TypedDict):
     #: one row an output
     robust_weights: _Floats | None
     sample_times: _OwnTimes | None
+
+class _Channel(TypedDict):
+    name: str
+    samples: _Floats
+    #: at the nonuniform times of the run
+    nonuniform: _Floats | None
+    #: zoh, foh, output or derived
+    role: str
+    #: [s]
+    delay: float | None
+    #: (law, value), in the order in which they act; None if it is free
+    limits: Sequence[tuple[str, float | None]]
+    #: whether it passed the sensor filter
+    filtered: bool
+    #: whether it enters an equation of another output
+    enters_others: bool
+
+class _Run(TypedDict):
+    name: str
+    step: float
+    #: nonuniform sample times [s]
+    times: _Floats | None
+    signals: Sequence[_Channel]
+    #: signals that equations simulate
+    outputs: Sequence[int]
+    #: (coefficient, order) of numerator and denominator
+    filter: tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]] | None
+    filter_states: int
+    at_rest: bool
+    coupled: bool
+    friction: bool
+    #: signal and law of each free delay or limit
+    free: Sequence[tuple[int, str]]
+
+@final
+class Recording:
+    def __new__(cls, /, run: _Run) -> Recording: ...
+    def pulses(
+        self, /, m: int, filtered: bool
+    ) -> tuple[float, _Matrix, _Vector | None, tuple[list[bool], list[float], _Matrix | None]]: ...
+    def experiment(
+        self, /, every: int, decimation: int, weights: Sequence[float], shares: _Floats | None = None
+    ) -> Experiment: ...
+    def jumps(self, /, signal: int) -> tuple[_Vector, _Vector] | None: ...
+    def values_at(self, /, signal: int, times: _Floats) -> _Vector | None: ...
+    def acting_samples(self, /, signal: int) -> _Vector: ...
+
+@final
+class Experiment:
+    @property
+    def compared_count(self) -> int: ...
+    @property
+    def robust_weights(self) -> _Matrix | None: ...
 
 _Progress: TypeAlias = Callable[[int, int, int], object]
 
@@ -248,6 +304,7 @@ def fractional_derivative(x: _Floats, order: float, step: float, definition: str
 def pulse_means(samples: _Floats, m: int, hold: bool) -> _Vector: ...
 def pulse_mean_rows(samples: _Floats, m: int, hold: bool) -> _Matrix: ...
 def point_samples(means: _Floats) -> _Vector: ...
+def nonuniform_means(times: _Floats, samples: _Floats, m: int, step: float, hold: bool) -> _Vector: ...
 def delay_samples(samples: _Floats, delay: float, before: float) -> _Vector: ...
 def filter_series(
     numerator: Sequence[tuple[float, float]], denominator: Sequence[tuple[float, float]], m: int, step: float
@@ -300,7 +357,7 @@ def instrumental_variables(
     tolerance: float,
 ) -> _InstrumentalFit: ...
 def output_error(
-    runs: Sequence[_Experiment],
+    runs: Sequence[Experiment | _Experiment],
     laws: Sequence[_FreeEquation],
     order_bounds: Sequence[tuple[float, float]],
     coordinates: Sequence[str],
@@ -350,15 +407,6 @@ class _Named(TypedDict):
     laws: Sequence[tuple[str, float, Sequence[str]]]
     hints: _Hints
 
-class _Asked(Protocol):
-    def sample(self, every: int, decimation: int, first: int | None, /) -> Sequence[_Experiment]: ...
-    def records(self, m: int, inputs: Sequence[float], /) -> Sequence[_Record]: ...
-    def read(self, signal: int, /) -> Sequence[_Floats]: ...
-
-#: (who answers, sample interval and duration of each run [s], what each signal does between samples if it is an input,
-#: who is told (done, all))
-_Runs: TypeAlias = tuple[_Asked, Sequence[tuple[float, float]], Sequence[str | None], Callable[[int, int], None] | None]
-
 class _JointFit(TypedDict):
     shares: list[_Matrix] | None
     every: int
@@ -401,7 +449,7 @@ class JointProblem:
     def minimize(
         self,
         /,
-        runs: Sequence[_Experiment],
+        runs: Sequence[Experiment | _Experiment],
         start: tuple[Sequence[float], Sequence[Sequence[float]]],
         plain: bool,
         held: Sequence[int],
@@ -422,15 +470,16 @@ class JointMultistart:
 
 def joint_multistart(
     problem: JointProblem,
-    runs: _Runs,
+    runs: Sequence[Recording],
     weights: Sequence[float],
     floor: float,
     means: tuple[int, int],
+    progress: Callable[[int, int], object] | None = None,
     stop: Stop | None = None,
 ) -> JointMultistart: ...
 def refine_candidates(
     problem: JointProblem,
-    runs: _Runs,
+    runs: Sequence[Recording],
     weights: Sequence[float],
     decimation: int,
     starts: Sequence[tuple[Sequence[float], str]],
@@ -439,7 +488,7 @@ def refine_candidates(
 ) -> JointMultistart: ...
 def joint_fit(
     problem: JointProblem,
-    runs: _Runs,
+    runs: Sequence[Recording],
     sizes: Sequence[tuple[float, float]],
     known: Sequence[Sequence[float]],
     start: Sequence[float] | None,
@@ -448,6 +497,7 @@ def joint_fit(
     huber: bool,
     refine: bool,
     means: tuple[int, int],
+    progress: Callable[[int, int], object] | None = None,
     stop: Stop | None = None,
 ) -> _JointFit | None: ...
 
@@ -484,7 +534,7 @@ def friction_respond(
     terms: Sequence[Sequence[tuple[float, float]]],
 ) -> _Motion: ...
 def friction_error(
-    runs: Sequence[_Experiment],
+    runs: Sequence[Experiment | _Experiment],
     laws: Sequence[_FreeEquation],
     frictions: Sequence[tuple[int, Sequence[_Monomial]]],
     order_bounds: Sequence[tuple[float, float]],

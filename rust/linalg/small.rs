@@ -1,6 +1,6 @@
 //! Small dense systems: inverses, LU, batched LDLᵀ solves, recursive least squares. The only user of `nalgebra`.
 
-use nalgebra::{DMatrix, DVector, Dyn, FullPivLU};
+use nalgebra::{DMatrix, DVector, Dyn, FullPivLU, Schur};
 
 use crate::error::{check_length, Error, Result};
 use crate::simd::Lanes;
@@ -36,6 +36,38 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
         Some(inverse) if inverse.iter().all(|v| v.is_finite()) => Ok(inverse.transpose().as_slice().to_vec()),
         _ => Err(Error::LeadingZero { leading: determinant }),
     }
+}
+
+/// Most steps of an iteration for eigenvalues, of which a polynomial of degree ten needs about thirty.
+const MAX_EIGENVALUE_STEPS: usize = 1000;
+
+/// Magnitude of the largest zero of a polynomial with these coefficients, the constant first.
+///
+/// None without a zero, or for coefficients of which the leading one is 0 or too small beside the others.
+///
+/// ```
+/// // (z + 3)(z − 2)
+/// assert!((ftlm::linalg::small::spectral_radius(&[-6.0, 1.0, 1.0]).unwrap_or(0.0) - 3.0).abs() < 1e-14);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn spectral_radius(coefficients: &[f64]) -> Option<f64> {
+    let (leading, others) = coefficients.split_last()?;
+    let ratios: Vec<f64> = others.iter().rev().map(|c| -c / leading).collect();
+    if ratios.is_empty() || ratios.iter().any(|v| !v.is_finite()) {
+        return None;
+    }
+    // In this unit no coefficient is above 1.
+    let unit = ratios.iter().zip(1..).map(|(v, k)| v.abs().powf(1.0 / k as f64)).fold(0.0, f64::max);
+    if unit == 0.0 {
+        return Some(0.0);
+    }
+    let scaled = |(k, v): (usize, &f64)| (0..=k).fold(*v, |v, _| v / unit);
+    let top: Vec<f64> = ratios.iter().enumerate().map(scaled).collect();
+    let n = top.len();
+    let companion = DMatrix::from_fn(n, n, |i, j| if i == 0 { top[j] } else { f64::from(u8::from(i == j + 1)) });
+    let found = Schur::try_new(companion, f64::EPSILON, MAX_EIGENVALUE_STEPS)?.complex_eigenvalues();
+    Some(unit * found.iter().map(|z| z.re.hypot(z.im)).fold(0.0, f64::max))
 }
 
 /// LU factorization of an equilibrated square matrix, whose rows and columns may differ in scale by any factor.

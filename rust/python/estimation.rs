@@ -9,6 +9,7 @@ use super::convert::{
     StructureArg,
 };
 use super::errors::{run_attached, run_detached};
+use super::recording::{input_law, Experiment};
 use crate::equation::{AffineOrder, Initial};
 use crate::error::{check_finite, check_length, Error};
 use crate::estimation::instrumental_variables as instruments;
@@ -172,7 +173,7 @@ pub type OwnTimesArg<'py> =
 /// weights of the samples of each output, nonuniform sample times.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
-pub struct ExperimentArg<'py> {
+pub struct ExperimentFields<'py> {
     record: RecordArg<'py>,
     pulses_per_sample: usize,
     samples: PyReadonlyArray2<'py, f64>,
@@ -181,6 +182,14 @@ pub struct ExperimentArg<'py> {
     signals: List<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
     robust_weights: Option<PyReadonlyArray2<'py, f64>>,
     sample_times: Option<OwnTimesArg<'py>>,
+}
+
+/// Experiment that the core sampled, or one given by its fields.
+#[derive(FromPyObject)]
+#[allow(clippy::large_enum_variant)] // there are as many as runs
+pub enum ExperimentArg<'py> {
+    Sampled(Py<Experiment>),
+    Given(ExperimentFields<'py>),
 }
 
 fn affine((constant, weights): AffineArg) -> AffineOrder {
@@ -203,6 +212,10 @@ pub fn jumps_near(
 }
 
 pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
+    let argument = match argument {
+        ExperimentArg::Sampled(experiment) => return Ok(experiment.get().inner.clone()),
+        ExperimentArg::Given(argument) => argument,
+    };
     let (record, samples, weights) = (record(&argument.record)?, rows(&argument.samples)?, argument.weights.to_vec());
     let experiment = match &argument.sample_times {
         None => joint::Experiment::new(record, argument.pulses_per_sample, samples, weights)?,
@@ -282,17 +295,8 @@ pub fn status(status: joint::Status) -> &'static str {
 pub(super) type FreeInputArg = (usize, String, (f64, f64), f64);
 
 pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeInput>> {
-    let law = |name: &str| match name {
-        "delay" => Ok(joint::InputLaw::Delay),
-        "saturation" => Ok(joint::InputLaw::Saturation),
-        "dead_zone" => Ok(joint::InputLaw::DeadZone),
-        other => Err(Error::Structure {
-            what: format!("law '{other}' of an input is not known"),
-            remedy: "use delay, saturation or dead_zone".into(),
-        }),
-    };
     let free = |(signal, name, bounds, _): &FreeInputArg| {
-        Ok::<_, Error>(joint::FreeInput { signal: *signal, law: law(name)?, bounds: *bounds })
+        Ok::<_, Error>(joint::FreeInput { signal: *signal, law: input_law(name)?, bounds: *bounds })
     };
     Ok(inputs.iter().map(free).collect::<Result<Vec<_>, _>>()?)
 }

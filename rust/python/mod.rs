@@ -10,6 +10,7 @@ mod joint_fit;
 mod kernels;
 mod operators;
 mod order_search;
+mod recording;
 mod simulation;
 mod virtual_arm;
 
@@ -50,6 +51,9 @@ mod _core {
         joint_multistart, long_run_covariance, refine_candidates, whitening_filter, JointMultistart, JointProblem,
         JointTimeScaling,
     };
+
+    #[pymodule_export]
+    use crate::python::recording::{nonuniform_means, Experiment, Recording};
 
     #[pymodule_export]
     use crate::python::simulation::{

@@ -41,15 +41,7 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Ve
     let Some(intervals) = samples.len().checked_sub(1).filter(|&n| n > 0) else {
         return Err(Error::Length { name: "samples".into(), expected: 2, found: samples.len() });
     };
-    if m == 0 {
-        return Err(Error::OutOfRange {
-            name: "m".into(),
-            value: 0.0,
-            range: "[1, ∞)".into(),
-            remedy: "ask for at least one pulse".into(),
-        });
-    }
-    check_points("m", m)?;
+    check_pulses(m)?;
     check_finite("samples", samples)?;
     // Integral over interval j from its start to a fraction x of it.
     let partial = |j: usize, x: f64| match between {
@@ -84,6 +76,19 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Ve
         (j, x) = (next_j, next_x);
     }
     Ok(means)
+}
+
+/// Return an error for no pulse or too many.
+pub(crate) fn check_pulses(m: usize) -> Result<()> {
+    if m > 0 {
+        return check_points("m", m);
+    }
+    Err(Error::OutOfRange {
+        name: "m".into(),
+        value: 0.0,
+        range: "[1, ∞)".into(),
+        remedy: "ask for at least one pulse".into(),
+    })
 }
 
 /// Integral over interval j from fraction a to b, without cancellation of two partial integrals.

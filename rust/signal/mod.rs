@@ -2,4 +2,5 @@
 
 pub mod block_pulse;
 pub mod metrics;
+pub mod nonuniform;
 pub mod statistics;

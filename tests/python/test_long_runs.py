@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter, ss2tf
 from scipy.special import erfcx
 
 import ftlm
-from ftlm.estimation.objective import RunSampler
-from ftlm.estimation.output_error import Initialization
 from ftlm.simulation import step_refinement as long
 from ftlm.simulation.output_samples import with_initial_conditions
 from ftlm.simulation.step_refinement import simulate_refined
@@ -139,37 +134,3 @@ def test_too_few_pulses_are_an_error_and_what_grows_is_one_too():
         model.simulate(run, max_m=30_000)
     with pytest.raises(ftlm.errors.ConvergenceError, match="leaves the range of numbers"):
         ftlm.Model(ftlm.equation("D^1.4 y = 4 y + 2 u")).simulate(run)
-
-
-def test_starts_of_a_long_fast_record_compete_on_a_part_that_still_shows_its_motion(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Thinned to 1200 samples, 60 000 of a swing of 20 rad/s would be read every 0.5 s, two turns and a half."""
-    rng = np.random.default_rng(1)
-    u = np.repeat(rng.choice([-1.0, 1.0], size=1200), 50)
-    y = lfilter(*(np.ravel(p) for p in cont2discrete(([1.0], [1.0, 2.0, 400.0]), 0.01)[:2]), u)
-    asked: set[tuple[int, int | None]] = set()
-    sampled = RunSampler.sample
-
-    def noted(self: RunSampler, every: int, decimation: int, first: int | None) -> list[Any]:
-        asked.add((decimation, first))
-        return sampled(self, every, decimation, first)
-
-    monkeypatch.setattr(RunSampler, "sample", noted)
-    structure = ftlm.equation("D^2 y = d D y + a y + b u", initial="rest")
-
-    def raced(y: np.ndarray) -> tuple[int, int | None]:
-        asked.clear()
-        Initialization.of(
-            [ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})], structure
-        ).run_multistart(2, None)
-        (found,) = asked
-        return found
-
-    share = np.cumsum(np.abs(np.fft.rfft((y - np.mean(y)) * np.hanning(y.size))) ** 2)
-    fastest = 2 * math.pi * int(np.searchsorted(share / share[-1], 0.9)) / (y.size * 0.01)
-    decimation, first = raced(y)
-    assert 10 <= decimation <= max(10.0, math.pi / (fastest * 0.01))
-    assert first == 1200 * decimation
-    # What stands still at first does not stand for what moves later.
-    assert raced(np.where(np.arange(y.size) < 3e4, 0.0, y)) == (50, None)

@@ -41,7 +41,7 @@ NOUNS = frozenset(
     embed encoding spelling breed shed weed indeed learning family
     seed speed need feed string ring spring sampling damping spacing timing warning setting settings meaning
     heading padding mapping logging reading testing rounding bearing ceiling filling opening coupling scaling
-    smoothing weighting plotting streaming indexing ordering loading screening pruning reply apply only
+    smoothing weighting plotting recording streaming indexing ordering loading screening pruning reply apply only
     multiply family assembly thing king hundred feedback
     """.split()  # noqa: SIM905 — read as words, not as a column of literals
 )

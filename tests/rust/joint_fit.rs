@@ -4,11 +4,11 @@ use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::joint_fit::covariance::long_run_covariance;
 use ftlm::estimation::joint_fit::{
-    best_alternative, fit_reweighted, refine_step, Iterate, Loss, Objective, Optimum, Problem, SampledRuns, Sampling,
-    Signal, Source, Weights,
+    best_alternative, fit_reweighted, refine_step, Iterate, Loss, Objective, Optimum, Problem, Weights,
 };
 use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
 use ftlm::parallel::Stop;
+use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
 use ftlm::signal::block_pulse::Intersample;
 use ftlm::signal::statistics;
 use serde_json::Value;
@@ -43,10 +43,13 @@ fn three_terms() -> Problem {
     problem(equation, &[(0.05, 3.0), (0.0, 3.0)], 3, Initial::Rest)
 }
 
-fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> SampledRuns {
-    let of = |samples: &Vec<f64>, between| Signal { samples: samples.clone(), intersample: between };
-    let runs = outputs.iter().zip(inputs).map(|(y, u)| vec![of(y, Intersample::Linear), of(u, Intersample::Hold)]);
-    SampledRuns::new(step, vec![0], runs.collect()).unwrap()
+fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> Recordings {
+    let run = |(y, u): (&Vec<f64>, &Vec<f64>)| {
+        let y = Channel::new("y", y.clone(), Role::Output);
+        let u = Channel::new("u", u.clone(), Role::Input(Intersample::Hold));
+        Recording::new("run", step, None, vec![y, u], vec![0]).unwrap()
+    };
+    Recordings::new(outputs.iter().zip(inputs).map(run).collect()).unwrap()
 }
 
 fn place(orders: &[f64], coefficients: &[f64]) -> Iterate {
@@ -119,7 +122,7 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
 }
 
 /// y′ = −2 y + 2 u with a little noise, in exact steps, and D y = −a y + b u, whatever the run starts from.
-fn first_order() -> (Problem, SampledRuns) {
+fn first_order() -> (Problem, Recordings) {
     let (step, decay) = (0.02, (-0.04_f64).exp());
     let mut random = Random::new(3);
     let (mut y, mut states, mut u) = (0.0, Vec::new(), Vec::new());
@@ -184,12 +187,6 @@ fn a_stop_is_heard_and_what_does_not_fit_is_refused() {
         Err(Error::Length { .. })
     ));
     assert!(problem.point(&[1.0]).is_err());
-    assert!(SampledRuns::new(
-        0.1,
-        vec![2],
-        vec![vec![Signal { samples: vec![0.0; 5], intersample: Intersample::Linear }]]
-    )
-    .is_err());
     assert_eq!(source.spans(), [(0.02, 8.0)]);
     stop.set();
     assert!(matches!(fit_reweighted(&start, grid, Loss::Squares).map(|_| ()), Err(Error::Interrupted)));

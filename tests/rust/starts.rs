@@ -5,18 +5,21 @@ use std::f64::consts::PI;
 use ftlm::equation::{self, Initial};
 use ftlm::error::{Error, Result};
 use ftlm::estimation::joint_fit::initial_guesses::{power_frequency, OrderGrids};
+use ftlm::estimation::joint_fit::multistart::coarse_sampling;
 use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Order, Structure, Term};
-use ftlm::estimation::joint_fit::{Candidate, Recordings, SampledRuns, Sampling, Signal, Source};
-use ftlm::estimation::output_error::{Experiment, FreeInput, InputLaw};
+use ftlm::estimation::joint_fit::Candidate;
+use ftlm::estimation::output_error::{FreeInput, InputLaw};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
 use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::Options;
 use ftlm::parallel::Stop;
+use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
 use ftlm::regressors::{Record, BANK_LIMIT};
-use ftlm::signal::block_pulse::{delay_samples, point_samples, Intersample};
+use ftlm::signal::block_pulse::{point_samples, Intersample};
 use ftlm::simulate::respond;
+use ftlm::state_space;
 
 use crate::common::{bits, check, deviation, Random};
 
@@ -25,7 +28,7 @@ const ALPHA: f64 = 1.7;
 const NU: f64 = 0.8;
 
 /// Samples of D^1.7 y = −3 D^0.8 y − 20 y + 5 u with a little noise, and the held input.
-fn plant() -> Vec<Signal> {
+fn plant() -> Recording {
     let mut random = Random::new(4);
     let input = random.steps(800, 15);
     let term = |signal, order| equation::Term { signal, order };
@@ -37,15 +40,18 @@ fn plant() -> Vec<Signal> {
     let size = 0.01 * deviation(&y);
     y.iter_mut().for_each(|v| *v += size * random.normal());
     y.truncate(800);
-    let signal = |samples, between| Signal { samples, intersample: between };
-    vec![signal(y, Intersample::Linear), signal(input, Intersample::Hold)]
+    recording(STEP, y, input)
 }
 
-fn runs() -> SampledRuns {
-    let mut run = plant();
-    let rows = run.iter().map(|s| s.samples.len()).min().unwrap();
-    run.iter_mut().for_each(|s| s.samples.truncate(rows));
-    SampledRuns::new(STEP, vec![0], vec![run]).unwrap()
+/// A run of an output and a held input.
+fn recording(step: f64, y: Vec<f64>, mut u: Vec<f64>) -> Recording {
+    u.truncate(y.len());
+    let (y, u) = (Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold)));
+    Recording::new("run", step, None, vec![y, u], vec![0]).unwrap()
+}
+
+fn runs() -> Recordings {
+    Recordings::new(vec![plant()]).unwrap()
 }
 
 fn term(signal: usize, order: Order, name: &str) -> Term {
@@ -70,7 +76,7 @@ fn structure(alpha: Order, beta: f64) -> Structure {
     }
 }
 
-fn found(structure: Structure, source: &dyn Recordings, threads: usize) -> Result<Vec<Candidate>> {
+fn found(structure: Structure, source: &Recordings, threads: usize) -> Result<Vec<Candidate>> {
     OrderGrids::new(source, threads, BANK_LIMIT, &Stop::default()).candidates(&ParameterSet::from_structure(structure)?)
 }
 
@@ -138,39 +144,6 @@ fn the_best_row_is_followed_to_where_no_neighbour_is_better() {
     assert!((at.order - best[0]).abs() < 1e-9 && (at.terms[0].order - best[1]).abs() < 1e-9);
 }
 
-/// Runs whose input acts later, or no further than a limit.
-struct Acting(SampledRuns, Vec<Signal>, Input);
-
-impl Source for Acting {
-    fn spans(&self) -> Vec<(f64, f64)> {
-        self.0.spans()
-    }
-
-    fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>> {
-        self.0.experiments(sampling)
-    }
-}
-
-impl Recordings for Acting {
-    fn inputs(&self) -> Vec<Option<Intersample>> {
-        self.0.inputs()
-    }
-
-    fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>> {
-        self.0.samples(signal)
-    }
-
-    fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
-        let mut run = self.1.clone();
-        let input = &mut run[1].samples;
-        *input = match self.2.free.law {
-            InputLaw::Delay => delay_samples(input, inputs[0] / STEP, 0.0)?,
-            _ => input.iter().map(|v| v.clamp(-inputs[0], inputs[0])).collect(),
-        };
-        SampledRuns::new(STEP, vec![0], vec![run])?.records(m, &[])
-    }
-}
-
 #[test]
 fn delays_and_limits_are_tried() {
     for (law, name, bounds, words) in [
@@ -180,16 +153,18 @@ fn delays_and_limits_are_tried() {
         let input = Input { name: name.into(), free: FreeInput { signal: 1, law, bounds } };
         let mut free = structure(Order::number(1.7), 0.0);
         free.inputs = vec![input.clone()];
-        let source = runs();
-        let run: Vec<Signal> = source
-            .samples(0)
-            .unwrap()
-            .into_iter()
-            .chain(source.samples(1).unwrap())
-            .zip([Intersample::Linear, Intersample::Hold])
-            .map(|(samples, between)| Signal { samples, intersample: between })
-            .collect();
-        let all = found(free, &Acting(source, run, input), 1).unwrap();
+        let run = plant();
+        let mut channels = run.channels().to_vec();
+        if law != InputLaw::Delay {
+            channels[1].nonlinearities.push((law, None));
+        }
+        let mut run = Recording::new("run", STEP, None, channels, vec![0]).unwrap();
+        run.free_inputs.push((1, law));
+        let source = Recordings::new(vec![run]).unwrap();
+        // What is free is left to the fit, but not where it starts.
+        let at = |value: f64| source.records(100, &[value]).unwrap()[0].signal(1).to_vec();
+        assert_ne!(bits(&at(bounds.0)), bits(&at(bounds.1)), "{name}");
+        let all = found(free, &source, 1).unwrap();
         let mut tried: Vec<f64> = all.iter().map(|r| r.result.iterate.point.inputs[0]).collect();
         tried.dedup();
         assert!(all[0].origin.contains(words), "{}", all[0].origin);
@@ -213,4 +188,53 @@ fn what_makes_no_start_is_refused() {
     stop.set();
     let free = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
     assert_eq!(OrderGrids::new(&source, 1, BANK_LIMIT, &stop).candidates(&free), Err(Error::Interrupted));
+}
+
+/// Samples of y″ + 2 y′ + 400 y = u, which swings with 20 rad/s, and an input that changes every 50 of 60 000 samples.
+fn fast_swing() -> (Vec<f64>, Vec<f64>) {
+    let (step, rows) = (0.01, 60_000);
+    let mut random = Random::new(1);
+    let u: Vec<f64> = random.signal(rows / 50).iter().flat_map(|v| std::iter::repeat_n(v.signum(), 50)).collect();
+    let term = |signal, order| equation::Term { signal, order };
+    let plant = equation::Structure { output: 0, order: 2.0, terms: vec![term(0, 1.0), term(0, 0.0), term(1, 0.0)] };
+    let plant = equation::Equation::new(plant, vec![-2.0, -400.0, 1.0]).unwrap();
+    let input =
+        state_space::Input { signal: 1, samples: u.clone(), between: Intersample::Hold, delay: 0.0, before: 0.0 };
+    let y = state_space::respond(&[plant], &[input], &[], step, rows, &Stop::default()).unwrap().unwrap();
+    (y, u)
+}
+
+#[test]
+fn a_long_fast_record_is_not_thinned_beyond_its_motion() {
+    // Thinned to 1200 samples, it would be read every 0.5 s, a turn and a half.
+    let (y, u) = fast_swing();
+    let free = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
+    let sampling = |y: &[f64]| {
+        let runs = Recordings::new(vec![recording(0.01, y.to_vec(), u.clone())]).unwrap();
+        coarse_sampling(&free, &runs).unwrap()
+    };
+    let (found, fastest) = (sampling(&y), power_frequency(&y, 0.01));
+    let most = (PI / (fastest * 0.01)).max(10.0);
+    assert!((10.0..=most).contains(&(found.decimation as f64)), "{found:?}, at most {most}");
+    assert_eq!(found.leading_intervals, Some(1200 * found.decimation));
+    // What stands still at first does not stand for what moves later.
+    let still: Vec<f64> = y.iter().enumerate().map(|(k, v)| if k < 30_000 { 0.0 } else { *v }).collect();
+    assert_eq!((sampling(&still).decimation, sampling(&still).leading_intervals), (50, None));
+}
+
+#[test]
+fn leading_samples_are_those_of_a_shorter_run() {
+    let run = plant();
+    let sampling = |leading_intervals| Sampling { pulses_per_sample: 2, decimation: 3, leading_intervals };
+    let (part, all) = (run.experiment(sampling(Some(100))).unwrap(), run.experiment(sampling(None)).unwrap());
+    assert_eq!(part.record.m(), 66);
+    for signal in 0..2 {
+        assert_eq!(bits(part.record.signal(signal)), bits(&all.record.signal(signal)[..66]));
+    }
+    assert_eq!(part.samples[0], all.samples[0][..34]);
+    let short = run.experiment(sampling(Some(1))).unwrap_err();
+    assert_eq!(short.to_string(), "window: 2 rows remain, 3 are needed; widen the limits");
+    let faint = recording(STEP, vec![1e-150; 10], vec![1.0; 10]);
+    let refused = faint.pulses(9, false).unwrap_err();
+    assert!(refused.to_string().starts_with("signal 'y' of run 'run': no mean is larger than 1e-150, and squares"));
 }

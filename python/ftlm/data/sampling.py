@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from ftlm import _core
 from ftlm.errors import DataError
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.validation import Floats, as_array, as_mapping, bad_rows, join_names, nearest
@@ -359,39 +360,12 @@ def resample_uniform(
     """Resample to another step: interval means of held inputs, linear interpolation of other signals."""
     rows = check_rows(since, step)
     grid = uniform_times(rows, step)
-    pieces = HoldSegments.of(since, rows, step)
     return {
-        signal: pieces.means(values) if behaviour.get(signal) == "zoh" else np.interp(grid, since, values)
+        signal: _core.nonuniform_means(since, values, rows, step, True)
+        if behaviour.get(signal) == "zoh"
+        else np.interp(grid, since, values)
         for signal, values in data.items()
     }
-
-
-@dataclass(frozen=True)
-class HoldSegments:
-    """Segments of new intervals split at old samples: old row, share of a step, first segment of each interval."""
-
-    row: npt.NDArray[np.intp]
-    share: Floats
-    first: npt.NDArray[np.intp]
-
-    @classmethod
-    def of(cls, since: Floats, rows: int, step: float) -> HoldSegments:
-        """Split the new intervals; old samples within rounding of a new one coincide. The last value is held."""
-        edges = uniform_times(rows + 1, step)
-        place = np.searchsorted(edges, since, side="left")
-        near = np.minimum(place, rows)
-        near = np.where((near > 0) & (np.abs(edges[near - 1] - since) <= _EDGE_TOLERANCE_STEPS * step), near - 1, near)
-        snapped = np.where(np.abs(edges[near] - since) <= _EDGE_TOLERANCE_STEPS * step, edges[near], since)
-        cuts = np.unique(np.concatenate([edges, snapped[snapped < edges[-1]]]))
-        row = np.searchsorted(snapped, cuts[:-1], side="right") - 1
-        return cls(row, np.diff(cuts) / step, np.searchsorted(cuts, edges[:-1]))
-
-    def means(self, values: Floats) -> Floats:
-        """Exact interval means of a zero-order hold; bit-exact where the value is constant within an interval."""
-        begin = values[self.row[self.first]]
-        counts = np.diff(np.append(self.first, self.row.size))
-        risen = (values[self.row] - np.repeat(begin, counts)) * self.share
-        return np.asarray(begin + np.add.reduceat(risen, self.first))
 
 
 def describe_interpolation(behaviour: Mapping[str, Intersample]) -> str:
@@ -481,37 +455,6 @@ class NonuniformSamples:
     times: Floats
     data: dict[str, Floats]
 
-    def means(self, name: str, kind: Intersample, m: int, duration: float, delay: float, before: float) -> Floats:
-        """Block-pulse coefficients of an input: exact means over m equal intervals, after a delay [s]."""
-        times, values = self._apply_delay(name, delay, before)
-        step = duration / m
-        if kind == ZERO_ORDER_HOLD:
-            return HoldSegments.of(times, m, step).means(values)
-        edges = uniform_times(m + 1, step)
-        area = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(times))])
-        row = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, times.size - 1)
-        there = np.interp(edges, times, values)
-        return np.asarray(np.diff(area[row] + 0.5 * (values[row] + there) * (edges - times[row])) / step)
-
-    def jumps(self, name: str, delay: float, before: float) -> tuple[Floats, Floats]:
-        """Times [s] and heights of the jumps of a held input, including the jump from 0 at the start."""
-        times, values = self._apply_delay(name, delay, before)
-        return times, np.diff(values, prepend=0.0)
-
-    def at(self, name: str, kind: Intersample, times: Floats, delay: float, before: float) -> Floats:
-        """Values of an input at given times; at a jump, the value after it."""
-        own, values = self._apply_delay(name, delay, before)
-        if kind != ZERO_ORDER_HOLD:
-            return np.asarray(np.interp(times, own, values))
-        # Times that differ from a switching instant only by rounding count as equal.
-        slack = _RELATIVE_TIME_TOLERANCE * max(float(own[-1]), 1e-300)
-        return np.asarray(values[np.maximum(np.searchsorted(own, times + slack, side="right") - 1, 0)])
-
-    def _apply_delay(self, name: str, delay: float, before: float) -> tuple[Floats, Floats]:
-        if not delay:
-            return self.times, self.data[name]
-        return np.append(0.0, self.times + delay), np.append(before, self.data[name])
-
     def indices_within(self, duration: float) -> NDArray[np.intp]:
         """Indices of the samples within a duration [s]."""
         return np.flatnonzero(self.times <= duration * (1.0 + _RELATIVE_TIME_TOLERANCE))
@@ -519,9 +462,9 @@ class NonuniformSamples:
     def resample(self, behaviour: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
         """Resample to a regular grid: interval means of held inputs, linear interpolation of other signals."""
         rows = int(np.floor(float(self.times[-1]) / step + 1e-6)) + 1
-        grid, pieces = uniform_times(rows, step), HoldSegments.of(self.times, rows, step)
+        grid = uniform_times(rows, step)
         return {
-            name: pieces.means(values)
+            name: _core.nonuniform_means(self.times, values, rows, step, True)
             if behaviour.get(name) == ZERO_ORDER_HOLD
             else np.interp(grid, self.times[~np.isnan(values)], drop_missing(values))
             for name, values in self.data.items()
@@ -536,10 +479,13 @@ class NonuniformSamples:
         times, data = np.maximum(self.times[kept] - start, 0.0), {n: v[kept] for n, v in self.data.items()}
         if kept.size == 0 or times[0] > tiny:
             times = np.append(0.0, times)
-            begin = np.array([start])
-            for name in self.data:
+            # Times that differ from a switching instant only by rounding count as equal.
+            before = start + _RELATIVE_TIME_TOLERANCE * float(self.times[-1])
+            row = max(int(np.searchsorted(self.times, before, side="right")) - 1, 0)
+            for name, values in self.data.items():
                 kind = behaviour.get(name)
-                first = np.array([np.nan]) if kind is None else self.at(name, kind, begin, 0.0, 0.0)
+                held = kind == ZERO_ORDER_HOLD
+                first = np.nan if kind is None else values[row] if held else np.interp(start, self.times, values)
                 data[name] = np.append(first, data[name])
         return NonuniformSamples(times, data)
 

@@ -14,7 +14,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError, FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Iterate, Objective, RunSampler
+from ftlm.estimation.objective import Iterate, Objective
 from ftlm.simulation.discretization import COULOMB_PREFIX, record
 from ftlm.structure.equation import Equation, Friction, Term
 from ftlm.structure.order import Order
@@ -166,7 +166,7 @@ def run_friction_multistart(
     structure = problem.structure
     check_moves(runs, structure)
     if not structure.has_friction:
-        return run_frictionless_multistart(alike, floor, threads, progress)
+        return run_plain_multistart(alike, floor, threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
     starts: list[Iterate] = []
     if any(rubs.stribeck is not None for _, rubs in equations_with_friction(structure)):
@@ -185,7 +185,7 @@ def run_friction_multistart(
         return fit_on_coarse_grids(coarse, starts, threads)
     # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
     signed = FreeProblem.of(replace(with_measured_sign(structure), coupling="measured"))
-    reached = run_frictionless_multistart(replace(alike, problem=signed), floor, threads, progress)
+    reached = run_plain_multistart(replace(alike, problem=signed), floor, threads, progress)
     for values, origin in list(zip(reached.values, reached.origins, strict=True))[:MAX_SURVIVORS]:
         starts += coulomb_starts(coarse, dict(zip(signed.names, values, strict=True)), origin)
     if len(structure.equations) > 1 and len(reached):
@@ -229,7 +229,7 @@ def fit_frictionless_equations(
         if item.friction is None:
             named = {n: orders[n] for n in item.order_names}
             alone = FreeProblem.of(structure.with_measured_inputs(item.output).with_orders(named))
-            reached = run_frictionless_multistart(replace(alike, problem=alone, weights=[weight]), floor, threads, None)
+            reached = run_plain_multistart(replace(alike, problem=alone, weights=[weight]), floor, threads, None)
             values |= alone.coefficients_by_name(alone.split(reached.values[0])[1]) if len(reached) else {}
     return values
 
@@ -319,21 +319,21 @@ def reaction_coefficients(
     return out
 
 
-def run_frictionless_multistart(
+def run_plain_multistart(
     alike: Objective, floor: float, threads: int, progress: Callable[[int, int], None] | None
 ) -> _core.JointMultistart:
     """Run the multistart of a problem without friction, with equal weight for every output."""
-    runs = RunSampler(alike.problem, alike.runs).core_arguments(progress)
     limits = (threads, memory_limit())
-    return _core.joint_multistart(alike.problem.core, runs, alike.weights, floor, limits, stop_flag())
+    return _core.joint_multistart(
+        alike.problem.core, alike.recordings, alike.weights, floor, limits, progress, stop_flag()
+    )
 
 
 def fit_on_coarse_grids(coarse: Objective, starts: Sequence[Iterate], threads: int) -> _core.JointMultistart:
     """Refine initial guesses on coarse grids and return them ranked, best first."""
-    runs = RunSampler(coarse.problem, coarse.runs).core_arguments()
     return _core.refine_candidates(
         coarse.problem.core,
-        runs,
+        coarse.recordings,
         coarse.weights,
         coarse.decimation,
         [(a.values.tolist(), a.origin) for a in starts],

@@ -16,11 +16,11 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inputs
-from ftlm.estimation.friction import run_friction_multistart
-from ftlm.estimation.objective import Iterate, Objective, RunSampler, propagated_errors
+from ftlm.estimation.friction import run_friction_multistart, run_plain_multistart
+from ftlm.estimation.objective import Iterate, Objective, propagated_errors
 from ftlm.model.model import FitParameters, Model
 from ftlm.progress import TOTAL_PARTS, ShareTracker
-from ftlm.simulation.discretization import compared_values
+from ftlm.simulation.discretization import compared_values, recording
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Structure
@@ -288,10 +288,9 @@ class Initialization:
         shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.deviations, strict=True)]
         floor = float(np.mean([share**2 for share in shares]))
         weights = [1.0 / (COARSE_SHARE * size) for size in self.deviations]
-        if self.problem.structure.has_friction:
-            return run_friction_multistart(Objective(self.problem, self.runs, weights), floor, threads, progress)
-        runs = RunSampler(self.problem, self.runs).core_arguments(progress)
-        return _core.joint_multistart(self.problem.core, runs, weights, floor, (threads, memory_limit()), stop_flag())
+        start = Objective(self.problem, self.runs, weights)
+        run = run_friction_multistart if self.problem.structure.has_friction else run_plain_multistart
+        return run(start, floor, threads, progress)
 
 
 def output_deviations(runs: Sequence[Run], structure: Structure) -> list[float]:
@@ -337,7 +336,7 @@ def fit_output_error(
         given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
     found = _core.joint_fit(
         problem.core,
-        RunSampler(problem, runs).core_arguments(lambda done, _: course.advance_to(done / TOTAL_PARTS)),
+        [recording(run, structure) for run in runs],
         list(zip(outset.deviations, outset.noise, strict=True)),
         [[v[n] for n in problem.names] for v in known],
         None if start is None else [start[n] for n in problem.names],
@@ -346,6 +345,7 @@ def fit_output_error(
         loss == "huber",
         refine,
         (threads, memory_limit()),
+        lambda done, _: course.advance_to(done / TOTAL_PARTS),
         stop_flag(),
     )
     if found is None:

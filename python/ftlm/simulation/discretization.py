@@ -13,19 +13,16 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run, Runs
-from ftlm.data.sampling import ZERO_ORDER_HOLD, NonuniformSamples, interpolate_gaps, make_read_only
+from ftlm.data.sampling import make_read_only
 from ftlm.errors import DataError, ModelError
 from ftlm.simulation.initial_conditions import (
     common_initial_conditions,
     deviations,
-    filter_impulse_responses,
     has_memory,
-    remove_filter_transient,
     resolve_initial_conditions,
     resolve_start,
 )
 from ftlm.structure.equation import Equation, Term
-from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
 from ftlm.utils.parameters import parameter, setting
@@ -152,70 +149,107 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     Raises for missing signals, signals whose squares underflow, delays of outputs, and missing samples of inputs. Other
     missing samples are interpolated and must not be fitted.
     """
-    _check_missing(run, structure)
-    check_zero_order_hold(run, structure)
     if structure.offset == "level":
         # Deviations rest at 0, where an equation has no term for the level.
         run, structure = deviations(run, structure)[0], replace(structure, offset="none")
+    _check_known_inputs(structure)
     initial = resolve_initial_conditions(run, structure)
-    sensor = None
-    if filtered and structure.sensor_filter is not None:
-        sensor = sensor_series(structure, m, run.duration / m)
-    rows = []
-    for name in structure.signals:
-        means = _means(run, structure, name, m, at_rest=initial == "rest")
-        if sensor is not None and not structure.is_filtered(name):
-            means = _core.series_multiply(sensor, means, m)
-        peak = float(np.max(np.abs(means), initial=0.0))
-        if 0 < peak < MIN_SIGNAL_PEAK:
-            raise DataError(
-                f"signal {name!r} of run {run.name!r}: no mean is larger than {peak:.3g}, and squares below "
-                f"{MIN_SIGNAL_PEAK:g} lose their digits; scale the signal"
-            )
-        rows.append(means)
-    states, step = structure.filter_states(initial), run.duration / m
-    levels = tuple(_initial_level(run, structure, s, initial) for s in structure.signals)
-    held = tuple(states > 0 and sensor is not None and structure.is_filtered(s) for s in structure.signals)
+    step, means, sensor, (transient, levels, responses) = recording(run, structure, initial).pulses(m, filtered)
     return Record(
         structure.signals,
         step,
-        make_read_only(np.stack(rows)),
+        make_read_only(means),
         tuple(s in run.inputs for s in structure.signals),
         sensor,
         initial,
         structure.offset,
-        states,
-        held,
-        levels,
-        None
-        if sensor is None or structure.sensor_filter is None
-        else filter_impulse_responses(structure.sensor_filter, states, m, step),
+        structure.filter_states(initial),
+        tuple(transient),
+        tuple(levels),
+        responses,
     )
 
 
-def _initial_level(run: Run, structure: Structure, name: str, initial: Initial) -> float:
-    """Initial level of a signal; 0 from rest, for filtered inputs, and for a missing first sample."""
-    if initial == "rest" or name not in run or (structure.all_filtered and structure.is_filtered(name)):
-        return 0.0
-    first = float(apply_input_nonlinearity(run, structure, name)[name][0])
-    return first if math.isfinite(first) else 0.0
+def recording(run: Run, structure: Structure, initial: Initial | None = None) -> _core.Recording:
+    """Return a run as the core samples it for a structure, with ``initial`` or the structure's initial conditions.
+
+    Free delays and limits are the core's to apply. Raises for missing signals, delays of outputs, and missing samples
+    of inputs.
+    """
+    if structure.offset == "level":
+        run, structure = deviations(run, structure)[0], replace(structure, offset="none")
+    _check_missing(run, structure)
+    check_zero_order_hold(run, structure)
+    initial = resolve_initial_conditions(run, structure) if initial is None else initial
+    sensor, signals = structure.sensor_filter, structure.signals
+    return _core.Recording(
+        {
+            "name": run.name,
+            "step": run.step,
+            "times": None if run.sample_times is None else run.sample_times.times,
+            "signals": [_channel(run, structure, name) for name in signals],
+            "outputs": [signals.index(name) for name in structure.outputs],
+            "filter": None if sensor is None else (sensor.numerator, sensor.denominator),
+            "filter_states": structure.filter_states(initial),
+            "at_rest": initial == "rest",
+            "coupled": structure.coupling == "simulated",
+            "friction": structure.has_friction,
+            "free": [(signals.index(item.signal), item.law) for item in structure.free_inputs],
+        }
+    )
+
+
+def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
+    """Return a signal of a run as the core samples it."""
+    channel: _core._Channel = {
+        "name": name,
+        "samples": np.zeros(0),
+        "nonuniform": None,
+        "role": "derived",
+        "delay": None,
+        "limits": [],
+        "filtered": structure.is_filtered(name),
+        "enters_others": any(t.signal == name for e in structure.equations if e.output != name for t in e.terms),
+    }
+    moving = name.removeprefix(COULOMB_PREFIX)
+    if name not in run and moving != name and moving in run:
+        # The sign of the measured rate over each interval; the last row repeats so that rows match.
+        rate = np.sign(np.diff(run[moving]))
+        return {**channel, "samples": np.append(rate, rate[-1])}
+    if name not in run:
+        raise DataError(
+            f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
+            f"it has {', '.join(run.signals)}: name the columns with {parameter('inputs')} and "
+            f"{parameter('outputs')}"
+        )
+    delay = structure.delay.get(name)
+    if delay and name not in run.inputs:
+        raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
+    limits = [limit for limit in structure.limits if limit.signal == name]
+    return {
+        **channel,
+        "samples": run[name],
+        "nonuniform": None if run.sample_times is None else run.sample_times.data[name],
+        "role": run.intersample.get(name, "output"),
+        "delay": delay,
+        "limits": [(limit.law, None if isinstance(limit.value, tuple) else limit.value) for limit in limits],
+    }
+
+
+def _check_known_inputs(structure: Structure) -> None:
+    """Raise ModelError for a free delay, saturation or dead zone."""
+    for item in structure.free_inputs:
+        what, value = ("delays", "value in seconds") if item.law == "delay" else ("limits", "value")
+        raise ModelError(
+            f"the {item.words} is free: only {parameter('method', 'output-error')} estimates {what}; give its {value}"
+        )
 
 
 def apply_input_nonlinearity(run: Run, structure: Structure, name: str | None = None) -> Run:
     """Return the run with known saturations and dead zones applied to its inputs, or to one of them."""
-    free = next((limit for limit in structure.limits if limit.free is not None), None)
-    if free is not None:
-        raise ModelError(
-            f"the {INPUT_EFFECT_LABELS[free.law]} of {free.signal} is free: only "
-            f"{parameter('method', 'output-error')} estimates limits; give its value"
-        )
+    _check_known_inputs(structure)
     limits = [limit for limit in structure.limits if limit.signal in run and name in (None, limit.signal)]
     return run.with_input_nonlinearities(limits) if limits else run
-
-
-def with_effective_inputs(run: Run, structure: Structure, name: str | None = None) -> Run:
-    """Return the run with effective inputs: input nonlinearities applied, filter transients removed."""
-    return remove_filter_transient(apply_input_nonlinearity(run, structure, name), structure, name)
 
 
 def check_zero_order_hold(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
@@ -318,44 +352,6 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
                 f"{int(np.flatnonzero(gone)[0])}: {what} cannot leave them out; use "
                 f"{parameter('method', 'output-error')} (identify), a part without gaps, or fill them yourself"
             )
-
-
-def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) -> Floats:
-    if name not in run and name.startswith(COULOMB_PREFIX) and name.removeprefix(COULOMB_PREFIX) in run:
-        # The sign of the measured rate over each interval; the last row repeats so that rows match.
-        rate = np.sign(np.diff(run[name.removeprefix(COULOMB_PREFIX)]))
-        return _core.pulse_means(np.append(rate, rate[-1]), m, True)
-    if name not in run:
-        raise DataError(
-            f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
-            f"it has {', '.join(run.signals)}: name the columns with {parameter('inputs')} and "
-            f"{parameter('outputs')}"
-        )
-    run = with_effective_inputs(run, structure, name)
-    samples = interpolate_gaps(run[name])
-    if name in structure.free_delays:
-        raise ModelError(
-            f"the delay of {name} is free: only {parameter('method', 'output-error')} estimates delays; give its "
-            "value in seconds"
-        )
-    delay = structure.delay.get(name, 0.0)
-    if name not in run.inputs:
-        if delay:
-            raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
-        if run.sample_times is not None and name not in run.missing_samples:
-            return run.sample_times.means(name, "foh", m, run.duration, 0.0, 0.0)
-        return _core.pulse_means(samples, m, False)
-    held = run.intersample[name] == "zoh"
-    if run.sample_times is not None:
-        before = 0.0 if at_rest else float(samples[0])
-        return run.sample_times.means(name, run.intersample[name], m, run.duration, delay, before)
-    if delay:
-        intervals = run.length - 1
-        # On a finer grid the delayed command switches within an interval, so it is held on that grid before the delay.
-        every = m // intervals if held and m % intervals == 0 else 1
-        samples = np.repeat(samples, every)[: intervals * every + 1]
-        samples = _core.delay_samples(samples, delay / run.step * every, 0.0 if at_rest else float(samples[0]))
-    return _core.pulse_means(samples, m, held)
 
 
 def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
@@ -488,62 +484,39 @@ class SampleTimes:
 
     Parameters
     ----------
-    run, record
-        The run, and its pulse means.
-    structure
-        Structure with the delays.
-    readings
-        Nonuniform samples of the run.
+    record
+        Pulse means of the run.
+    recording
+        The run.
     times
         Sample times [s since the first sample].
     """
 
-    run: Run
     record: Record
-    structure: Structure
-    readings: NonuniformSamples
+    recording: _core.Recording
     times: Floats
 
     @classmethod
     def of(cls, run: Run, record: Record, structure: Structure, times: Floats) -> SampleTimes:
         """Build for given times of a run; a uniformly sampled run has the samples of its grid."""
-        run = apply_input_nonlinearity(run, structure)
-        readings = run.sample_times or NonuniformSamples(run.time, {n: run[n] for n in run.signals})
-        return cls(run, record, structure, readings, times)
+        return cls(record, recording(run, structure, record.initial), times)
 
     @property
     def pulse_positions(self) -> Floats:
         """Sample times in units of pulses."""
         return np.asarray(np.minimum(self.times / self.record.step, float(self.record.m)))
 
-    def jumps(self, name: str) -> tuple[Floats, Floats] | None:
-        """Positions and sizes of the jumps of a zero-order-hold input; None for other signals."""
-        if name not in self.run.inputs or self.run.intersample[name] != ZERO_ORDER_HOLD:
-            return None
-        times, sizes = self.readings.jumps(name, self._delay(name), self._initial_value(name))
-        return np.asarray(times / self.record.step), sizes
-
     def values(self, name: str) -> Floats | None:
         """Values of a signal just after the sample times; None for a derived signal."""
-        if name in self.run.inputs:
-            kind = self.run.intersample[name]
-            return self.readings.at(name, kind, self.times, self._delay(name), self._initial_value(name))
-        if name not in self.run:
-            return None
-        return self.readings.at(name, "foh", self.times, 0.0, 0.0)
+        return self.recording.values_at(self.record.signals.index(name), self.times)
 
     def jump_correction(self, name: str, order: float) -> Floats | None:
         """Correction to the pulse means of I^order of an input with jumps, at the sample times."""
-        jumps = self.jumps(name)
+        jumps = self.recording.jumps(self.record.signals.index(name))
         if jumps is None:
             return None
+        jumps = (jumps[0] / self.record.step, jumps[1])
         return _core.kink_correction(self.record.m, self.pulse_positions, jumps, order, self.record.step)
-
-    def _delay(self, name: str) -> float:
-        return self.structure.delay.get(name, 0.0)
-
-    def _initial_value(self, name: str) -> float:
-        return 0.0 if self.record.initial == "rest" else float(self.readings.data[name][0])
 
 
 def compared_times(run: Run, structure: Structure) -> Floats:

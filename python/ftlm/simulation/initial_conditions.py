@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftlm.data.run import Run
-from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, make_read_only
-from ftlm.structure.sensor_filter import SensorFilter
+from ftlm.data.sampling import drop_missing
 from ftlm.structure.structure import History, Initial, Structure
 from ftlm.utils.linalg import vector_norm
 from ftlm.utils.statistics import (
@@ -342,138 +340,3 @@ def needs_history(
         return start_score(many, terms[1], few) + HISTORY_MARGIN < start_score(few, terms[0], few)
     doubt = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
     return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, doubt)
-
-
-#: Length of the fit of the transient, in time constants of the fastest pole, over which the filter's input is nearly a
-#: level and a slope; and minimum number of samples per parameter of the fit.
-TRANSIENT_FIT_TIME_CONSTANTS = 1.0
-SAMPLES_PER_PARAMETER = 2
-#: Product of fastest pole and sampling interval above which the transient has decayed before the second sample.
-MAX_POLE_STEP_PRODUCT = 1e3
-#: Number of cached filter responses.
-CACHED_RESPONSES = 4
-
-
-def remove_filter_transient(run: Run, structure: Structure, name: str | None = None) -> Run:
-    """Return the run without the filter's transient in its signals, or in one signal, that enter as filtered inputs.
-
-    From rest there is no transient. Unchanged are outputs that enter no other equation, zero-order-hold or delayed
-    commands, and signals of filters whose transients are not impulse responses or have decayed before the second
-    sample.
-    """
-    sensor = structure.sensor_filter
-    if sensor is None or not structure.all_filtered:
-        return run
-    names = [n for n in ([name] if name else structure.signals) if n in run and _enters_as_input(run, structure, n)]
-    if not names or not sensor.holds_answers or _fastest_pole(sensor) * run.step > MAX_POLE_STEP_PRODUCT:
-        return run
-    states = structure.filter_states(resolve_initial_conditions(run, structure))
-    if not states:
-        return run
-    changed = {n: run[n] - _filter_transient(run[n], run.step, sensor, states) for n in names}
-    if run.sample_times is None:
-        return run.with_samples(changed)
-    times = run.sample_times.times
-    own = {n: run.sample_times.data[n] - np.interp(times, run.time, run[n] - v) for n, v in changed.items()}
-    return run.with_samples(changed, own)
-
-
-def _enters_as_input(run: Run, structure: Structure, name: str) -> bool:
-    """Whether a filtered signal is an input of an equation other than its own."""
-    if not structure.is_filtered(name) or (structure.coupling == "simulated" and name in structure.outputs):
-        return False
-    if name in run.inputs and (
-        run.intersample[name] == ZERO_ORDER_HOLD or name in (*structure.delay, *structure.free_delays)
-    ):
-        return False
-    return any(t.signal == name for e in structure.equations if e.output != name for t in e.terms)
-
-
-def _filter_transient(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Floats:
-    """Transient of the filter at the samples of a signal; the first sample is all transient."""
-    system, gain = _state_space(sensor)
-    size = system.shape[0]
-    fastest = _fastest_pole(sensor)
-    shown = round(TRANSIENT_FIT_TIME_CONSTANTS / (fastest * step)) if fastest > 0 else 0
-    count = min(max(shown, SAMPLES_PER_PARAMETER * (states + 2)), samples.size)
-    # A level and a slope that come in are two states more, which nothing moves but the slope the level.
-    whole = np.zeros((size + 2, size + 2))
-    whole[:size, :size], whole[size - 1, size], whole[size, size + 1] = system, gain, 1.0
-    begun = np.zeros((size + 2, states + 2))
-    begun[:size, :states] = _impulse_states(system, gain, states)
-    begun[size, states], begun[size + 1, states + 1] = 1.0, 1.0
-    columns = _free_responses(whole * step, begun, count, 0)
-    jump = columns[0, states - 1]
-    rest = np.delete(columns, states - 1, axis=1)
-    level = samples[0] / jump
-    sizes = np.linalg.norm(rest, axis=0)
-    sizes[sizes == 0] = 1.0
-    found = np.linalg.lstsq(rest / sizes, samples[:count] - level * columns[:, states - 1], rcond=None)[0] / sizes
-    first = begun[:size, :states] @ np.append(found[: states - 1], level)
-    return _free_responses(system * step, first[:, None], samples.size, 0)[:, 0]
-
-
-@lru_cache(maxsize=CACHED_RESPONSES)
-def filter_impulse_responses(sensor: SensorFilter, states: int, m: int, step: float) -> Floats | None:
-    """Return pulse means of a filter's responses to an impulse and its derivatives, shape (states, m).
-
-    On the pulse grid an impulse would last for one pulse and its derivative for two. None for a filter with zeros, or
-    with a transient that decays within a pulse.
-    """
-    if not sensor.holds_answers or not states or _fastest_pole(sensor) * step > MAX_POLE_STEP_PRODUCT:
-        return None
-    system, gain = _state_space(sensor)
-    size = system.shape[0]
-    # What the answer has come to is one state more.
-    whole = np.zeros((size + 1, size + 1))
-    whole[:size, :size], whole[size, 0] = system, 1.0
-    begun = np.zeros((size + 1, states))
-    begun[:size] = _impulse_states(system, gain, states)
-    return make_read_only(
-        np.ascontiguousarray(np.diff(_free_responses(whole * step, begun, m + 1, size), axis=0).T / step)
-    )
-
-
-def _impulse_states(system: Floats, gain: float, states: int) -> Floats:
-    """Return the states after an impulse and after its derivatives, one column each."""
-    # An impulse is caught by the last state; each derivative of one goes through the system once more.
-    return np.stack([np.linalg.matrix_power(system, k)[:, -1] * gain for k in range(states)], axis=1)
-
-
-def _state_space(sensor: SensorFilter) -> tuple[Floats, float]:
-    """Return a filter without zeros as a chain of states with the output first, and its input gain."""
-    powers = {int(order): 0.0 for _, order in sensor.denominator}
-    for coefficient, order in sensor.denominator:
-        powers[int(order)] += coefficient
-    size = max(order for order, coefficient in powers.items() if coefficient)
-    system = np.diag(np.ones(size - 1), 1)
-    system[-1] = [-powers.get(k, 0.0) / powers[size] for k in range(size)]
-    return system, sum(c for c, _ in sensor.numerator) / powers[size]
-
-
-def _fastest_pole(sensor: SensorFilter) -> float:
-    """Magnitude of the fastest pole of a filter without zeros [rad/s]."""
-    return float(np.max(np.abs(np.linalg.eigvals(_state_space(sensor)[0])), initial=0.0))
-
-
-def _free_responses(system: Floats, begun: Floats, count: int, state: int) -> Floats:
-    """Return one state at unit time steps for several initial states, shape (count, initial states)."""
-    power = matrix_exponential(system)
-    states = begun[None]
-    while states.shape[0] < count:
-        states = np.concatenate([states, power @ states])
-        power = power @ power
-    return np.asarray(states[:count, state])
-
-
-def matrix_exponential(matrix: Floats) -> Floats:
-    """Exponential of a small matrix by scaling and squaring of a Taylor series."""
-    halvings = max(0, math.ceil(math.log2(max(float(np.linalg.norm(matrix, 1)), 1e-300))) + 1)
-    part = matrix / 2.0**halvings
-    term = total = np.eye(matrix.shape[0])
-    for k in range(1, 20):
-        term = term @ part / k
-        total = total + term
-    for _ in range(halvings):
-        total = total @ total
-    return total

@@ -23,8 +23,8 @@ from ftlm.simulation.discretization import (
     has_nonuniform_samples,
     linear_tuple,
     record,
+    recording,
     sensor_series,
-    with_effective_inputs,
 )
 from ftlm.simulation.initial_conditions import (
     has_memory,
@@ -561,7 +561,7 @@ def _values_at_samples(
     filtered = rec.sensor is not None and not structure.is_filtered(name)
     if not delay and not filtered:
         # Between two pulses there may be a corner, which their mean rounds off.
-        return with_effective_inputs(run, structure, name)[name]
+        return recording(run, structure, rec.initial).acting_samples(rec.signals.index(name))
     means = rec.of(name)
     if filtered or run.intersample.get(name) != "zoh":
         return _core.point_samples(means)[::every]

@@ -316,7 +316,7 @@ def score_subsets(
 def _products(
     ground: BaseModel,
     problem: FreeProblem,
-    experiments: list[object],
+    experiments: Sequence[_core.Experiment],
     ends: Sequence[int],
     places: Sequence[int],
     point: tuple[float, ...],

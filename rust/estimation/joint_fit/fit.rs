@@ -6,11 +6,11 @@ use super::parameter_set::ParameterSet;
 use super::problem::{Candidate, Iterate, OptimizationResult};
 use super::progress::{FitProgress, ProgressListener};
 use super::reweighting::{fit_reweighted, Loss, EVALUATIONS_PER_REWEIGHTING};
-use super::source::{Recordings, Sampling};
 use super::stability_preference::{prefer_stable, StabilityComparison};
 use super::step_refinement::{refine_step, Optimum, OptimumStatistics};
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
+use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::{mean, median, robust_deviation};
 
 /// Share of the progress of a fit that belongs to the multistart. Each sweep takes [`SWEEP_PROGRESS_SHARE`] of the
@@ -125,7 +125,7 @@ pub struct FitProblem<'a> {
     /// Free parameters.
     pub free: &'a ParameterSet,
     /// The runs.
-    pub source: &'a dyn Recordings,
+    pub source: &'a Recordings,
     /// Source of initial guesses.
     pub starts: &'a dyn InitialGuessSource,
     /// Scale of each output.
@@ -138,7 +138,7 @@ impl<'a> FitProblem<'a> {
     fn grid(&self, outputs: Vec<f64>, every: usize) -> Result<Objective<'a>> {
         let sampling = Sampling { pulses_per_sample: every, ..Sampling::default() };
         let weights = Weights { outputs, robust_weights: None };
-        let source: &'a dyn Recordings = self.source;
+        let source: &'a Recordings = self.source;
         Objective::new((&self.free.problem, source, self.stop), weights, sampling, false)
     }
 
@@ -183,11 +183,10 @@ impl<'a> FitProblem<'a> {
 /// use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure, Term};
 /// use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 /// use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
-/// use ftlm::estimation::joint_fit::{
-///     fit, FitProblem, Initialization, Loss, OutputScale, SampledRuns, Settings, Signal,
-/// };
-/// use ftlm::signal::block_pulse::Intersample;
+/// use ftlm::estimation::joint_fit::{fit, FitProblem, Initialization, Loss, OutputScale, Settings};
 /// use ftlm::parallel::Stop;
+/// use ftlm::recording::{Channel, Recording, Recordings, Role};
+/// use ftlm::signal::block_pulse::Intersample;
 /// // Data of D y = −2 y + 3 u in exact steps, fitted by D^alpha y = a y + b u.
 /// let (step, mut y) = (0.05, vec![0.0]);
 /// let u: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
@@ -195,9 +194,8 @@ impl<'a> FitProblem<'a> {
 /// u.iter().for_each(|u| y.push(fall * y[y.len() - 1] + 1.5 * (1.0 - fall) * u));
 /// y.pop();
 /// let sizes = [OutputScale::from_runs(&[y.clone()])];
-/// let signal = |samples, intersample| Signal { samples, intersample };
-/// let run = vec![signal(y, Intersample::Linear), signal(u, Intersample::Hold)];
-/// let runs = SampledRuns::new(step, vec![0], vec![run])?;
+/// let (y, u) = (Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold)));
+/// let runs = Recordings::new(vec![Recording::new("run", step, None, vec![y, u], vec![0])?])?;
 /// let term = |signal, name: &str| {
 ///     let coefficient = Coefficient::Free(name.into());
 ///     Term { signal, order: Order::number(0.0), coefficient, factor: 1.0 }

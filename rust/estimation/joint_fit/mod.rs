@@ -8,7 +8,7 @@
 
 pub mod covariance;
 pub mod fit;
-mod format;
+pub(crate) mod format;
 pub mod initial_guesses;
 pub mod multistart;
 pub mod objective;
@@ -16,7 +16,6 @@ pub mod parameter_set;
 pub mod problem;
 pub mod progress;
 pub mod reweighting;
-pub mod source;
 pub mod stability_preference;
 pub mod step_refinement;
 pub mod structure;
@@ -27,6 +26,5 @@ pub use objective::{Objective, Weights};
 pub use parameter_set::TimeScaling;
 pub use problem::{Candidate, Iterate, OptimizationResult, Problem};
 pub use reweighting::{fit_reweighted, Loss, RobustSummary};
-pub use source::{Recordings, SampledRuns, Sampling, Signal, Source};
 pub use stability_preference::StabilityComparison;
 pub use step_refinement::{best_alternative, refine_step, Optimum, OptimumStatistics};

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use super::problem::{Iterate, OptimizationResult, Problem};
-use super::source::{Sampling, Source};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{Experiment, Settings};
 use crate::parallel::Stop;
+use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 
 /// Relative cost decrease predicted for a full step below which an optimization has converged.
@@ -30,7 +30,7 @@ pub struct Weights {
 pub struct Objective<'a> {
     /// The optimization problem.
     pub problem: &'a Problem,
-    source: &'a dyn Source,
+    source: &'a Recordings,
     stop: &'a Stop,
     /// Weights of outputs and samples.
     pub weights: Weights,
@@ -49,7 +49,7 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// As the source; [`Error::Length`] for a wrong number of weights.
     pub fn new(
-        (problem, source, stop): (&'a Problem, &'a dyn Source, &'a Stop),
+        (problem, source, stop): (&'a Problem, &'a Recordings, &'a Stop),
         weights: Weights,
         sampling: Sampling,
         steady: bool,
@@ -83,18 +83,9 @@ impl<'a> Objective<'a> {
             check_length("runs with shares", experiments.len(), shares.len())?;
         }
         for (k, experiment) in experiments.iter_mut().enumerate() {
-            experiment.weights.clone_from(&weights.outputs);
             experiment.sample_weights.clone_from(&self.sample_mask[k]);
-            let Some(shares) = weights.robust_weights.as_ref().map(|of| &of[k]) else { continue };
-            check_length("outputs with shares", self.problem.outputs.len(), shares.len())?;
-            if experiment.sample_weights.is_empty() {
-                experiment.sample_weights.clone_from(shares);
-            } else {
-                for (row, by) in experiment.sample_weights.iter_mut().zip(shares) {
-                    check_length("shares of samples", row.len(), by.len())?;
-                    row.iter_mut().zip(by).for_each(|(share, by)| *share *= by);
-                }
-            }
+            let shares = weights.robust_weights.as_ref().map(|of| of[k].as_slice());
+            *experiment = experiment.clone().with_weights(&weights.outputs, shares)?;
         }
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
     }
@@ -128,7 +119,7 @@ impl<'a> Objective<'a> {
 
     /// Source of the runs.
     #[must_use]
-    pub fn source(&self) -> &'a dyn Source {
+    pub fn source(&self) -> &'a Recordings {
         self.source
     }
 

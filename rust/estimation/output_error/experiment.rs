@@ -99,6 +99,25 @@ impl Experiment {
         Ok(self)
     }
 
+    /// Set the weights of the outputs, and multiply those of the compared samples by `shares`.
+    ///
+    /// # Errors
+    /// [`Error::Length`] for another number of shares than outputs or compared samples.
+    pub fn with_weights(mut self, outputs: &[f64], shares: Option<&[Vec<f64>]>) -> Result<Self> {
+        self.weights = outputs.to_vec();
+        let Some(shares) = shares else { return Ok(self) };
+        check_length("outputs with shares", self.samples.len(), shares.len())?;
+        if self.sample_weights.is_empty() {
+            self.sample_weights = shares.to_vec();
+            return Ok(self);
+        }
+        for (row, by) in self.sample_weights.iter_mut().zip(shares) {
+            check_length("shares of samples", row.len(), by.len())?;
+            row.iter_mut().zip(by).for_each(|(share, by)| *share *= by);
+        }
+        Ok(self)
+    }
+
     /// Set the sensor filter of the simulated outputs.
     ///
     /// # Errors
@@ -197,7 +216,8 @@ impl Experiment {
     }
 
     /// Number of compared samples: those with a pulse on either side, or all nonuniform samples.
-    pub(crate) fn compared_count(&self) -> usize {
+    #[must_use]
+    pub fn compared_count(&self) -> usize {
         match &self.nonuniform {
             Some(own) => own.readings.len(),
             None => (self.record.m() / self.pulses_per_sample).saturating_sub(1),

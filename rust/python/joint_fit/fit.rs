@@ -7,7 +7,6 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::problem::JointProblem;
-use super::resampler::{CallbackSource, PythonResampler, Request, RunProperties, RunsArg};
 use crate::error::Result;
 use crate::estimation::joint_fit::fit;
 use crate::estimation::joint_fit::initial_guesses::OrderGrids;
@@ -15,12 +14,14 @@ use crate::estimation::joint_fit::multistart::{self, select_survivors, Multistar
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::{
     Candidate, FitProblem, Initialization, Iterate, JointFit, Loss, Objective, OptimizationResult, OptimumStatistics,
-    OutputScale, Sampling, Settings, Weights,
+    OutputScale, Settings, Weights,
 };
 use crate::python::convert::{matrix, stack_rows, List};
 use crate::python::errors::run_attached;
 use crate::python::estimation::status;
-use crate::python::order_search::watch::{run_with_requests, Stop};
+use crate::python::order_search::watch::{run_with_progress, Stop};
+use crate::python::recording::{recordings, Recording};
+use crate::recording::{Recordings, Sampling};
 
 type Table<'py> = Bound<'py, PyArray2<f64>>;
 /// Resources: (threads, bytes of memory of one order grid).
@@ -51,41 +52,39 @@ impl JointMultistart {
     }
 }
 
-/// Run `work` with the runs of an argument as source.
-fn run_on_source<T: Send + 'static>(
-    py: Python<'_>,
-    runs: RunsArg,
-    stop: Option<&Stop>,
-    work: impl FnOnce(&crate::parallel::Stop, &CallbackSource<'_, T>) -> Result<T> + Send + 'static,
-) -> PyResult<T> {
-    let (known, answering): (RunProperties, PythonResampler) = RunProperties::of(runs)?;
-    run_with_requests(
-        py,
-        stop,
-        |py, question: Request| answering.answer(py, question),
-        move |stop, desk| work(stop, &CallbackSource::<T>::new(desk, known)),
-    )
+/// Runs as source of a fit.
+fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
+    let outputs: Vec<usize> = free.structure.equations.iter().map(|e| e.output).collect();
+    recordings(runs, free.structure.signals.len(), &outputs, free.structure.inputs.len())
 }
 
 /// Multistart of a problem with these output weights. `floor` is the cost of pure noise per residual.
 #[pyfunction]
-#[pyo3(signature = (problem, runs, weights, floor, means, stop=None))]
-#[allow(clippy::needless_pass_by_value)]
+#[pyo3(signature = (problem, runs, weights, floor, means, progress=None, stop=None))]
+#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn joint_multistart(
     py: Python<'_>,
     problem: &JointProblem,
-    runs: RunsArg,
+    runs: List<Py<Recording>>,
     weights: List<f64>,
     floor: f64,
     means: Means,
+    progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<JointMultistart> {
     let (free, (threads, memory)) = (Arc::clone(&problem.inner), means);
-    let reached = run_on_source(py, runs, stop, move |stop, source| {
-        let starts = OrderGrids::new(source, threads, memory, stop);
-        let told = |done, of| source.report_progress(done, of);
-        let course =
-            MultistartContext { source, starts: &starts, stop, weights: &weights, floor, threads, told: Some(&told) };
+    let source = source(&free, &runs)?;
+    let reached = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
+        let starts = OrderGrids::new(&source, threads, memory, stop);
+        let course = MultistartContext {
+            source: &source,
+            starts: &starts,
+            stop,
+            weights: &weights,
+            floor,
+            threads,
+            told: Some(&report),
+        };
         multistart::run_multistart(&free, course)
     })?;
     Ok(JointMultistart { inner: Arc::new(reached) })
@@ -98,7 +97,7 @@ pub fn joint_multistart(
 pub fn refine_candidates(
     py: Python<'_>,
     problem: &JointProblem,
-    runs: RunsArg,
+    runs: List<Py<Recording>>,
     weights: List<f64>,
     decimation: usize,
     starts: List<(List<f64>, String)>,
@@ -108,10 +107,11 @@ pub fn refine_candidates(
     let free = Arc::clone(&problem.inner);
     let starts =
         starts.into_iter().map(|(values, origin)| candidate_at(&free, &values, origin)).collect::<Result<Vec<_>>>()?;
-    let reached = run_on_source(py, runs, stop, move |stop, source| {
+    let source = source(&free, &runs)?;
+    let reached = run_with_progress(py, stop, None, move |stop, _| {
         let weights = Weights { outputs: weights.into(), robust_weights: None };
         let sampling = Sampling { decimation, ..Sampling::default() };
-        let grid = Objective::new((&free.problem, source, stop), weights, sampling, false)?;
+        let grid = Objective::new((&free.problem, &source, stop), weights, sampling, false)?;
         multistart::optimize_on_coarse_grids(&free, &grid, &starts, threads)
     })?;
     Ok(JointMultistart { inner: Arc::new(reached) })
@@ -127,12 +127,12 @@ type NearArg = (List<f64>, List<f64>, usize);
 
 /// Fit a structure to its runs. None if every start has a simulation that overflows.
 #[pyfunction]
-#[pyo3(signature = (problem, runs, sizes, known, start, near, candidates, huber, refine, means, stop=None))]
+#[pyo3(signature = (problem, runs, sizes, known, start, near, candidates, huber, refine, means, progress=None, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn joint_fit<'py>(
     py: Python<'py>,
     problem: &JointProblem,
-    runs: RunsArg,
+    runs: List<Py<Recording>>,
     sizes: List<(f64, f64)>,
     known: List<List<f64>>,
     start: Option<List<f64>>,
@@ -141,6 +141,7 @@ pub fn joint_fit<'py>(
     huber: bool,
     refine: bool,
     means: Means,
+    progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<Option<Bound<'py, PyDict>>> {
     let (free, (threads, memory)) = (Arc::clone(&problem.inner), means);
@@ -161,10 +162,11 @@ pub fn joint_fit<'py>(
     let outputs = free.problem.outputs.len();
     crate::error::check_length("sizes of outputs", outputs, sizes.len())?;
     let size = free.problem.size();
-    let found = run_on_source(py, runs, stop, move |stop, source| {
-        let starts = OrderGrids::new(source, threads, memory, stop);
-        let sought = FitProblem { free: &free, source, starts: &starts, sizes: &sizes, stop };
-        fit::fit(sought, initialization, settings, &|done, of| source.report_progress(done, of))
+    let source = source(&free, &runs)?;
+    let found = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
+        let starts = OrderGrids::new(&source, threads, memory, stop);
+        let sought = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
+        fit::fit(sought, initialization, settings, report)
     })?;
     found.map(|found| fit_to_dict(py, found, size)).transpose()
 }

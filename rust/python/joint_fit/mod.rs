@@ -2,7 +2,6 @@
 
 mod fit;
 mod problem;
-mod resampler;
 mod residuals;
 mod structure;
 

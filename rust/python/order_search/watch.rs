@@ -1,7 +1,7 @@
 //! Interruptible computation: work on a separate thread, polling of Python signals, progress and checkpoints.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{channel, Receiver, RecvTimeoutError, Sender};
+use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::time::Duration;
 
 use pyo3::prelude::*;
@@ -142,89 +142,54 @@ pub fn run_interruptible<T: Send + 'static>(
     })
 }
 
-/// Channel through which a computing thread sends requests to Python and receives responses.
-pub struct RequestChannel<Q, A, T> {
-    tell: Sender<WorkerMessage<Q, T>>,
-    answers: Receiver<Result<A, Error>>,
-}
-
-enum WorkerMessage<Q, T> {
-    Asks(Q),
+/// Message of a computing thread: progress, as steps done and total, or its end.
+enum WorkerMessage<T> {
+    Progresses(usize, usize),
     Ends(Result<T, Error>),
 }
 
-impl<Q, A, T> RequestChannel<Q, A, T> {
-    /// Send a request and wait for the response.
-    ///
-    /// # Errors
-    /// [`Error::Source`] if Python raised an exception of ftlm, [`Error::Interrupted`] if it raised another one or the
-    /// caller is gone.
-    pub fn ask(&self, question: Q) -> Result<A, Error> {
-        self.tell.send(WorkerMessage::Asks(question)).map_err(|_| Error::Interrupted)?;
-        self.answers.recv().unwrap_or(Err(Error::Interrupted))
-    }
-}
+/// Reports steps done and total.
+pub type Report<'a> = &'a dyn Fn(usize, usize) -> Result<(), Error>;
 
-/// As [`run_interruptible`], always on a separate thread, which may send requests to Python.
+/// As [`run_interruptible`], always on a separate thread, which reports its progress.
 ///
-/// Requests are served on the calling thread, so that an abandoned thread does not access Python. An exception of
-/// Python is raised again if `work` ends with it.
-pub fn run_with_requests<T: Send + 'static, Q: Send + 'static, A: Send + 'static>(
+/// `progress` is called on the calling thread, so that an abandoned thread does not access Python. An exception of it
+/// stops the computation.
+pub fn run_with_progress<T: Send + 'static>(
     py: Python<'_>,
     flag: Option<&Stop>,
-    answer: impl Fn(Python<'_>, Q) -> PyResult<A> + Send + Sync,
-    work: impl FnOnce(&parallel::Stop, &RequestChannel<Q, A, T>) -> Result<T, Error> + Send + 'static,
+    progress: Option<&Py<PyAny>>,
+    work: impl FnOnce(&parallel::Stop, Report<'_>) -> Result<T, Error> + Send + 'static,
 ) -> PyResult<T> {
     let stop = flag.cloned().unwrap_or_default().0;
     py.detach(|| {
-        let (tell, hear) = channel();
-        let (reply, answers) = channel();
-        let (told, desk) = (stop.clone(), RequestChannel { tell: tell.clone(), answers });
+        let (send, receive) = channel();
+        let told = stop.clone();
         // An abandoned thread has no receiver.
-        std::thread::spawn(move || drop(tell.send(WorkerMessage::Ends(catch_panic(|| work(&told, &desk))))));
-        let mut raised: Option<PyErr> = None;
+        std::thread::spawn(move || {
+            let report = |done, of| send.send(WorkerMessage::Progresses(done, of)).map_err(|_| Error::Interrupted);
+            let ended = catch_panic(|| work(&told, &report));
+            drop(send.send(WorkerMessage::Ends(ended)));
+        });
         loop {
-            match hear.recv_timeout(SIGNAL_POLL_INTERVAL) {
-                Ok(WorkerMessage::Ends(Err(Error::Source { why }))) => {
-                    return Err(raised.unwrap_or_else(|| Error::Source { why }.into()));
-                }
+            let looked = match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
                 Ok(WorkerMessage::Ends(result)) => return result.map_err(PyErr::from),
-                Ok(WorkerMessage::Asks(question)) => {
-                    let answered = Python::attach(|py| match answer(py, question) {
-                        Err(error) if own(py, &error)? => {
-                            let why = error.value(py).to_string();
-                            raised = Some(error);
-                            Ok(Err(Error::Source { why }))
-                        }
-                        answered => answered.map(Ok),
-                    });
-                    match answered {
-                        Ok(answered) => drop(reply.send(answered)),
-                        Err(error) => {
-                            stop.set();
-                            return Err(error);
-                        }
-                    }
+                Ok(WorkerMessage::Progresses(done, of)) => {
+                    Python::attach(|py| progress.map_or(Ok(()), |progress| progress.call1(py, (done, of)).map(drop)))
                 }
-                Err(RecvTimeoutError::Timeout) => {
-                    if let Err(error) = Python::attach(|py| py.check_signals()) {
-                        stop.set();
-                        return Err(error);
-                    }
-                    stop.check()?;
-                }
+                Err(RecvTimeoutError::Timeout) => Python::attach(|py| py.check_signals()),
                 Err(RecvTimeoutError::Disconnected) => {
                     let what = "a computing thread ended without a result".into();
                     return Err(Error::Internal { what }.into());
                 }
+            };
+            if let Err(error) = looked {
+                stop.set();
+                return Err(error);
             }
+            stop.check()?;
         }
     })
-}
-
-/// Whether an exception is one of ftlm's, which a computation may handle.
-fn own(py: Python<'_>, error: &PyErr) -> PyResult<bool> {
-    Ok(error.is_instance(py, &py.import("ftlm.errors")?.getattr("FtlmError")?))
 }
 
 /// Progress: candidates done, total, and pruned.

@@ -15,11 +15,11 @@ use super::format::format_general;
 use super::multistart::InitialGuessSource;
 use super::parameter_set::ParameterSet;
 use super::problem::Candidate;
-use super::source::Recordings;
 use crate::error::{check_length, Error, Result};
 use crate::estimation::joint_fit::structure::Input;
 use crate::estimation::output_error::InputLaw;
 use crate::parallel::Stop;
+use crate::recording::Recordings;
 use crate::regressors::Record;
 use crate::signal::block_pulse::Intersample;
 use crate::signal::statistics::median;
@@ -35,7 +35,7 @@ const ORDER_TOLERANCE: f64 = 1e-9;
 
 /// Initial guesses from coarse order grids, by least squares on records of the runs.
 pub struct OrderGrids<'a> {
-    source: &'a dyn Recordings,
+    source: &'a Recordings,
     threads: usize,
     memory: u64,
     stop: &'a Stop,
@@ -45,7 +45,7 @@ pub struct OrderGrids<'a> {
 impl<'a> OrderGrids<'a> {
     /// Order grids on the given runs, with the number of threads and bytes of memory per search.
     #[must_use]
-    pub fn new(source: &'a dyn Recordings, threads: usize, memory: u64, stop: &'a Stop) -> Self {
+    pub fn new(source: &'a Recordings, threads: usize, memory: u64, stop: &'a Stop) -> Self {
         Self { source, threads, memory, stop, low_passes: LowPassCache::default() }
     }
 
@@ -85,7 +85,7 @@ impl<'a> OrderGrids<'a> {
     /// Number of pulses of the records, limited by the shortest run.
     fn pulse_count(&self, free: &ParameterSet) -> Result<usize> {
         let output = free.structure.equations.first().map_or(0, |e| e.output);
-        let shortest = self.source.samples(output)?.iter().map(Vec::len).min().unwrap_or(0);
+        let shortest = self.source.samples(output)?.iter().map(|run| run.len()).min().unwrap_or(0);
         Ok(MAX_START_PULSES.min(shortest.saturating_sub(1)))
     }
 
@@ -189,11 +189,7 @@ const MIN_LIMIT_RATIO: f64 = 0.1;
 ///
 /// A fit with a delay too far off ends in a local optimum shifted by an oscillation. A limit above all samples has no
 /// effect.
-pub(super) fn input_points(
-    free: &ParameterSet,
-    source: &dyn Recordings,
-    fastest: f64,
-) -> Result<Vec<(Vec<f64>, String)>> {
+pub(super) fn input_points(free: &ParameterSet, source: &Recordings, fastest: f64) -> Result<Vec<(Vec<f64>, String)>> {
     let inputs = &free.structure.inputs;
     let axes = inputs.iter().map(|item| input_axis(item, inputs.len(), source, fastest)).collect::<Result<Vec<_>>>()?;
     let mut points = vec![Vec::new()];
@@ -208,7 +204,7 @@ pub(super) fn input_points(
 }
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-fn input_axis(item: &Input, count: usize, source: &dyn Recordings, fastest: f64) -> Result<Vec<f64>> {
+fn input_axis(item: &Input, count: usize, source: &Recordings, fastest: f64) -> Result<Vec<f64>> {
     let (low, high) = item.free.bounds;
     let most = (libm::pow(MAX_DELAY_STARTS, 1.0 / count as f64) as usize).max(2);
     if item.free.law == InputLaw::Delay {
@@ -217,7 +213,7 @@ fn input_axis(item: &Input, count: usize, source: &dyn Recordings, fastest: f64)
     }
     // `max` ignores NaN, so missing samples are skipped.
     let samples = source.samples(item.free.signal)?;
-    let largest = samples.iter().flatten().fold(0.0, |largest: f64, v| largest.max(v.abs()));
+    let largest = samples.into_iter().flatten().fold(0.0, |largest: f64, v| largest.max(v.abs()));
     let (least, reached) = (low.max(MIN_LIMIT_RATIO * largest), high.min(largest));
     let mut values = linspace(least.min(reached), reached, MAX_LIMIT_STARTS.min(most) + 1);
     values.pop();

@@ -9,7 +9,7 @@ use crate::estimation::joint_fit::initial_guesses::power_frequency;
 use crate::estimation::joint_fit::objective::{Objective, MAX_PULSES_PER_SAMPLE};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::Candidate;
-use crate::estimation::joint_fit::source::{Recordings, Sampling};
+use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::mean;
 
 /// Number of candidates that determine the step of the coarse grid.
@@ -103,8 +103,11 @@ const MIN_DEVIATION_RATIO: f64 = 0.7;
 ///
 /// Decimation must not alias the motion. If a long record needs a larger decimation, its first part is used instead,
 /// provided that it varies like the whole record.
+///
+/// # Errors
+/// If an output of the structure is no signal of the runs.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn coarse_sampling(free: &ParameterSet, source: &dyn Recordings) -> Result<Sampling> {
+pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampling> {
     let spans = source.spans();
     let each = (MAX_COARSE_SAMPLES / spans.len().max(1)).max(MIN_RUN_SAMPLES);
     let outputs = free.structure.equations.iter().map(|equation| source.samples(equation.output));
@@ -115,7 +118,7 @@ pub(super) fn coarse_sampling(free: &ParameterSet, source: &dyn Recordings) -> R
     if decimation <= MAX_UNCHECKED_DECIMATION {
         return Ok(all);
     }
-    let turns = |runs: &Vec<Vec<f64>>| {
+    let turns = |runs: &Vec<&[f64]>| {
         let pairs = runs.iter().zip(&spans);
         pairs.map(|(samples, &(step, _))| power_frequency(samples, step) * step).fold(f64::NEG_INFINITY, f64::max)
     };
@@ -126,7 +129,7 @@ pub(super) fn coarse_sampling(free: &ParameterSet, source: &dyn Recordings) -> R
         return Ok(all);
     }
     let first = each * carried;
-    let as_lively = |samples: &Vec<f64>| {
+    let as_lively = |samples: &&[f64]| {
         standard_deviation(&samples[..=first.min(samples.len() - 1)])
             >= MIN_DEVIATION_RATIO * standard_deviation(samples)
     };

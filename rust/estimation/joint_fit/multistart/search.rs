@@ -16,9 +16,9 @@ use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER
 use crate::estimation::joint_fit::parameter_set::{ParameterSet, TimeScaling};
 use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::progress::ProgressListener;
-use crate::estimation::joint_fit::source::Recordings;
 use crate::estimation::joint_fit::structure::{Equation, Structure};
 use crate::parallel::Stop;
+use crate::recording::Recordings;
 
 /// Ratio of the best cost to the noise floor above which candidates behind the best are promoted, too. Candidates up to
 /// [`MAX_PROMOTION_COST_RATIO`] are promoted if they improve in a few evaluations.
@@ -38,7 +38,7 @@ pub trait InitialGuessSource {
 #[derive(Clone, Copy)]
 pub struct MultistartContext<'a> {
     /// The runs.
-    pub source: &'a dyn Recordings,
+    pub source: &'a Recordings,
     /// Source of initial guesses.
     pub starts: &'a dyn InitialGuessSource,
     /// Cancellation flag.

@@ -1,0 +1,175 @@
+//! States of a sensor filter without zeros: its initial transient in a signal, and its responses to impulses.
+//!
+//! A signal that was filtered from an unknown state holds a sum of the filter's responses to an impulse and its
+//! derivatives. On a pulse grid an impulse would last for one pulse and its derivative for two, so these responses are
+//! those of the states.
+
+use crate::equation::Filter;
+use crate::error::{check_points, Result};
+use crate::linalg::dense::{multiply, singular_values};
+use crate::linalg::orthogonal::norm;
+use crate::linalg::small::spectral_radius;
+use crate::state_space::exponential;
+
+/// Length of the fit of the transient, in time constants of the fastest pole, over which the filter's input is nearly a
+/// level and a slope; and minimum number of samples per parameter of the fit.
+const TRANSIENT_FIT_TIME_CONSTANTS: f64 = 1.0;
+const SAMPLES_PER_PARAMETER: usize = 2;
+/// Product of fastest pole and sampling interval above which the transient has decayed before the second sample.
+const MAX_POLE_STEP_PRODUCT: f64 = 1e3;
+
+/// Filter without zeros as a chain of states, the output first.
+pub(super) struct FilterStates {
+    /// Number of states.
+    size: usize,
+    /// Row-major system matrix.
+    system: Vec<f64>,
+    /// Gain of the filter's input on the last state.
+    gain: f64,
+    /// Magnitude of the fastest pole \[rad/s\].
+    fastest: f64,
+}
+
+impl FilterStates {
+    /// States of a filter; None if its transients are not impulse responses: for zeros, fractional orders, no order.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(super) fn of(filter: &Filter) -> Option<Self> {
+        let whole = |order: f64| order.fract() == 0.0;
+        let used = |terms: &[(f64, f64)]| terms.iter().copied().filter(|(c, _)| *c != 0.0).collect::<Vec<_>>();
+        let (top, bottom) = (used(&filter.numerator), used(&filter.denominator));
+        if top.iter().any(|(_, order)| *order > 0.0) || !bottom.iter().all(|(_, order)| whole(*order)) {
+            return None;
+        }
+        let highest = bottom.iter().map(|(_, order)| *order as usize).max()?;
+        let mut powers = vec![0.0; highest + 1];
+        bottom.iter().for_each(|&(coefficient, order)| powers[order as usize] += coefficient);
+        let size = powers.iter().rposition(|c| *c != 0.0).filter(|&size| size > 0)?;
+        let mut system = vec![0.0; size * size];
+        (1..size).for_each(|i| system[(i - 1) * size + i] = 1.0);
+        (0..size).for_each(|k| system[(size - 1) * size + k] = -powers[k] / powers[size]);
+        let gain = filter.numerator.iter().map(|(c, _)| c).sum::<f64>() / powers[size];
+        let fastest = spectral_radius(&powers[..=size])?;
+        Some(Self { size, system, gain, fastest })
+    }
+
+    /// Whether a transient lasts beyond the first sample at this interval \[s\].
+    pub(super) fn lasts(&self, step: f64) -> bool {
+        self.fastest * step <= MAX_POLE_STEP_PRODUCT
+    }
+
+    /// States after an impulse and its derivatives, as rows.
+    fn impulse_states(&self, count: usize) -> Vec<Vec<f64>> {
+        // An impulse is caught by the last state; each derivative of one goes through the system once more.
+        let mut state = vec![0.0; self.size];
+        state[self.size - 1] = self.gain;
+        let mut states = Vec::with_capacity(count);
+        for _ in 0..count {
+            let next = self.times(&state);
+            states.push(std::mem::replace(&mut state, next));
+        }
+        states
+    }
+
+    fn times(&self, state: &[f64]) -> Vec<f64> {
+        self.system.chunks_exact(self.size).map(|row| row.iter().zip(state).map(|(a, x)| a * x).sum()).collect()
+    }
+
+    /// System with more states behind it, `step` times each element: (row, column, value) of what is added.
+    fn extended_system(&self, more: usize, links: &[(usize, usize, f64)], step: f64) -> Vec<f64> {
+        let n = self.size + more;
+        let mut whole = vec![0.0; n * n];
+        for (i, row) in self.system.chunks_exact(self.size).enumerate() {
+            row.iter().enumerate().for_each(|(j, v)| whole[i * n + j] = v * step);
+        }
+        links.iter().for_each(|&(i, j, value)| whole[i * n + j] = value * step);
+        whole
+    }
+
+    /// Initial transient of a signal at its samples; the first sample is all transient. None if it cannot be computed.
+    ///
+    /// The signal that the filter passed is nearly a level and a slope over the first samples, beside which responses
+    /// to an impulse and its derivatives, `states` in all, are fitted.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(super) fn transient(&self, samples: &[f64], step: f64, states: usize) -> Option<Vec<f64>> {
+        let shown = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest * step);
+        let shown = if self.fastest > 0.0 { shown.round_ties_even().min(samples.len() as f64) as usize } else { 0 };
+        let count = shown.max(SAMPLES_PER_PARAMETER * (states + 2)).min(samples.len());
+        // A level and a slope that come in are two states more, which nothing moves but the slope the level.
+        let n = self.size;
+        let whole = self.extended_system(2, &[(n - 1, n, self.gain), (n, n + 1, 1.0)], step);
+        let unit = |at: usize| (0..n + 2).map(|i| f64::from(u8::from(i == at))).collect::<Vec<f64>>();
+        let impulses = self.impulse_states(states);
+        let mut starts: Vec<Vec<f64>> = impulses.iter().map(|state| [state.as_slice(), &[0.0; 2]].concat()).collect();
+        starts.extend([unit(n), unit(n + 1)]);
+        let mut columns = free_responses(&whole, n + 2, &starts, count, 0)?;
+        let first = columns.remove(states.checked_sub(1)?);
+        let level = samples.first()? / first.first()?;
+        let sizes: Vec<f64> = columns.iter().map(|c| norm(c)).map(|s| if s == 0.0 { 1.0 } else { s }).collect();
+        let scaled: Vec<Vec<f64>> =
+            columns.iter().zip(&sizes).map(|(c, size)| c.iter().map(|v| v / size).collect()).collect();
+        let rest: Vec<f64> = samples.iter().zip(&first).map(|(v, one)| v - level * one).collect();
+        let mut found = minimum_norm_solution(&scaled, &rest)?;
+        found.iter_mut().zip(&sizes).for_each(|(x, size)| *x /= size);
+        found.truncate(states - 1);
+        found.push(level);
+        let mut start = vec![0.0; n];
+        for (state, x) in impulses.iter().zip(&found) {
+            start.iter_mut().zip(state).for_each(|(sum, v)| *sum += v * x);
+        }
+        free_responses(&self.extended_system(0, &[], step), n, &[start], samples.len(), 0)
+            .map(|mut rows| rows.remove(0))
+    }
+
+    /// Means over `m` pulses of the responses to an impulse and its derivatives; empty if they are not finite or have
+    /// decayed within a pulse.
+    ///
+    /// # Errors
+    /// Too many pulses.
+    pub(super) fn impulse_responses(&self, states: usize, m: usize, step: f64) -> Result<Vec<Vec<f64>>> {
+        check_points("m", m)?;
+        if states == 0 || !self.lasts(step) {
+            return Ok(Vec::new());
+        }
+        // The integral of the response is one state more.
+        let n = self.size;
+        let starts: Vec<Vec<f64>> =
+            self.impulse_states(states).iter().map(|state| [state.as_slice(), &[0.0]].concat()).collect();
+        let integrals = free_responses(&self.extended_system(1, &[(n, 0, 1.0)], step), n + 1, &starts, m + 1, n);
+        let means = |row: Vec<f64>| row.windows(2).map(|pair| (pair[1] - pair[0]) / step).collect();
+        Ok(integrals.unwrap_or_default().into_iter().map(means).collect())
+    }
+}
+
+/// One state at unit time steps for several initial states, as rows of `count`; None if the transition overflows.
+fn free_responses(system: &[f64], n: usize, starts: &[Vec<f64>], count: usize, state: usize) -> Option<Vec<Vec<f64>>> {
+    // Powers of the transition double the number of steps that are known: a row of each is read at those before.
+    let mut power = exponential(system, n)?;
+    let rows = starts.len();
+    let mut known: Vec<f64> = starts.concat();
+    let mut steps = 1;
+    while steps < count {
+        // States are rows, so that they are multiplied by the transposed transition.
+        let transposed: Vec<f64> = (0..n * n).map(|k| power[(k % n) * n + k / n]).collect();
+        known.extend(multiply(&known, &transposed, steps * rows, n, n));
+        steps *= 2;
+        power = multiply(&power, &power, n, n, n);
+    }
+    Some((0..rows).map(|row| (0..count).map(|k| known[(k * rows + row) * n + state]).collect()).collect())
+}
+
+/// Least-squares solution of smallest norm; None if the singular values cannot be computed.
+#[allow(clippy::cast_precision_loss)]
+fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64]) -> Option<Vec<f64>> {
+    let found = singular_values(columns)?;
+    let least = found.values.first().copied().unwrap_or(0.0)
+        * f64::EPSILON
+        * target.len().min(columns.first().map_or(0, Vec::len)).max(columns.len()) as f64;
+    let mut solution = vec![0.0; columns.len()];
+    for ((left, value), right) in found.left.iter().zip(&found.values).zip(&found.right) {
+        if *value > least {
+            let share = left.iter().zip(target).map(|(u, v)| u * v).sum::<f64>() / value;
+            solution.iter_mut().zip(right).for_each(|(x, v)| *x += share * v);
+        }
+    }
+    Some(solution)
+}

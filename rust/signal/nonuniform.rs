@@ -1,0 +1,202 @@
+//! Signals at nonuniform sample times: values between the samples, jumps of a hold, exact block-pulse means.
+//!
+//! A held signal keeps its value until the next sample, all others are linear between samples. Sample times ascend
+//! from 0.
+
+use std::borrow::Cow;
+
+use super::block_pulse::{check_pulses, Intersample};
+use crate::error::{check_finite, check_length, check_step, Error, Result};
+
+/// Largest distance of a sample from an edge of a pulse, in pulses, at which both coincide.
+const EDGE_TOLERANCE_PULSES: f64 = 1e-6;
+/// Relative tolerance of comparisons of times, as a share of the duration.
+pub(crate) const TIME_TOLERANCE: f64 = 1e-12;
+
+/// Samples of one signal with their times \[s\].
+#[derive(Debug, Clone)]
+pub struct NonuniformSignal<'a> {
+    times: Cow<'a, [f64]>,
+    values: Cow<'a, [f64]>,
+    intersample: Intersample,
+}
+
+impl<'a> NonuniformSignal<'a> {
+    /// Signal of as many samples as times, one at least. Values may be NaN where a linear signal was not read.
+    ///
+    /// # Errors
+    /// [`Error::Length`]; [`Error::Structure`] for times that do not ascend from 0.
+    pub fn new(times: &'a [f64], values: &'a [f64], intersample: Intersample) -> Result<Self> {
+        check_times(times)?;
+        check_length("values at the sample times", times.len(), values.len())?;
+        Ok(Self::new_unchecked(times, values, intersample))
+    }
+
+    /// Signal of checked times.
+    pub(crate) fn new_unchecked(times: &'a [f64], values: &'a [f64], intersample: Intersample) -> Self {
+        Self { times: Cow::Borrowed(times), values: Cow::Borrowed(values), intersample }
+    }
+
+    /// Signal after a delay \[s\], with the value before its first sample.
+    #[must_use]
+    pub fn with_delay(self, delay: f64, before: f64) -> Self {
+        if delay == 0.0 {
+            return self;
+        }
+        let times = std::iter::once(0.0).chain(self.times.iter().map(|t| t + delay)).collect();
+        let values = std::iter::once(before).chain(self.values.iter().copied()).collect();
+        Self { times, values, ..self }
+    }
+
+    /// Exact means over `m` pulses of this width \[s\]. O((N + m) log m).
+    ///
+    /// # Errors
+    /// No pulse or too many, a step that is not positive, a value that is not finite.
+    ///
+    /// ```
+    /// # use ftlm::signal::{block_pulse::Intersample, nonuniform::NonuniformSignal};
+    /// let held = NonuniformSignal::new(&[0.0, 0.5, 1.25], &[1.0, 3.0, 0.0], Intersample::Hold)?;
+    /// assert_eq!(held.means(2, 1.0)?, [2.0, 0.75]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[allow(clippy::cast_precision_loss)]
+    pub fn means(&self, m: usize, step: f64) -> Result<Vec<f64>> {
+        check_pulses(m)?;
+        check_step(step)?;
+        check_finite("samples", &self.values)?;
+        let edges: Vec<f64> = (0..=m).map(|k| k as f64 * step).collect();
+        Ok(match self.intersample {
+            Intersample::Hold => self.hold_means(&edges, step),
+            Intersample::Linear => self.linear_means(&edges, step),
+        })
+    }
+
+    /// Means of a hold: bit-exact where the value is constant within a pulse.
+    fn hold_means(&self, edges: &[f64], step: f64) -> Vec<f64> {
+        let m = edges.len() - 1;
+        let close = |edge: f64, time: f64| (edge - time).abs() <= EDGE_TOLERANCE_PULSES * step;
+        // A switch within rounding of an edge is at that edge.
+        let switches: Vec<f64> = (self.times.iter())
+            .map(|&time| {
+                let after = edges.partition_point(|edge| *edge < time).min(m);
+                let near = if after > 0 && close(edges[after - 1], time) { after - 1 } else { after };
+                if close(edges[near], time) {
+                    edges[near]
+                } else {
+                    time
+                }
+            })
+            .collect();
+        let (mut means, mut row) = (Vec::with_capacity(m), 0);
+        for pulse in edges.windows(2) {
+            let (start, end) = (pulse[0], pulse[1]);
+            let advance = |mut row: usize, until: f64| {
+                while switches.get(row + 1).is_some_and(|next| *next <= until) {
+                    row += 1;
+                }
+                row
+            };
+            row = advance(row, start);
+            let (first, mut at, mut more) = (self.values[row], start, 0.0);
+            while at < end {
+                let next = switches.get(row + 1).copied().unwrap_or(f64::INFINITY).min(end);
+                more += (self.values[row] - first) * ((next - at) / step);
+                at = next;
+                if at < end {
+                    row = advance(row, at);
+                }
+            }
+            means.push(first + more);
+        }
+        means
+    }
+
+    fn linear_means(&self, edges: &[f64], step: f64) -> Vec<f64> {
+        let (times, values) = (&self.times, &self.values);
+        let mut areas = vec![0.0];
+        let mut area = 0.0;
+        for (t, v) in times.windows(2).zip(values.windows(2)) {
+            area += 0.5 * (v[1] + v[0]) * (t[1] - t[0]);
+            areas.push(area);
+        }
+        let integrals: Vec<f64> = (edges.iter())
+            .map(|&edge| {
+                let row = times.partition_point(|time| *time <= edge).saturating_sub(1);
+                areas[row] + 0.5 * (values[row] + interpolate(edge, times, values)) * (edge - times[row])
+            })
+            .collect();
+        integrals.windows(2).map(|pair| (pair[1] - pair[0]) / step).collect()
+    }
+
+    /// Values at given times \[s\]; at a jump of a hold, the value after it.
+    #[must_use]
+    pub fn at(&self, times: &[f64]) -> Vec<f64> {
+        let (own, values) = (&self.times, &self.values);
+        if self.intersample == Intersample::Linear {
+            return times.iter().map(|&time| interpolate(time, own, values)).collect();
+        }
+        // Times that differ from a switch by rounding only count as equal.
+        let slack = TIME_TOLERANCE * own.last().copied().unwrap_or(0.0).max(1e-300);
+        let held = |time: &f64| values[own.partition_point(|at| *at <= time + slack).saturating_sub(1)];
+        times.iter().map(held).collect()
+    }
+
+    /// Times \[s\] and sizes of the jumps of a hold, the one from 0 at the start included; None for a linear signal.
+    #[must_use]
+    pub fn jumps(&self) -> Option<(Vec<f64>, Vec<f64>)> {
+        let mut before = 0.0;
+        let sizes = self.values.iter().map(|&value| value - std::mem::replace(&mut before, value)).collect();
+        (self.intersample == Intersample::Hold).then(|| (self.times.to_vec(), sizes))
+    }
+}
+
+/// Return an error for times that do not ascend from 0.
+///
+/// # Errors
+/// [`Error::Length`] for no time, [`Error::NotFinite`], [`Error::Structure`].
+pub(crate) fn check_times(times: &[f64]) -> Result<()> {
+    check_length("sample times", times.len().max(1), times.len())?;
+    check_finite("sample times", times)?;
+    let falls = times.windows(2).position(|pair| pair[0] > pair[1]).map(|k| k + 1);
+    match falls.or((times[0] < 0.0).then_some(0)) {
+        None => Ok(()),
+        Some(row) => Err(Error::Structure {
+            what: format!("sample time {row} is {} s", times[row]),
+            remedy: "give times that ascend from 0".into(),
+        }),
+    }
+}
+
+/// Linear interpolation of samples at ascending times; the first or last value outside them.
+///
+/// Next to a missing value (NaN) only the sample times themselves have values.
+#[must_use]
+#[allow(clippy::float_cmp)]
+pub fn interpolate(time: f64, times: &[f64], values: &[f64]) -> f64 {
+    let after = times.partition_point(|t| *t <= time);
+    let Some(row) = after.checked_sub(1) else { return values[0] };
+    if after == times.len() || times[row] == time {
+        return values[row];
+    }
+    let slope = (values[after] - values[row]) / (times[after] - times[row]);
+    slope * (time - times[row]) + values[row]
+}
+
+/// Uniform samples with missing ones (NaN) interpolated linearly; the nearest value at the ends.
+///
+/// ```
+/// # use ftlm::signal::nonuniform::interpolate_gaps;
+/// assert_eq!(*interpolate_gaps(&[f64::NAN, 1.0, f64::NAN, 2.0]), [1.0, 1.0, 1.5, 2.0]);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn interpolate_gaps(samples: &[f64]) -> Cow<'_, [f64]> {
+    if !samples.iter().any(|v| v.is_nan()) || samples.iter().all(|v| v.is_nan()) {
+        return Cow::Borrowed(samples);
+    }
+    let there = || samples.iter().enumerate().filter(|(_, v)| !v.is_nan());
+    let rows: Vec<f64> = there().map(|(row, _)| row as f64).collect();
+    let values: Vec<f64> = there().map(|(_, v)| *v).collect();
+    let filled = |(row, &v): (usize, &f64)| if v.is_nan() { interpolate(row as f64, &rows, &values) } else { v };
+    Cow::Owned(samples.iter().enumerate().map(filled).collect())
+}
