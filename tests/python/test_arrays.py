@@ -9,7 +9,7 @@ import pytest
 
 import ftlm
 import public
-from ftlm import analysis, control, plot, rig
+from ftlm import analysis, control, kernels, plot, rig
 from ftlm.data.sampling import NonuniformSamples
 from ftlm.sklearn import FractionalRegressor
 from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, as_array, as_complex, as_floats
@@ -121,6 +121,26 @@ CALLS = {
     ],
     "control.Shaper.filter": [(lambda x: control.input_shaper(-2 + 17j).filter(x, 500.0), U)],
     "control.inverse_dynamics": [(lambda x: control.inverse_dynamics(DESIGN, x), MOVE)],
+    "kernels.pulse_means": [(kernels.pulse_means, U)],
+    "kernels.block_pulse_kernel": [(lambda x: kernels.block_pulse_kernel(x, 5, step=STEP), W / 10)],
+    "kernels.integrate": [
+        (lambda x: kernels.integrate(x, 0.5, step=STEP), U),
+        (lambda x: kernels.integrate(U, x, step=STEP), W / 10),
+    ],
+    "kernels.toeplitz_apply": [
+        (lambda x: kernels.toeplitz_apply(x, U), T + 1),
+        (lambda x: kernels.toeplitz_apply(U, x), T),
+    ],
+    "kernels.toeplitz_solve": [
+        (lambda x: kernels.toeplitz_solve(x, U), T + 1),
+        (lambda x: kernels.toeplitz_solve(U, x), T),
+    ],
+    "kernels.multi_innovation": [
+        (lambda x: kernels.multi_innovation(x, T, prior_covariance=1e6), np.stack([U, T], axis=1)),
+        (lambda x: kernels.multi_innovation(np.stack([U, T], axis=1), x, prior_covariance=1e6), T),
+        (lambda x: kernels.multi_innovation(np.stack([U, T], axis=1), T, prior_covariance=x), np.array([1.0, 2.0])),
+    ],
+    "kernels.errors": [(lambda x: kernels.errors(x, U), T), (lambda x: kernels.errors(T, x), U)],
     "plot.bode": [(lambda x: plot.bode(MODEL, x), W)],
     "plot.impulse": [(lambda x: plot.impulse(MODEL, x), T)],
     "plot.step": [(lambda x: plot.step(MODEL, x), T)],

@@ -328,7 +328,9 @@ BAD = {
     "dependent regressors": (
         CONVERGENCE,
         "regressor 2 of 3 is a combination of the others",
-        lambda: identify(words="D^1.5 y = a y + b u + c D^0 u"),
+        lambda: ftlm.identify(
+            run(), ftlm.equation("D^1.5 y = a y + b u + c D^0 u", initial="rest"), method="least-squares"
+        ),
     ),
     "Euler of a fractional order": (
         MODEL,

@@ -112,7 +112,7 @@ def grows(attempt: Iterate) -> bool:
 
 
 def test_a_steady_descent_stays_where_free_runs_die_away() -> None:
-    problem = FreeProblem.of(ftlm.equation("D^2 y = a y + d D y + b u", initial="caputo"))
+    problem = FreeProblem.of(ftlm.equation("D^2 y = d D y + a y + b u", initial="caputo"))
     grid = Objective(problem, [swing(0.2)], [1.0 / 0.001])
     held = Objective(problem, [swing(0.2)], [1.0 / 0.001], prefer_stable=True)
     start = Iterate([], [-25.0, -0.1, 1.0], "near", {})
@@ -245,13 +245,13 @@ def test_a_raw_run_by_the_natural_call(tmp_path: Path, fitted: str, judged: str,
 
 def test_a_coefficient_that_keeps_its_sign_ends_where_it_no_longer_shows() -> None:
     # D y feeds energy here: with the sign of a damper a descent went on towards 0 until its evaluations ran out.
-    problem = FreeProblem.of(ftlm.equation("D^2 y = a y + d D y + b u", initial="caputo"))
+    problem = FreeProblem.of(ftlm.equation("D^2 y = d D y + a y + b u", initial="caputo"))
     grid = Objective(problem, [swing(0.2)], [1.0 / 0.001])
-    start = Iterate([], [-25.0, -0.1, 1.0], "damped", {})
+    start = Iterate([], [-0.1, -25.0, 1.0], "damped", {})
     end = grid.minimize(start, 60)
     assert end.has_converged
     assert end.outcome["evaluations"] < 30
-    assert end.coefficients[1] == pytest.approx(-0.1 * np.exp(-20.0), rel=1e-6)
+    assert end.coefficients[0] == pytest.approx(-0.1 * np.exp(-20.0), rel=1e-6)
     # At 0 itself it may take the other sign.
-    let_go = replace(end, coefficients=[end.coefficients[0], 0.0, end.coefficients[2]])
-    assert grid.minimize(let_go, 60).coefficients[1] == pytest.approx(0.2, abs=0.02)
+    let_go = replace(end, coefficients=[0.0, *end.coefficients[1:]])
+    assert grid.minimize(let_go, 60).coefficients[0] == pytest.approx(0.2, abs=0.02)

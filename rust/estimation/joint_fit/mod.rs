@@ -4,7 +4,8 @@
 //! multistart with successive halving optimizes them on subsampled records. Iterative reweighting then estimates the
 //! noise level of each output. An unstable optimum is kept only if it fits significantly better than a stable one.
 //! Finally the step is halved until the estimate changes by a small part of its standard error, and extrapolated to
-//! zero step. [`fit::fit`] runs all of it. The runs come from a [`Source`], which samples them at the requested step.
+//! zero step. [`fit::fit`] runs all of it. [`Recordings`](crate::recording::Recordings) sample the runs at the requested
+//! step.
 
 pub mod covariance;
 pub mod fit;
