@@ -28,6 +28,8 @@ LARGE = 1 << 34
 ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
 #: Where a fit is told how often it may evaluate its cost, which it does; an attack asks it to so often at most.
 EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10, "JointProblem.minimize": 4}, 2000
+#: Where a count multiplies other sizes: pulses a sample, rows of up to 128 states.
+COUNTS, MOST_COUNT = {"Recording.experiment": 0, "state_space_respond": 5}, 1 << 12
 
 
 class OursError(Exception):
@@ -1001,7 +1003,8 @@ def attacked(name, given, named, r):
         spots = [path for path in places(arguments) if len(path) > 1]
         if spots:
             arguments = exchanged(arguments, r.choice(spots), lambda value: hostile(value, r, large))
-    at = EVALUATIONS.get(name)
-    if at is not None and isinstance(arguments[0][at], int):
-        arguments[0][at] = min(arguments[0][at], MOST_EVALUATIONS)
+    for places_of, most in ((EVALUATIONS, MOST_EVALUATIONS), (COUNTS, MOST_COUNT)):
+        at = places_of.get(name)
+        if at is not None and isinstance(arguments[0][at], int):
+            arguments[0][at] = min(arguments[0][at], most)
     return arguments

@@ -194,10 +194,11 @@ def toeplitz_solve(kernel: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     -----
     O(m log^2 m) a system; ``scipy.linalg.solve_toeplitz`` takes O(m^2).
     """
-    zero = np.argwhere(as_floats("kernel", kernel)[..., :1] == 0.0)
+    columns, _ = _rows("kernel", kernel)
+    zero = np.flatnonzero(columns[:, 0] == 0.0)
     if zero.size:
         raise ModelError(
-            f"kernel begins with 0 at index {zero[0].tolist()} ({len(zero)} such kernels in all), so its matrix is "
+            f"kernel {zero[0]} of {len(columns)} begins with 0 ({len(zero)} such kernels in all), so its matrix is "
             "singular; leave it out"
         )
     return _with_kernels(_core.toeplitz_solve, kernel, "b", b)
