@@ -108,12 +108,12 @@ pub fn respond(
     recursion.run(model.start, rows, stop).map(Some)
 }
 
-/// Integer from an order or an exponent.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Integer from an order or an exponent; one above [`MAX_STATES`] is one more than that.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 fn integer(order: f64) -> Result<usize> {
     let nearest = order.round();
     if nearest >= 0.0 && (order - nearest).abs() <= ORDER_GRAIN {
-        return Ok(nearest as usize);
+        return Ok(nearest.min(MAX_STATES as f64 + 1.0) as usize);
     }
     Err(Error::Structure {
         what: format!("an order or exponent {order} that no chain of integrators has"),

@@ -287,3 +287,10 @@ def test_the_core_refuses_what_it_cannot_simulate(change, error, message):
     assert _core.state_space_respond(*arguments.values()) is not None
     with pytest.raises(error, match=message):
         _core.state_space_respond(*(arguments | change).values())
+
+
+@pytest.mark.parametrize("exponent", [200.0, 1e300])
+def test_exponents_of_more_states_than_are_simulated_are_left_to_the_series(exponent):
+    model = [((0, 2.0, [(0, 0.0), (1, 0.0)]), [-1.0, 1.0])]
+    inputs = [(1, np.ones(8), True, 0.0, 0.0)]
+    assert _core.state_space_respond(model, [False, True], inputs, [[(exponent, 1.0)]], 0.1, 8) is None
