@@ -17,6 +17,9 @@ import time
 from collections import Counter
 from pathlib import Path
 
+# Threads of BLAS that wait for one another on a busy machine take seconds of processor time. Read when NumPy loads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 HERE = Path(__file__).resolve().parent
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
