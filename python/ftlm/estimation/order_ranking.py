@@ -62,7 +62,7 @@ def search_orders(
     equation
         Structure with free orders; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
     order_grid
-        Intervals and step; see :func:`ftlm.lattice`.
+        Intervals and increment; see :func:`ftlm.order_grid`.
     criterion
         ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
         measured signals on the right-hand side; it prefers near-identities.
@@ -106,7 +106,7 @@ def search_orders(
         Runs that do not fit, or a constant output; a store of another search, in use, damaged, or that cannot be
         written.
     ModelError
-        Nothing to search, a lattice without or with too many candidates, settings out of range, an option that these
+        Nothing to search, a grid without or with too many candidates, settings out of range, an option that these
         coefficients do not use; what needs more memory than the machine has left, or than ``FTLM_MEMORY`` allows.
     ConvergenceError
         An executor that has lost its workers.
