@@ -186,9 +186,40 @@ def test_a_stable_model_settles_and_an_unstable_one_grows():
     assert 0 < agreed < 12
 
 
-def test_models_without_a_common_base_have_no_poles_to_list():
-    with pytest.raises(ftlm.ModelError, match=r"no common base of 0\.01 or more"):
-        model("D^1.31 y = -2 D^0.4301 y - y + u").poles()
+def zeros_inside(polynomial: dict[float, float], radius: float) -> int:
+    """Zeros of a sum of c s^p within a circle cut along the negative axis, by the turn of its value on the way round."""
+    angle = math.pi - 1e-9
+    along = np.geomspace(1e-8, radius, 200_001)
+    round_ = np.exp(1j * np.linspace(-angle, angle, 200_001))
+    path = np.concatenate(
+        [along * np.exp(-1j * angle), radius * round_, along[::-1] * np.exp(1j * angle), 1e-8 * round_[::-1]]
+    )
+    values = sum(c * path**p for p, c in polynomial.items())
+    turns = np.angle(values[1:] / values[:-1])
+    assert np.max(np.abs(turns)) < 1.5
+    return round(float(np.sum(turns)) / (2 * math.pi))
+
+
+def test_poles_of_any_orders_are_all_zeros_on_the_principal_sheet():
+    rng = np.random.default_rng(5)
+    counts = []
+    for _ in range(40):
+        powers = np.sort(rng.uniform(0.05, 5, int(rng.integers(1, 5)))).round(4)
+        values = rng.choice([-1, 1], powers.size + 1, p=[0.2, 0.8]) * 10 ** rng.uniform(-1, 1, powers.size + 1)
+        polynomial = {0.0: float(values[0])} | dict(zip(powers.tolist(), values[1:].tolist(), strict=True))
+        highest = powers[-1]
+        own = " ".join(f"{-c / values[-1]:+.17g} D^{p} y" for p, c in polynomial.items() if p != highest)
+        found = model(f"D^{highest} y = {own.replace('D^0.0 y', 'y')} + u").poles()
+        for s in found:
+            terms = [c * s**p for p, c in polynomial.items()]
+            assert abs(sum(terms)) < 1e-8 * sum(map(abs, terms))
+        reach = 10 * float(np.max(np.abs(found), initial=1.0))
+        assert found.size == zeros_inside(polynomial, reach), polynomial
+        counts.append(found.size)
+    assert len(set(counts)) >= 4
+
+
+def test_stability_without_a_common_base_is_that_of_the_argument_principle():
     assert model("D^1.31 y = -2 D^0.4301 y - y + u").stability().method == "argument principle"
     assert model("D^1.3 y = -2 D^0.4 y - y + u").stability().base == pytest.approx(0.1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import itertools
 import math
 from collections.abc import Sequence
@@ -139,43 +140,65 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
 
 @check_arguments
 def poles(model: Model, *, coupling: str = "simulated") -> Complex:
-    """Poles of a commensurate model on the principal sheet.
+    """Return the poles of a model on the principal sheet, for any orders.
 
     Parameters
     ----------
     model
-        A model whose orders are multiples of one number, at least 0.01.
+        The model.
     coupling
         See :func:`frequency_response`.
 
     Returns
     -------
     ndarray of complex
-        Values of s [rad/s], ``|arg s| < pi``, slowest first, without those at the origin. Roots on other sheets are no
-        poles: they only shape how a response dies away.
+        Values of s [rad/s], ``|arg s| < pi`` (whole orders: ``<= pi``), slowest first, without those at the origin.
+        Roots on other sheets are no poles: they only shape how a response dies away.
 
     Raises
     ------
     ModelError
-        Orders without a common base, or a degree in it above 100.
+        Poles out of the range of numbers, or a number of them that differs from that by the argument principle.
+
+    Notes
+    -----
+    Orders with a common base q give a polynomial in s^q, whose roots are those of its companion matrix. Other orders:
+    Newton's method in ln s, and the argument principle counts whether all zeros were found.
     """
     every: list[complex] = []
     for polynomial in characteristic(model, coupled=is_coupled(coupling)):
-        roots = roots_in_base(polynomial)
-        if roots is None:
+        upper = zeros_of(polynomial, math.pi)
+        if not _whole_orders(polynomial):
+            upper = [w for w in upper if w.imag < math.pi - DISTINCT_ZERO_TOLERANCE]
+        if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
+            decades = int(MAX_LOG_FREQUENCY / math.log(10))
             raise ModelError(
-                "the orders have no common base of 0.01 or more (or a degree above 100 in it), or the poles are out of "
-                "the range of numbers, so the model has no polynomial whose roots could be found; use stability(), or "
-                "round the orders"
+                f"the poles are out of the range of numbers, 1e-{decades} to 1e{decades} rad/s: change the unit of time "
+                "or the coefficients"
             )
-        base, values = roots
-        angle = np.angle(values)
-        kept = values[np.abs(angle) < base * math.pi - 1e-12]
-        if abs(base - 1) < POWER_TOLERANCE:
-            kept = values  # whole orders have one sheet, the negative real axis included
-        # Principal logarithm: arg s = arg(lambda) / q lies within (-pi, pi) by the choice above.
-        every += (np.abs(kept) ** (1 / base) * np.exp(1j * np.angle(kept) / base)).tolist()
+        found = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
+        if roots_in_base(polynomial) is None:
+            expected, on_cut = right_zeros(polynomial, math.pi)
+            if not on_cut and len(found) != expected:
+                raise ModelError(
+                    f"{len(found)} of {expected:.0f} poles were found (counted by the argument principle); use "
+                    "stability(), or round the orders to multiples of 0.01"
+                )
+        every += found
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
+
+
+def _whole_orders(polynomial: Polynomial) -> bool:
+    """Whether all powers of s differ by whole numbers, so that there is one sheet."""
+    lowest = min(polynomial)
+    return all(abs(p - lowest - round(p - lowest)) < POWER_TOLERANCE for p in polynomial)
+
+
+def _pole(w: complex) -> complex:
+    """Return s = exp(w); on the real axis without the rounding of pi."""
+    if abs(w.imag) in (0.0, math.pi):
+        return complex(math.copysign(math.exp(w.real), 1.0 if w.imag == 0.0 else -1.0))
+    return cmath.exp(w)
 
 
 @check_arguments

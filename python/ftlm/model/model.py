@@ -232,7 +232,7 @@ class Model:
 
     @check_arguments
     def poles(self, *, coupling: str = "simulated") -> Complex:
-        """Poles of a model whose orders have a common base; see :func:`ftlm.analysis.poles`."""
+        """Return the poles on the principal sheet [rad/s]; see :func:`ftlm.analysis.poles`."""
         from ftlm.analysis.poles import poles
 
         return poles(self, coupling=coupling)
