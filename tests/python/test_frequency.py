@@ -187,7 +187,7 @@ def test_a_stable_model_settles_and_an_unstable_one_grows():
 
 
 def zeros_inside(polynomial: dict[float, float], radius: float) -> int:
-    """Zeros of a sum of c s^p within a circle cut along the negative axis, by the turn of its value on the way round."""
+    """Zeros of a sum of c s^p within a circle cut along the negative axis, by the turn of its value on its edge."""
     angle = math.pi - 1e-9
     along = np.geomspace(1e-8, radius, 200_001)
     round_ = np.exp(1j * np.linspace(-angle, angle, 200_001))

@@ -173,8 +173,8 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
         if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
             decades = int(MAX_LOG_FREQUENCY / math.log(10))
             raise ModelError(
-                f"the poles are out of the range of numbers, 1e-{decades} to 1e{decades} rad/s: change the unit of time "
-                "or the coefficients"
+                f"the poles are out of the range of numbers, 1e-{decades} to 1e{decades} rad/s: change the unit of time"
+                " or the coefficients"
             )
         found = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
         if roots_in_base(polynomial) is None:
