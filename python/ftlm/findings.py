@@ -815,8 +815,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "response_number_vague": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "{parameter} = {value:.4g} ± {error:.2g} cannot be told from other values; fix it, or leave it out",
-        "{parameter} = {value:.4g} ± {error:.2g} cannot be told from other values",
+        "the data hardly tell {parameter} = {value:.4g} ± {error:.2g}; fix it, or leave it out",
+        "the data hardly tell {parameter} = {value:.4g} ± {error:.2g}",
     ),
     # Selection, consistency, design
     "other_optimum": FindingKind(

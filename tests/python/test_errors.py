@@ -71,8 +71,8 @@ BAD = {
     ),
     "input order above alpha": (
         MODEL,
-        "order 2.7 of u is 1.2 above alpha = 1.5 of y",
-        lambda: ftlm.equation("D^1.5 y = a D^2.7 u"),
+        "order 2.7 of u is above alpha = 1.5 of y",
+        lambda: identify(run(), "D^1.5 y = a D^2.7 u"),
     ),
     "other output below 0": (
         MODEL,

@@ -53,6 +53,12 @@ CLOSED = {
         {**TRUTH, "c": 0.02, "d": 0.02 * 1e-2**-0.8},
         {},
     ),
+    "cable": (
+        "D^alpha U = a U + l D^(alpha+1) I + r D^alpha I + k D I + b I",
+        1e-6 * 1j * W + circuits.zarc(W, 0.01, 0.05, 1e-2, 0.8),
+        {**TRUTH, "l": 1e-6, "k": 1e-6 * 1e-2**-0.8},
+        {},
+    ),
     "delay": (
         "D^alpha y = a1 D^beta y + a0 y + b1 D^gamma u + b0 u",
         circuits.transfer(W[:40], [(3, 0.4), (5, 0)], [(1, 2.2), (2, 1.1), (5, 0)], 0.02),
@@ -184,6 +190,17 @@ def test_numbers_that_move_together_are_named():
     assert found.verdict().level == "do not use"
     assert json.dumps(found.to_dict(), allow_nan=False)
     assert found.model.estimate.covariance is None
+
+
+def test_a_number_that_another_hides_is_said_and_their_ratio_holds():
+    words = CLOSED["diffusion"][0]
+    w = 2 * math.pi * np.geomspace(0.01, 1e4, 60)
+    exact = circuits.warburg(w, 0.01, 0.02, 0.005, 0.8, 0.0005)
+    found = ftlm.identify_frequency(ftlm.FrequencyData.from_arrays(w, noisy(exact, 0.005, 3)), words)
+    vague = {f.parameter for f in found.findings if f.code == "response_number_vague"}
+    assert "c" in vague
+    assert not vague & {"alpha", "a", "r", "b"}
+    assert found.values["d"] / -found.values["a"] == pytest.approx(0.0005, rel=0.15)
 
 
 def test_a_second_record_decides_the_verdict():

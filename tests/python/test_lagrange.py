@@ -341,7 +341,7 @@ def test_a_held_input_is_not_differentiated_beyond_the_output() -> None:
     )
     assert ftlm.identify(smooth, words).coefficients.keys() == {"a", "b"}
     with pytest.raises(ftlm.ModelError, match=r"order 2 of u is 1 above alpha = 1 of y; .*lower it"):
-        ftlm.equation("D y = a y + b D^2 u")
+        ftlm.identify(smooth, ftlm.equation("D y = a y + b D^2 u"))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

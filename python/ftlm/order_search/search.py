@@ -35,8 +35,8 @@ from ftlm.progress import Progress
 from ftlm.simulation.discretization import (
     InitialTuple,
     Record,
+    check_derivative_orders,
     check_linear,
-    check_zero_order_hold,
     named_coefficients,
     named_signals,
     prepare,
@@ -286,7 +286,7 @@ def make_job(
     values = (order_grid or OrderGrid()).values(equation)
     known = {n: v[0] for n, v in values.items() if len(v) == 1}
     for run in checked:
-        check_zero_order_hold(run, equation, known)
+        check_derivative_orders(run, equation, known)
     records = prepare(checked, equation, m, power_of_two=settings.needs_haar)
     units = {n: u for n, u in checked[0].units.items() if n in equation.signals}
     names = tuple(r.name for r in checked)

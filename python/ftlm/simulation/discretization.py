@@ -23,7 +23,7 @@ from ftlm.simulation.initial_conditions import (
     resolve_start,
 )
 from ftlm.structure.equation import Equation, Term
-from ftlm.structure.order import Order
+from ftlm.structure.order import MAX_IMPROPER_ORDER, ORDER_RESOLUTION, Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, check_pulses, nearest
@@ -179,7 +179,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
     if structure.offset == "level":
         run, structure = deviations(run, structure)[0], replace(structure, offset="none")
     _check_missing(run, structure)
-    check_zero_order_hold(run, structure)
+    check_derivative_orders(run, structure)
     initial = resolve_initial_conditions(run, structure) if initial is None else initial
     sensor, signals = structure.sensor_filter, structure.signals
     return _core.Recording(
@@ -252,16 +252,17 @@ def apply_input_nonlinearity(run: Run, structure: Structure, name: str | None = 
     return run.with_input_nonlinearities(limits) if limits else run
 
 
-def check_zero_order_hold(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
-    """Raise ModelError for the derivative of a jump: a zero-order-hold input above the order of its equation.
+def check_derivative_orders(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
+    """Raise ModelError for derivatives of a run's signals that its samples do not determine.
 
-    ``known`` maps free orders with a single value to it.
+    The order of another signal is below that of the equation plus 1, and for a zero-order-hold input at most that of
+    the equation, because its jumps have no derivative. ``known`` maps free orders with a single value to it.
     """
     for item in structure.equations:
         alpha = item.order.substitute(known or {})
         for term in item.terms:
             order = term.order.substitute(known or {})
-            if alpha.names or order.names or order.constant <= alpha.constant + 1e-9:
+            if alpha.names or order.names or order.constant <= alpha.constant + ORDER_RESOLUTION:
                 continue
             if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
                 raise ModelError(
@@ -269,6 +270,16 @@ def check_zero_order_hold(run: Run, structure: Structure, known: Mapping[str, fl
                     f"{item.output}, and run {run.name!r} holds {term.signal} between its samples: its jumps have no "
                     f"derivative; lower the order, or say {parameter('intersample', 'foh')} if it moves in between"
                 )
+            _check_excess_order(term.signal, order.constant, item.output, alpha.constant)
+
+
+def _check_excess_order(signal: str, order: float, output: str, alpha: float) -> None:
+    """Raise ModelError for a signal that is differentiated once more than the output, or more often."""
+    if signal != output and order > alpha + MAX_IMPROPER_ORDER - ORDER_RESOLUTION:
+        raise ModelError(
+            f"order {order:g} of {signal} is {order - alpha:g} above alpha = {alpha:g} of {output}; in the time domain "
+            "an equation carries another signal less than one order above its own output: lower it"
+        )
 
 
 def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True) -> list[Record]:
@@ -406,6 +417,8 @@ def equation_tuple(
     item: Equation, signals: Sequence[str]
 ) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
     """Return an identified equation: its structure and its coefficients."""
+    for term in item.terms:
+        _check_excess_order(term.signal, term.order.constant, item.output, item.order.constant)
     return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
 
 

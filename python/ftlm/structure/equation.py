@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from msgspec import UNSET, UnsetType
 
 from ftlm.errors import ModelError
-from ftlm.structure.order import MAX_IMPROPER_ORDER, MAX_ORDER, MIN_INPUT_ORDER, Order
+from ftlm.structure.order import MAX_ORDER, MIN_INPUT_ORDER, Order
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import real_number
 
@@ -207,9 +207,9 @@ class Equation:
     order
         Highest order alpha, in (0, 10].
     terms
-        Right-hand side. Orders of the output itself lie in [0, alpha), orders of other signals in [-3, alpha + 1).
-        Orders above alpha occur, for example, when the hub of an arm drives its link. Held commands need orders of at
-        most alpha, because their jumps have no derivative.
+        Right-hand side. Orders of the output itself lie in [0, alpha), orders of other signals in [-3, 10].
+        Orders above alpha occur, for example, when the hub of an arm drives its link. In the time domain they are below
+        alpha + 1, and for zero-order-hold inputs at most alpha, because jumps have no derivative.
     coulomb
         Optional Coulomb and Stribeck friction of the output's velocity. Alpha then lies in (1, 2], and all orders are
         below alpha.
@@ -260,11 +260,8 @@ class Equation:
                 raise ModelError(f"own-output order {order:g} of {self.output} is outside [0, {alpha:g}); lower it")
             if not own and order < MIN_INPUT_ORDER:
                 raise ModelError(f"order {order:g} of {term.signal} is below {MIN_INPUT_ORDER:g}; raise it")
-            if not own and order >= alpha + MAX_IMPROPER_ORDER - 1e-9:
-                raise ModelError(
-                    f"order {order:g} of {term.signal} is {order - alpha:g} above alpha = {alpha:g} of {self.output}; "
-                    "an equation carries another signal less than one order above its own output: lower it"
-                )
+            if not own and order > MAX_ORDER:
+                raise ModelError(f"order {order:g} of {term.signal} is above {MAX_ORDER:g}; lower it")
 
         if self.friction is not None:
             self._check_friction(self.friction)
