@@ -8,12 +8,13 @@ import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any
-
-from rich.progress import Progress as RichProgress
-from rich.progress import TaskID
+from typing import TYPE_CHECKING, Any
 
 from ftlm.utils.formatting import EscapedStream, escape_controls, escape_standard_streams
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
 
 #: Work that ends sooner shows no bar.
 BAR_DELAY_S = 1.0

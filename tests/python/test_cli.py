@@ -483,9 +483,9 @@ ACTS = "\x1b]0;PWN\x07\x1b[31m\x9b2K\r\u202egpj\u2066\x7f"
 CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 EVERY_COMMAND = """
 import json, sys
-from ftlm.cli.main import app, main
+from ftlm.cli.main import COMMAND_HELP, main
 commands = json.loads(sys.argv[1])
-known = {c.name for c in app.registered_commands}
+known = set(COMMAND_HELP)
 assert known == {words[0] for words in commands}, known ^ {words[0] for words in commands}
 for words in commands:
     sys.argv = ["ftlm", *words]
@@ -601,3 +601,19 @@ def test_a_bar_is_drawn_and_its_label_escaped(monkeypatch):
     assert "\x9b" not in drawn
     assert "\u202e" not in drawn
     assert isinstance(sys.stderr, EscapedStream)
+
+
+# ------------------------------------------------------------------------------------------------ start
+
+
+@pytest.mark.parametrize("words", [["--version"], ["-h"], ["open", "run.csv"]])
+def test_a_command_imports_what_it_needs_alone(words, tmp_path):
+    (tmp_path / "run.csv").write_text("t,u,y\n" + "".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(200)))
+    code = (
+        "import sys; from ftlm.cli import app\n"
+        f"try: app({words!r})\nexcept SystemExit as end: assert not end.code, end.code\n"
+        "heavy = ('ftlm.estimation', 'ftlm.rig', 'ftlm.control', 'ftlm.app', 'ftlm.reproduction', 'rich', 'scipy')\n"
+        "print('imported:', sorted(set(heavy) & set(sys.modules)))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert out.stdout.splitlines()[-1] == "imported: []"

@@ -23,7 +23,8 @@ from ftlm.cli.framework import (
     show_json,
     write_figure,
 )
-from ftlm.cli.options import Force, Json, Noise, Number, ReadingOptions, SavedModel, Text, Texts
+from ftlm.cli.options import Noise, SavedModel
+from ftlm.cli.reading_options import Force, Json, Number, ReadingOptions, Text, Texts
 from ftlm.errors import ModelError
 from ftlm.experiment_design import design_input as experiment
 from ftlm.model.serialization import load_model

@@ -2,41 +2,89 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import sys
-from typing import Annotated
+from collections import UserDict
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from ftlm import _core
-from ftlm.cli.data_commands import doctor, inspect, open_, record
-from ftlm.cli.design_commands import control, design_input, input_shaper
-from ftlm.cli.estimation_commands import (
-    certify,
-    consistency,
-    identify,
-    identify_frequency,
-    resume,
-    search,
-    select,
-    status,
-)
 from ftlm.cli.framework import EXIT_INTERRUPTED, Command
-from ftlm.cli.model_commands import compare, export, plot, report, resid, simulate
-from ftlm.cli.other_commands import app as page
-from ftlm.cli.other_commands import demo, orders, reproduce
 from ftlm.utils.formatting import escape_standard_streams
 
+#: Module of each command, and its short help in `ftlm -h`; the docstring of its function is its own help.
+COMMAND_HELP = {
+    "demo": ("other", "Identify a simulated arm, and draw what came out."),
+    "app": ("other", "From a file to a model, in a browser."),
+    "record": ("rig", "Drive a rig, simulated by default, and record a run."),
+    "open": ("data", "Say what a file is, and what to type next."),
+    "inspect": ("data", "Show ranges, noise and rest of a run, and advice."),
+    "identify": ("estimation", "Identify a model from runs, with a verdict."),
+    "identify-frequency": ("estimation", "The same from frequency responses, impedances."),
+    "select": ("estimation", "Choose the structure that predicts."),
+    "consistency": ("estimation", "Test whether segments of runs are one model."),
+    "search": ("estimation", "Rank all orders of an order grid."),
+    "certify": ("estimation", "Prove a bound over all orders in intervals."),
+    "resume": ("estimation", "Go on with the searches of a store."),
+    "status": ("estimation", "Show how far the searches of a store are."),
+    "compare": ("model", "Judge a saved model on measured runs."),
+    "resid": ("model", "Test what a saved model leaves over."),
+    "simulate": ("model", "Run a saved model on a run's inputs."),
+    "design-input": ("design", "Lay out the experiment that tells most."),
+    "control": ("design", "Design a controller on a saved model."),
+    "input-shaper": ("design", "Make an input shaper of a saved model's poles."),
+    "report": ("model", "Write the report of a saved model."),
+    "reproduce": ("other", "Recompute the paper's tables and figures."),
+    "orders": ("other", "Judge whole and fractional orders on a real arm."),
+    "plot": ("model", "Draw a saved model for a paper."),
+    "export": ("model", "Write a saved model for another tool."),
+    "doctor": ("rig", "Show versions, cores, and what is installed."),
+}
+
+
+class CommandTable(UserDict[str, Any]):
+    """Commands by name; the module of a command is imported when the command is looked up."""
+
+    def __getitem__(self, name: str) -> TyperCommand:
+        """Return a command."""
+        module, short = super().__getitem__(name)
+        commands = importlib.import_module(f"ftlm.cli.{module}_commands")
+        # `open` would hide a builtin function.
+        function = getattr(commands, name.replace("-", "_"), None) or getattr(commands, f"{name}_")
+        own = typer.Typer(rich_markup_mode=None, add_completion=False, context_settings=CONTEXT_SETTINGS)
+        own.command(name, cls=Command, short_help=short)(function)
+        found = typer.main.get_command(own)
+        assert isinstance(found, TyperCommand)
+        return found
+
+
+class Program(TyperGroup):
+    """Group of commands whose modules are imported when they are called."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**{**attributes, "commands": CommandTable(COMMAND_HELP)})
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, short) for name, (_, short) in COMMAND_HELP.items()])
+
+
+CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 app = typer.Typer(
     name="ftlm",
+    cls=Program,
     help="Fractional-order models of flexible machines from measured data.",
     no_args_is_help=True,
     add_completion=True,
     # Rich markup would remove the brackets of units, [s] and [A], from help texts.
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT_SETTINGS,
 )
 
 
@@ -48,39 +96,6 @@ def version(
     if show_version:
         print(f"ftlm {_core.__version__}")
         raise typer.Exit
-
-
-#: Short help of each command in `ftlm -h`; its docstring is its own help.
-COMMAND_HELP = {
-    demo: "Identify a simulated arm, and draw what came out.",
-    page: "From a file to a model, in a browser.",
-    record: "Drive a rig, simulated by default, and record a run.",
-    open_: "Say what a file is, and what to type next.",
-    inspect: "Show ranges, noise and rest of a run, and advice.",
-    identify: "Identify a model from runs, with a verdict.",
-    identify_frequency: "The same from frequency responses, impedances.",
-    select: "Choose the structure that predicts.",
-    consistency: "Test whether segments of runs are one model.",
-    search: "Rank all orders of an order grid.",
-    certify: "Prove a bound over all orders in intervals.",
-    resume: "Go on with the searches of a store.",
-    status: "Show how far the searches of a store are.",
-    compare: "Judge a saved model on measured runs.",
-    resid: "Test what a saved model leaves over.",
-    simulate: "Run a saved model on a run's inputs.",
-    design_input: "Lay out the experiment that tells most.",
-    control: "Design a controller on a saved model.",
-    input_shaper: "Make an input shaper of a saved model's poles.",
-    report: "Write the report of a saved model.",
-    reproduce: "Recompute the paper's tables and figures.",
-    orders: "Judge whole and fractional orders on a real arm.",
-    plot: "Draw a saved model for a paper.",
-    export: "Write a saved model for another tool.",
-    doctor: "Show versions, cores, and what is installed.",
-}
-for _command, _short in COMMAND_HELP.items():
-    name = _command.__name__.rstrip("_").replace("_", "-")
-    app.command(name, cls=Command, short_help=_short)(_command)
 
 
 def main() -> None:

@@ -20,7 +20,8 @@ from ftlm.cli.framework import (
     show,
     write_figure,
 )
-from ftlm.cli.options import BlockPulses, Files, Force, Json, Number, Page, ReadingOptions, SavedModel, Text, Texts
+from ftlm.cli.options import BlockPulses, Page, SavedModel
+from ftlm.cli.reading_options import Files, Force, Json, Number, ReadingOptions, Text, Texts
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.model.model import Model

@@ -9,20 +9,8 @@ from typer import Argument, Option
 
 from ftlm.app.server import DEFAULT_PORT, serve
 from ftlm.cli.framework import command, print_text, show_json
-from ftlm.cli.options import (
-    Files,
-    Force,
-    GeneticOptions,
-    GridIncrement,
-    Json,
-    Page,
-    ReadingOptions,
-    Text,
-    Texts,
-    Threads,
-    Verbose,
-    given_fields,
-)
+from ftlm.cli.options import GeneticOptions, GridIncrement, Page, Threads, Verbose
+from ftlm.cli.reading_options import Files, Force, Json, ReadingOptions, Text, Texts, given_fields
 from ftlm.errors import ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.progress import Progress

@@ -44,7 +44,7 @@ from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, join_names, names_to_columns, nearest
 
 if TYPE_CHECKING:
-    from ftlm.validation.data_advice import Advice
+    from ftlm.validation.data_advice import Advice, Inspection
 
 
 @dataclass(eq=False, repr=False, init=False)
@@ -705,6 +705,18 @@ class Run:
         from ftlm.validation.data_advice import advise
 
         return advise(self, structure)
+
+    def inspect(self) -> Inspection:
+        """Return range, noise, quantization and rest of every signal.
+
+        Returns
+        -------
+        Inspection
+            Prints as a table.
+        """
+        from ftlm.validation.data_advice import inspect_run
+
+        return inspect_run(self)
 
     @check_arguments
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:

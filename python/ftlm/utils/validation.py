@@ -7,8 +7,9 @@ import math
 import operator
 import os
 import re
+import sys
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeGuard, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,9 +54,15 @@ def check_choice(name: str, value: object, known: Iterable[str]) -> None:
         raise ModelError(f"{setting(name)} {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
 
 
+def is_masked_array(value: object) -> TypeGuard[np.ma.MaskedArray[Any, Any]]:
+    """Whether a value is a masked array or a masked element of one."""
+    # Without the module there is none, and its import takes a tenth of NumPy's.
+    return "numpy.ma" in sys.modules and np.ma.isMaskedArray(value)
+
+
 def _is_number(value: object) -> bool:
     """Whether a value may be a real number; complex values are excluded."""
-    if isinstance(value, (str, bytes, bytearray, bool, complex)) or value is np.ma.masked:
+    if isinstance(value, (str, bytes, bytearray, bool, complex)) or is_masked_array(value):
         return False
     return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL_DTYPE_KINDS
 
@@ -217,10 +224,10 @@ def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
     """
     _check_sequence(name, values)
     try:
-        if isinstance(values, (list, tuple)) and any(np.ma.isMaskedArray(item) for item in values):
+        if isinstance(values, (list, tuple)) and any(map(is_masked_array, values)):
             # NumPy takes what lies under the masks of the items.
             values = np.ma.stack([np.ma.asarray(item) for item in values])
-        mask = np.ma.getmaskarray(values) if np.ma.isMaskedArray(values) else None
+        mask = np.ma.getmaskarray(values) if is_masked_array(values) else None
         array = np.asarray(values)
     except Exception as error:
         raise DataError(

@@ -1,0 +1,161 @@
+"""Options for reading files, and those of every command."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar, Literal
+
+from typer import Argument, Option
+
+from ftlm.cli.framework import announce_reading, interval, pairs
+from ftlm.data.run import Run
+from ftlm.errors import DataError, ModelError
+from ftlm.io.dialect import Layout
+from ftlm.io.load import load
+from ftlm.io.preview import OpenedFile, open_file
+
+#: Panels of options in a command's help.
+FILE_PANEL, STRUCTURE_PANEL, METHOD_PANEL, OUTPUT_PANEL = "File", "Structure", "Method", "Output"
+#: Types of optional options.
+Text = str | None
+Number = float | None
+Texts = list[str] | None
+
+Files = Annotated[list[str], Argument(metavar="FILE...", help="Measured files; several files are several runs.")]
+Force = Annotated[bool, Option("--force", rich_help_panel=OUTPUT_PANEL, help="Overwrite existing files.")]
+Json = Annotated[bool, Option("--json", rich_help_panel=OUTPUT_PANEL, help="Print the result as JSON.")]
+#: Options of a text file's layout; `layout_options` collects them from a dataclass.
+Separator = Annotated[
+    Literal["comma", "semicolon", "tab", "space"] | None,
+    Option(help="Separator of cells; default detected."),
+]
+Decimal = Annotated[Literal["point", "comma"] | None, Option(help="Decimal mark; default detected.")]
+Thousands = Annotated[
+    Literal["none", "point", "comma", "space", "apostrophe"] | None,
+    Option(help="Mark between groups of thousands; default detected."),
+]
+SkippedLines = Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default detected.")]
+HeaderLines = Annotated[
+    int | None, Option(metavar="0|1|2", help="Header lines: none, names, names and units; default detected.")
+]
+Sheet = Annotated[Text, Option(help="Sheet of a workbook.")]
+
+
+def layout_options(record: object) -> dict[str, Any]:
+    """Layout options that a dataclass has and the user has set."""
+    said = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
+    return {name: value for name, value in said.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """Options for reading files."""
+
+    panel: ClassVar[str] = FILE_PANEL
+
+    time: Annotated[Text, Option(help="Time column; default found by its name.")] = None
+    time_unit: Annotated[
+        Literal["s", "ms", "us", "min", "h"] | None, Option(help="Unit of the time column; default its header's, or s.")
+    ] = None
+    step: Annotated[Number, Option(help="Sampling interval [s] of files without a time column.")] = None
+    inputs: Annotated[
+        Texts, Option("-u", "--inputs", metavar="NAME=COLUMN", help="Input; NAME alone if the column has that name.")
+    ] = None
+    outputs: Annotated[
+        Texts, Option("-y", "--outputs", metavar="NAME=COLUMN", help="Output; NAME alone if the column has that name.")
+    ] = None
+    units: Annotated[Texts, Option(metavar="NAME=UNIT", help="Unit of a signal, such as deg.")] = None
+    columns: Annotated[Text, Option(metavar="TOML", help="File that names columns and units.")] = None
+    intersample: Annotated[
+        Texts, Option(metavar="NAME=zoh|foh", help="Hold of an input between samples; default zoh.")
+    ] = None
+    window: Annotated[Text, Option(metavar="FROM:TO", help="Part of the run, in seconds [s] since its first row.")] = (
+        None
+    )
+    resample: Annotated[Number, Option(metavar="STEP", help="Resample irregular rows to this step [s].")] = None
+    missing: Annotated[
+        Literal["refuse", "weight", "hold"] | None,
+        Option(help="Missing outputs get no weight; hold: inputs are held, too."),
+    ] = None
+    encoding: Annotated[Text, Option(help="Text encoding, such as cp1252; default detected.")] = None
+    separator: Separator = None
+    decimal: Decimal = None
+    thousands: Thousands = None
+    skip: SkippedLines = None
+    header: HeaderLines = None
+    dates: Annotated[Literal["ymd", "dmy", "mdy"] | None, Option(help="Order of day and month in ambiguous dates.")] = (
+        None
+    )
+    sheet: Sheet = None
+    detrend: Annotated[
+        Literal["constant", "linear"] | None, Option(help="Subtract the mean or a straight line from every signal.")
+    ] = None
+
+    def runs(self, files: Sequence[str] | None, *, apart: bool = False) -> list[Run]:
+        """Load each file as a run, detrended if requested; see :meth:`_read`."""
+        runs = self._read(files, apart=apart)
+        return runs if self.detrend is None else [run.detrend(self.detrend) for run in runs]
+
+    def _read(self, files: Sequence[str] | None, *, apart: bool) -> list[Run]:
+        """Load each file as a run; .mat files with one signal each form one run unless ``apart``."""
+        given: dict[str, Any] = {
+            "time": self.time,
+            "step": self.step,
+            "inputs": pairs("-u", self.inputs),
+            "outputs": pairs("-y", self.outputs),
+            "units": pairs("--units", self.units),
+            "columns": self.columns,
+            "time_unit": self.time_unit,
+            "intersample": pairs("--intersample", self.intersample),
+            "resample": self.resample,
+            "missing": self.missing,
+            "layout": layout_options(self),
+        }
+        if not files:
+            return []
+        announce_reading(files)
+        options = {name: value for name, value in given.items() if value not in (None, {}, "")}
+        if self.window is not None:
+            options["window"] = interval(self.window, "--window", "1.1:19.5")
+        if not apart and len(files) > 1 and all(f.lower().endswith(".mat") for f in files):
+            try:
+                load(files[0], **options)
+            except DataError:
+                # The first file alone lacks a column that is asked for, so the files belong together.
+                run = load(list(files), **options)
+                print(f"ftlm: {len(files)} .mat files read as one run", file=sys.stderr)
+                return [run]
+        return [load(f, **options) for f in files]
+
+    def preview_file(self, file: str) -> OpenedFile:
+        """Preview a file that is not loaded as a run."""
+        if self.detrend is not None:
+            raise ModelError("--detrend is not used with open; give it to the commands that open names")
+        announce_reading([file])
+        return open_file(
+            file,
+            time=self.time,
+            step=self.step,
+            inputs=pairs("-u", self.inputs) or None,
+            outputs=pairs("-y", self.outputs) or None,
+            units=pairs("--units", self.units),
+            columns=self.columns,
+            time_unit=self.time_unit,
+            intersample=pairs("--intersample", self.intersample),
+            layout=layout_options(self),
+            window=None if self.window is None else interval(self.window, "--window", "1.1:19.5"),
+            resample=self.resample,
+            missing=self.missing,
+        )
+
+
+def given_fields(*records: Any) -> dict[str, Any]:
+    """Return the fields of option records that the user has set, by name."""
+    return {
+        f.name: getattr(record, f.name)
+        for record in records
+        for f in fields(record)
+        if getattr(record, f.name) is not None
+    }

@@ -1,0 +1,239 @@
+"""Commands for the rig and the installation: record, doctor."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import metadata
+from typing import Annotated, Any, Literal
+
+import typer
+from typer import Option
+
+from ftlm import _core
+from ftlm.arm.flexible_link import flexible_link
+from ftlm.cli.framework import command, numbers, parse_numbers
+from ftlm.cli.reading_options import Force, Json, Number, Text, Texts, given_fields
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError, ModelError
+from ftlm.estimation.linear import Streaming, estimate_coefficients
+from ftlm.findings import Finding
+from ftlm.order_search.options import SearchSettings
+from ftlm.progress import Progress
+from ftlm.rig import recording as experiment
+from ftlm.rig.arm_parameters import ArmParameters
+from ftlm.rig.quanser import driver_state
+from ftlm.rig.rig import SignalHandlers
+from ftlm.structure.parser import equation
+from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import available_threads
+
+#: Reader packages with their file types and the extra that installs them.
+_READER_PACKAGES = {
+    "scipy": (".mat files", "mat"),
+    "h5py": (".mat files of version 7.3 and HDF5", "hdf5"),
+    "pyarrow": ("parquet and feather", "parquet"),
+    "python-calamine": ("xlsx and ods", "excel"),
+}
+
+
+@command
+def doctor(*, as_json: Json = False) -> None:
+    """Print versions, cores, vector unit, and whether the rig's driver is installed."""
+    about: dict[str, Any] = {
+        "ftlm": _core.__version__,
+        "core": _core.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": available_threads(),
+        "simd": _core.SIMD,
+        "numpy": _installed_version("numpy"),
+        **{package: _installed_version(package) for package in _READER_PACKAGES},
+        "rig driver": driver_state(),
+    }
+    if as_json:
+        print(json.dumps(about, indent=1))
+        return
+    for name, value in about.items():
+        print(f"{name:<17}{value if value is not None else 'not installed'}")
+    for package, (files, extra) in _READER_PACKAGES.items():
+        if about[package] is None:
+            print(f"{package} is needed for {files}: pip install 'ftlm[{extra}]'")
+
+
+def _installed_version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Options of the identification during a recording."""
+
+    live: Annotated[
+        Text, Option(metavar="STRUCTURE", help="Identify while recording: flexible-link:1, :2, an equation.")
+    ] = None
+    orders: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix an order of --live; default the arm's.")] = None
+    innovation_length: Annotated[int | None, Option(help="Innovation length of --live; default 7.")] = None
+    prior_covariance: Annotated[Number, Option(help="Prior covariance of --live; default 1.")] = None
+
+    def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
+        """Return the streaming estimator for a rate [Hz] and a longest run [s]; None if not requested."""
+        if self.live is None:
+            useless = [parameter(name) for name in given_fields(self)]
+            if useless:
+                raise ModelError(f"{', '.join(useless)}: of --live, which is not given; leave out, or give --live")
+            return None
+        free = numbers("--orders", self.orders)
+        if self.live.startswith("flexible-link:"):
+            stages: dict[str, Literal[1, 2]] = {"1": 1, "2": 2}
+            stage = stages.get(self.live.removeprefix("flexible-link:"))
+            if stage is None:
+                raise ModelError(
+                    f"--live {self.live!r} is not known; use flexible-link:1, flexible-link:2 or an equation"
+                )
+            structure = flexible_link(stage=stage, laws=("orders",), coupling="measured")
+            if rig == "virtual":
+                arm = ArmParameters.of(parameters)
+                usual = (arm.stage1 if stage == 1 else arm.stage2).orders(stage)
+                free = {n: v for n, v in usual.items() if n in structure.order_names} | free
+        else:
+            structure = equation(self.live)
+        return Streaming(
+            structure.with_orders(free),
+            step=1.0 / rate,
+            longest=limit + 1.0,
+            innovation_length=self.settings.innovation_length,
+            prior_covariance=self.settings.prior_covariance,
+        )
+
+    @property
+    def settings(self) -> SearchSettings:
+        """Settings of the estimate after the last sample."""
+        given = {
+            n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance") and v is not None
+        }
+        return SearchSettings(row_basis="time", **given)
+
+    def findings(self, run: Run, stream: Streaming) -> list[Finding]:
+        """Return the findings on the estimate of a stream after a recorded run."""
+        try:
+            fit = estimate_coefficients([run], replace(stream.structure, initial="rest"), self.settings, stream.pulses)
+        except FtlmError:
+            # A run that was stopped early.
+            return []
+        return fit.findings
+
+
+@command
+def record(
+    *,
+    out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Write the run to this .csv or .parquet file.")],
+    rig: Annotated[str, Option(help="Rig: virtual or q8.")] = "virtual",
+    shape: Annotated[str, Option("--input", help="square, sine, chirp, multisine, prbs, doublet or csv.")] = "square",
+    amplitude: Annotated[
+        str, Option(metavar="A or A1:A2", help="Amplitude of the current [A], of both motors or each.")
+    ] = "0.3",
+    period: Annotated[Number, Option(help="Period, or clock of a prbs [s].")] = None,
+    band: Annotated[str, Option(metavar="LOW:HIGH", help="Frequency band of chirp and multisine [Hz].")] = "0.1:20",
+    ramp: Annotated[float, Option(help="Time over which the amplitude grows [s].")] = 0.0,
+    file: Annotated[Text, Option(help="Currents I1, I2 [A] for --input csv.")] = None,
+    duration: Annotated[float, Option(help="Length of the run [s].")] = 10.0,
+    limit: Annotated[float, Option(help="Longest permitted run, at most 600 [s].")] = 30.0,
+    rate: Annotated[float, Option(help="Sampling rate [Hz].")] = 500.0,
+    seed: Annotated[int, Option(min=0, help="Seed of noise and random inputs.")] = 0,
+    parameters: Annotated[
+        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, measured-lqr, linear.")
+    ] = "effective",
+    offset: Annotated[
+        Text, Option(metavar="A1:A2", help="Virtual arm: current in addition to the command [A].")
+    ] = None,
+    real_time: Annotated[bool, Option("--real-time", help="Run the virtual rig in real time.")] = False,
+    sensor_filter: Annotated[
+        Literal["stock"] | None,
+        Option(metavar="stock", help="Record behind the stock 2 Hz low-pass filter; default none."),
+    ] = None,
+    watchdog: Annotated[float, Option(help="Time after which the motors are stopped [s].")] = 0.1,
+    arm: Annotated[bool, Option("--arm", help="Confirm that a real arm may move.")] = False,
+    board: Annotated[str, Option(help="Identifier of the Q8-USB board.")] = "0",
+    live: LiveOptions,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Run an experiment on a rig, simulated by default, and record it as a run."""
+    currents = parse_numbers("--amplitude", amplitude, 1, 2)
+    low, high = parse_numbers("--band", band, 2)
+    shift = None if offset is None else parse_numbers("--offset", offset, 2)
+    stream = live.stream(rig, parameters, rate, limit)
+    if stream is not None:
+        print(f"live: {stream.structure}", file=sys.stderr)
+    signals = SignalHandlers()
+    try:
+        signals.install()
+        with Progress("recording", quiet=as_json) as progress:
+            run = experiment.record(
+                rig,
+                input=shape,
+                amplitude=(currents[0], currents[-1]),
+                period=period,
+                band=(low, high),
+                ramp=ramp,
+                file=file,
+                duration=duration,
+                limit=limit,
+                rate=rate,
+                seed=seed,
+                parameters=parameters,
+                offset=None if shift is None else (shift[0], shift[1]),
+                real_time=real_time,
+                sensor_filter=sensor_filter,
+                watchdog=watchdog,
+                arm=arm,
+                board=board,
+                out=out,
+                force=force,
+                live=stream,
+                progress=live_reporter(stream, rate, progress),
+            )
+    except (KeyboardInterrupt, SystemExit) as ended:
+        signals.ignore()
+        what = experiment.describe_interruption(ended)
+        *troubles, rows = getattr(ended, "__notes__", None) or ["nothing was recorded"]
+        print(f"ftlm: {'; '.join([what, *(troubles or ['the motors are at 0 V']), rows])}", file=sys.stderr)
+        code = ended.code if isinstance(ended, SystemExit) else 130
+        raise typer.Exit(code if isinstance(code, int) else 1) from None
+    finally:
+        signals.restore()
+    if stream is not None:
+        print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
+        for finding in live.findings(run, stream):
+            print(f"! {finding}", file=sys.stderr)
+    if as_json:
+        told = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}
+        print(json.dumps(told, indent=1, ensure_ascii=False))
+    else:
+        print(f"{run}\nwritten to {out}")
+    missed = run.metadata["missed_deadlines"]
+    if missed:
+        print(f"ftlm: {missed} deadlines were missed", file=sys.stderr)
+
+
+def live_reporter(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
+    """Return a callback that updates the bar and prints the live estimate once per second of the run."""
+    due = 1.0
+
+    def report_progress(done: int, total: int) -> None:
+        nonlocal due
+        progress(done, total)
+        seconds = done / rate
+        if stream is not None and seconds >= due:
+            print(f"{seconds:7.2f} s: {stream}", file=sys.stderr, flush=True)
+            due = math.floor(seconds) + 1.0
+
+    return report_progress
