@@ -47,7 +47,7 @@ MODEL, DATA, CONVERGENCE = ftlm.ModelError, ftlm.DataError, ftlm.ConvergenceErro
 
 BAD = {
     # Orders
-    "alpha of 0": (MODEL, "order alpha = 0 of y", lambda: ftlm.equation("D^0 y = a u")),
+    "alpha of 0": (MODEL, "its left-hand side has no derivative", lambda: ftlm.equation("D^0 y = a u")),
     "alpha above 10": (MODEL, "order alpha = 10.01 of y", lambda: ftlm.equation("D^10.01 y = a u")),
     "alpha below 0": (MODEL, "order alpha = -1 of y", lambda: ftlm.equation("D^(-1) y = a u")),
     "alpha above 10 in a lattice": (MODEL, "order alpha = 10.5", lambda: ftlm.order_grid(alpha=(1.0, 10.5))),

@@ -510,7 +510,8 @@ class Structure:
     @check_arguments
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
         """Texts of inputs with delay or nonlinearity, such as ``sat(u(t - 0.035 s), 0.94)``."""
-        out = {n: f"{n}(t - {d:.6g} s)" for n, d in self.delay.items() if d > 0 and digits != "r"}
+        ends: dict[str, tuple[float, ...]] = {n: (d,) for n, d in self.delay.items() if d > 0} | dict(self.free_delays)
+        out = {n: f"{n}(t - {':'.join(_format(d, digits) for d in values)} s)" for n, values in ends.items()}
         for limit in self.limits:
             out[limit.signal] = limit.as_text(out.get(limit.signal, limit.signal), digits)
         return out
@@ -536,6 +537,11 @@ class Structure:
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
+
+
+def _format(value: float, digits: str) -> str:
+    """Format a number with these digits, or exactly for ``"r"``."""
+    return repr(float(value)) if digits == "r" else format(value, digits)
 
 
 def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, ...] | UnsetType:

@@ -1,0 +1,681 @@
+"""Grammar of equation texts: a recursive-descent parser from text to sums of terms, with positions in errors.
+
+::
+
+    equation    = sum "=" (sum | "0")  |  transfer
+    sum         = {sign} item {sign {sign} item}
+    item        = "c"  |  "(c + ramp t)"  |  friction  |  product  |  number "(" sum ")"
+    product     = {number [* /]} [name [*]] derivative [/ number]
+    derivative  = ["D" ["^" order]] signal  |  signal "'"…  |  "dy/dt"  |  "d^2 y/dt^2"  |  "d/dt" signal
+    signal      = name ["(t" ["-" delay ["s"]] ")"]  |  "sat(" signal "," limit ")"  |  "dead(" signal "," limit ")"
+    friction    = [strength [*]] ["exp(-(D y/" speed ")^2)" [*]] "sign(D y)"
+    transfer    = signal "=" {sign} ratio signal {sign ratio signal}  |  signal "/" signal "=" ratio
+    ratio       = factor {("*" | "/" | "") factor}
+    factor      = number  |  name  |  "s" ["^" order]  |  "sqrt(s)"  |  "e^(-" delay "s)"
+                |  "(" polynomial ")" ["^" whole number]
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from ftlm.errors import ModelError
+from ftlm.structure.equation import Friction, Stribeck
+from ftlm.structure.input_nonlinearity import INPUT_EFFECT_ABBREVIATIONS, NonlinearityKind, Value
+from ftlm.structure.order import Order
+from ftlm.utils.parameters import parameter
+
+IDENTIFIER_PATTERN = r"[^\W\d]\w*"
+#: Input nonlinearities with a syntax in equation texts.
+NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
+#: A term that consists of such a name alone is an offset.
+_OFFSET_PATTERN = re.compile(r"c\d*")
+_TOKEN_PATTERN = re.compile(
+    rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{IDENTIFIER_PATTERN})|(?P<symbol>[-+*/^(){{}}=,:']))"
+)
+#: What follows the name of an offset in parentheses, by the kind of offset.
+OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
+#: Functions of signals, whose terms are refused by name.
+FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt", "sign", "atan", "arctan")
+#: Largest power of a polynomial in s that is multiplied out.
+MAX_POLYNOMIAL_POWER = 10
+
+
+@dataclass(frozen=True)
+class Product:
+    """Product ``factor * name * D^order signal`` of a sum; ``name`` is None for a known coefficient."""
+
+    factor: float
+    name: str | None
+    order: Order
+    signal: str
+
+
+#: Sum of ``factor * name * s^order``, a polynomial in s.
+Polynomial = list[tuple[float, str | None, Order]]
+UNIT_POLYNOMIAL: Polynomial = [(1.0, None, Order())]
+
+
+class EquationParser:
+    """Parser of one equation: terms on both sides, friction, offset, delays and limits of inputs.
+
+    Parameters
+    ----------
+    text
+        Text of the equation.
+
+    Attributes
+    ----------
+    left, right
+        Terms of both sides.
+    friction, stribeck
+        Friction of the output on the right-hand side, with its signal.
+    offset
+        ``"constant"``, ``"ramp"`` or ``"auto"``, or None.
+    limits
+        Saturations and dead zones, by signal and kind.
+    plain
+        Signals that occur without a limit.
+    delays
+        Delays [s], by signal; (lower, upper) is estimated.
+    """
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.left: list[Product] = []
+        self.right: list[Product] = []
+        self.friction: tuple[Friction, str] | None = None
+        self.stribeck: tuple[Stribeck, str] | None = None
+        self.offset: str | None = None
+        self.limits: dict[tuple[str, NonlinearityKind], Value] = {}
+        self.plain: set[str] = set()
+        self.delays: dict[str, Value] = {}
+        self._tokens: list[tuple[str, str, int]] = []
+        self._position = 0
+        # A minus sign of a printed text, and the power of a Python text, of the same length.
+        readable = text.replace("−", "-").replace("**", "^ ")
+        at = 0
+        while readable[at:].strip():
+            token = _TOKEN_PATTERN.match(readable, at)
+            if token is None:
+                start = at + len(readable[at:]) - len(readable[at:].lstrip())
+                raise ModelError(f"equation {text!r}: {text[start]!r} at character {start + 1} has no meaning there")
+            kind = str(token.lastgroup)
+            self._tokens.append((kind, token[kind], token.start(kind)))
+            at = token.end()
+        self._readable = readable
+        self._parse()
+
+    # -------------------------------------------------------------------------------------------------- tokens
+
+    def _peek(self, ahead: int = 0) -> tuple[str, str, int]:
+        index = self._position + ahead
+        return self._tokens[index] if index < len(self._tokens) else ("end", "the end", len(self.text))
+
+    def _take(self) -> tuple[str, str, int]:
+        token = self._peek()
+        self._position += 1
+        return token
+
+    def _sees(self, *values: str) -> bool:
+        """Whether the next tokens have these values."""
+        return all(self._peek(k)[1] == value for k, value in enumerate(values))
+
+    def _accept(self, symbol: str) -> bool:
+        """Take the next token if it is this symbol."""
+        found = self._peek()[:2] == ("symbol", symbol)
+        self._position += found
+        return found
+
+    def _expect(self, symbol: str, wanted: str | None = None) -> None:
+        if self._peek()[1] != symbol:
+            raise self._syntax_error(wanted or f"'{symbol}'")
+        self._take()
+
+    def _error(self, message: str) -> ModelError:
+        return ModelError(f"equation {self.text!r}: {message}")
+
+    def _syntax_error(self, wanted: str) -> ModelError:
+        kind, value, at = self._peek()
+        if kind == "symbol" and value in ",:'":
+            return self._error(f"{value!r} at character {at + 1} has no meaning there")
+        return self._error(
+            f"expected {wanted} at character {at + 1}, found {value!r}; "
+            "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
+        )
+
+    # ------------------------------------------------------------------------------------------------ equation
+
+    def _parse(self) -> None:
+        """Parse the whole text."""
+        if self._is_transfer():
+            self._transfer()
+            return
+        self.left = self._sum(left=True)
+        self._expect("=")
+        if self._sees("0", "the end"):
+            self._take()
+        else:
+            self.right = self._sum()
+        if self._peek()[0] != "end":
+            raise self._syntax_error("'+', '-' or the end")
+
+    def _sum(self, *, left: bool = False, closed: bool = False) -> list[Product]:
+        """Parse a sum up to a token that does not continue it."""
+        found: list[Product] = []
+        while True:
+            sign = self._signs()
+            if self._is_offset():
+                self._take_offset(sign, left=left)
+            elif closed or not (self._take_phrase() or self._take_friction(-sign if left else sign)):
+                found += self._item(sign)
+            if self._peek()[1] not in "+-" or self._peek()[0] != "symbol":
+                return found
+
+    def _signs(self) -> float:
+        sign = 1.0
+        while self._peek()[0] == "symbol" and self._peek()[1] in "+-":
+            sign *= -1.0 if self._take()[1] == "-" else 1.0
+        return sign
+
+    def _item(self, sign: float) -> list[Product]:
+        """Parse a product, or a number times a sum in parentheses."""
+        factor = self._numbers(sign)
+        name: str | None = None
+        if self._accept("("):
+            inner = self._sum(closed=True)
+            self._expect(")")
+            factor = self._divisors(factor)
+            return [replace(item, factor=factor * item.factor) for item in inner]
+        kind, value, at = self._peek()
+        if kind == "name" and value != "D" and self._leibniz() is None and self._continues_after_name():
+            name = value
+            self._take()
+            self._accept("*")
+            if self._peek()[0] == "number":
+                raise self._error(
+                    f"{self._peek()[1]} at character {self._peek()[2] + 1} follows the coefficient {name}; write "
+                    "numbers first"
+                )
+            if self._sees("("):
+                raise self._error(
+                    f"{name} at character {at + 1} multiplies a sum; multiply it out, with a coefficient of its own "
+                    "in each term"
+                )
+        order, signal = self._derivative()
+        after, end = self._peek()[1], self._peek()[2] + 1
+        if after == "^":
+            raise self._error(
+                f"a power of {signal} at character {end}: terms that are not linear in the signals are not computed"
+            )
+        if after == "*":
+            raise self._error(
+                f"{signal} is multiplied at character {end}: products of signals are not computed, and a coefficient "
+                "stands before its signal"
+            )
+        return [Product(self._divisors(factor), name, order or Order(), signal)]
+
+    def _numbers(self, factor: float) -> float:
+        """Parse the numbers at the head of a product."""
+        while self._peek()[0] == "number":
+            factor *= float(self._take()[1])
+            while self._sees("/") and self._peek(1)[0] == "number":
+                factor = self._divisors(factor)
+            self._accept("*")
+        return factor
+
+    def _divisors(self, factor: float) -> float:
+        """Divide by the numbers behind a product."""
+        while self._accept("/"):
+            kind, value, at = self._peek()
+            if kind != "number" or float(value) == 0.0:
+                raise self._error(
+                    f"{value!r} at character {at + 1} divides, but a divisor is a number other than 0; give the "
+                    "quotient a name of its own, as in a y for y/T"
+                )
+            factor /= float(self._take()[1])
+        return factor
+
+    def _continues_after_name(self) -> bool:
+        """Whether the name at hand is a coefficient: a signal, a derivative or a sum follows."""
+        kind, value, _ = self._peek(1)
+        if kind == "name" or value == "*":
+            return self._peek()[1] not in FUNCTION_NAMES or kind == "name"
+        if value != "(" or self._peek()[1] in FUNCTION_NAMES or self._peek()[1] in INPUT_EFFECT_ABBREVIATIONS.values():
+            return False
+        return self._peek(2)[1] not in ("t", "s") or self._peek(3)[1] not in ")-+"
+
+    # ------------------------------------------------------------------------------------------------- offset
+
+    def _is_offset(self) -> bool:
+        """Whether the next term is an unknown constant; raise for a known one."""
+        (kind, value, at), (after, symbol, _) = self._peek(), self._peek(1)
+        if not (after == "end" or (after == "symbol" and symbol in "+-=")):
+            return False
+        if kind == "number":
+            raise self._error(
+                f"{value} at character {at + 1} is a constant without a signal; an offset is unknown: write '+ c' and "
+                "it is estimated, or subtract a known one from the run"
+            )
+        return kind == "name" and _OFFSET_PATTERN.fullmatch(value) is not None
+
+    def _take_offset(self, sign: float, *, left: bool) -> None:
+        _, value, at = self._peek()
+        if self.offset or sign < 0 or left:
+            reason = "stands there twice" if self.offset else "has a sign, but an unknown constant has its own"
+            reason = "stands on the left-hand side" if left else reason
+            raise self._error(
+                f"the offset {value!r} at character {at + 1} {reason}; write '+ c' once, on the right-hand side"
+            )
+        self.offset = "constant"
+        self._take()
+
+    def _take_phrase(self) -> bool:
+        """Take an offset in parentheses, as structures with one are printed; False for any other term."""
+        for kind, phrase in OFFSET_PHRASES.items():
+            if self._sees("(") and self._peek(1)[0] == "name":
+                values = [self._peek(k)[1] for k in range(2, 3 + len(phrase))]
+                if values == [*phrase, ")"]:
+                    if self.offset:
+                        raise self._error("the offset stands there twice; write it once")
+                    self.offset = kind
+                    self._position += 3 + len(phrase)
+                    return True
+        return False
+
+    # ------------------------------------------------------------------------------------ derivatives and signals
+
+    def _derivative(self) -> tuple[Order | None, str]:
+        """Parse a signal or its derivative; the order is None without one."""
+        found = self._leibniz()
+        if found is not None:
+            order, signal, tokens = found
+            self._position += tokens
+            return order, signal or self._signal()
+        if self._peek()[:2] == ("name", "D"):
+            self._take()
+            return (self._order() if self._accept("^") else Order(1.0)), self._signal()
+        signal = self._signal()
+        primes = 0
+        while self._accept("'"):
+            primes += 1
+        return (Order(float(primes)) if primes else None), signal
+
+    def _leibniz(self) -> tuple[Order, str, int] | None:
+        """Return order, signal and number of tokens of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
+        ahead, order = 0, 1
+        kind, value, _ = self._peek()
+        if kind != "name" or not value.startswith("d"):
+            return None
+        signal = value[1:]
+        if not signal and self._peek(1)[1] == "^" and self._peek(2)[1].isdigit():
+            ahead, order = 2, int(self._peek(2)[1])
+            if self._peek(3)[0] == "name":
+                ahead, signal = 3, self._peek(3)[1]
+        elif re.fullmatch(r"\d+\D.*", signal):
+            digits = re.match(r"\d+", signal)
+            assert digits is not None
+            order, signal = int(digits[0]), signal[digits.end() :]
+        if self._peek(ahead + 1)[1] != "/":
+            return None
+        bottom = self._peek(ahead + 2)[1]
+        ahead += 3
+        if bottom == "dt" and self._peek(ahead)[1] == "^" and self._peek(ahead + 1)[1] == str(order):
+            ahead += 2
+        elif bottom != ("dt" if order == 1 else f"dt{order}"):
+            return None
+        if signal:
+            self.plain.add(signal)
+        return Order(float(order)), signal, ahead
+
+    def _signal(self) -> str:
+        """Parse a signal, at time t or delayed, or an input behind a saturation or a dead zone."""
+        kind, value, at = self._peek()
+        if kind != "name" or value == "D":
+            raise self._syntax_error("the name of a signal")
+        law = next(
+            (law for law in NONLINEARITY_KINDS if INPUT_EFFECT_ABBREVIATIONS[law] == value and self._peek(1)[1] == "("),
+            None,
+        )
+        if law is None and value in FUNCTION_NAMES and self._peek(1)[1] == "(":
+            raise self._error(
+                f"{value}(…) at character {at + 1}: of the functions of signals only sign(D y), sat(u, …) and "
+                "dead(u, …) are computed"
+            )
+        self._take()
+        if law is None:
+            self.plain.add(value)
+            self._time_argument(value)
+            return value
+        self._take()
+        before = set(self.plain)
+        signal = self._signal()
+        self.plain = before | (self.plain - {signal})
+        if law == "dead_zone" and (signal, "saturation") in self.limits:
+            raise self._error(f"a dead zone acts before a saturation: write sat(dead({signal}, …), …)")
+        self._expect(",", "',' and the limit, as in sat(u, 0.94)")
+        limit = self._value("a limit, or LEAST:LARGEST where it is estimated")
+        self._expect(")")
+        if self.limits.setdefault((signal, law), limit) != limit:
+            raise self._error(f"{signal} has two limits of one kind; an actuator has one")
+        return signal
+
+    def _time_argument(self, signal: str) -> None:
+        """Parse ``(t)`` or ``(t - 0.06 s)`` behind a signal; the delay is kept."""
+        if not (self._sees("(", "t") and self._peek(2)[1] in ")-+"):
+            self._check_delay(signal, 0.0)
+            return
+        self._position += 2
+        delay: Value = 0.0
+        if self._sees("+") and self._peek(1)[0] == "number":
+            self._take()
+            delay = -float(self._take()[1])
+        elif self._accept("-"):
+            delay = self._delay(signal)
+            # The unit of a printed model.
+            self._position += self._sees("s")
+        self._expect(")")
+        self._check_delay(signal, delay)
+
+    def _check_delay(self, signal: str, delay: Value) -> None:
+        if self.delays.setdefault(signal, delay) != delay:
+            raise self._error(
+                f"{signal} has two delays; a run holds one signal for each: give the input that comes later a name of "
+                "its own"
+            )
+
+    def _delay(self, signal: str) -> Value:
+        kind, value, _ = self._peek()
+        if kind == "name":
+            raise self._error(
+                f"the delay {value} of {signal} is free, and a delay is estimated between bounds; write them: "
+                f"{signal}(t - 0:0.5)"
+            )
+        return self._value("a delay [s], or LEAST:LARGEST where it is estimated")
+
+    def _value(self, wanted: str) -> Value:
+        """Parse a number, or an interval in which one is estimated."""
+        ends = []
+        while True:
+            if self._peek()[0] != "number":
+                raise self._syntax_error(wanted)
+            ends.append(float(self._take()[1]))
+            if len(ends) == 2 or not self._accept(":"):
+                return ends[0] if len(ends) == 1 else (ends[0], ends[1])
+
+    def _order(self) -> Order:
+        """Parse an order: a number, a name, or an expression in parentheses."""
+        kind, value, start = self._peek()
+        if value in "({" and kind == "symbol":
+            close = ")" if value == "(" else "}"
+            self._take()
+            depth, begin, at = 1, start + 1, start + 1
+            while depth:
+                kind, token, at = self._take()
+                if kind == "end":
+                    self._position -= 1
+                    raise self._syntax_error(f"'{close}'")
+                depth += token in "({" and kind == "symbol"
+                depth -= token in ")}" and kind == "symbol"
+            return self._order_from(self._readable[begin:at], begin)
+        sign = "-" if self._accept("-") else ""
+        kind, value, _ = self._peek()
+        if kind not in ("number", "name"):
+            raise self._syntax_error("an order: a number, a name or (…)")
+        self._take()
+        return self._order_from(sign + value, start)
+
+    def _order_from(self, text: str, at: int) -> Order:
+        try:
+            return Order.parse(text)
+        except ModelError as error:
+            raise self._error(f"at character {at + 1}: {error}") from error
+
+    # ------------------------------------------------------------------------------------------------ friction
+
+    def _take_friction(self, sign: float) -> bool:
+        """Parse ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; False for any other term."""
+        ahead, number, name = 0, 1.0, None
+        if self._peek(ahead)[0] == "number":
+            number = float(self._peek(ahead)[1])
+            ahead += 1 + (self._peek(ahead + 1)[1] == "*")
+        if self._peek(ahead)[0] == "name" and self._peek(ahead)[1] not in ("D", "sign", "exp"):
+            name = self._peek(ahead)[1]
+            ahead += 1 + (self._peek(ahead + 1)[1] == "*")
+        if self._peek(ahead)[1] not in ("sign", "exp") or self._peek(ahead + 1)[1] != "(":
+            return False
+        self._position += ahead
+        near = self._stribeck_factor() if self._sees("exp") else None
+        if near is not None:
+            self._accept("*")
+            if not self._sees("sign"):
+                raise self._syntax_error(f"sign(D {near[0]})")
+        self._take()
+        self._expect("(")
+        signal = self._velocity("D and the name of a signal, as in sign(D y)")
+        self._expect(")")
+        if near is not None and near[0] != signal:
+            raise self._error(
+                f"Stribeck friction has the speed of {near[0]} and the sign of {signal}; it follows one velocity"
+            )
+        if sign > 0:
+            shape = "fc*" if near is None else f"fs*exp(-(D {signal}/vs)^2)*"
+            raise self._error(f"friction takes energy, so it is subtracted: write '- {shape}sign(D {signal})'")
+        if (self.friction if near is None else self.stribeck) is not None:
+            which = "friction" if near is None else "Stribeck friction"
+            raise self._error(f"{which} of D {signal} stands there twice; write it once")
+        strength: tuple[str | float, float] = (name, sign * number) if name is not None else (number, sign)
+        if near is None:
+            self.friction = Friction(*strength), signal
+        else:
+            self.stribeck = Stribeck(strength[0], near[1], strength[1]), signal
+        return True
+
+    def _stribeck_factor(self) -> tuple[str, str | float]:
+        """Parse ``exp(-(D y/vs)^2)``: the signal, and name or value of the Stribeck speed."""
+        self._take()
+        for symbol in "(-(":
+            self._expect(symbol, "-(D y/vs)^2, as in exp(-(D y/vs)^2)")
+        signal = self._velocity("D and the name of a signal, as in exp(-(D y/vs)^2)")
+        self._expect("/")
+        kind, value, _ = self._peek()
+        if kind not in ("name", "number"):
+            raise self._syntax_error("a speed, its name or a positive number")
+        self._take()
+        for symbol in (")", "^", "2", ")"):
+            self._expect(symbol, f"'{symbol}', as in exp(-(D y/vs)^2)")
+        return signal, float(value) if kind == "number" else value
+
+    def _velocity(self, wanted: str) -> str:
+        """Parse ``D y``."""
+        if not self._sees("D") or self._peek(1)[0] != "name":
+            raise self._syntax_error(wanted)
+        self._take()
+        return self._take()[1]
+
+    # --------------------------------------------------------------------------------------- transfer functions
+
+    def _is_transfer(self) -> bool:
+        """Whether the text is ``y = G(s) u`` or ``y/u = G(s)``: a bare signal, and s on the other side."""
+        values = [value for _, value, _ in self._tokens]
+        if values.count("=") != 1:
+            return False
+        at = values.index("=")
+        signal = rf"{IDENTIFIER_PATTERN}( \( s \))?"
+        if not re.fullmatch(rf"{signal}( / {signal})?", " ".join(values[:at])):
+            return False
+        last = len(values) - 1
+        # Neither u(s), nor the unit of u(t - 0.1 s), nor a signal of that name.
+        return any(
+            values[k] == "s" and k != last and values[k - 1] != "(" and values[k - 3 : k - 1] != ["t", "-"]
+            for k in range(at + 1, len(values))
+        ) or any(values[k : k + 2] == ["(", "s"] and values[k + 2 : k + 3] != [")"] for k in range(at, len(values)))
+
+    def _transfer(self) -> None:
+        """Parse transfer functions, and multiply by the common denominator."""
+        output = self._transform()
+        common = self._transform() if self._accept("/") else None
+        self._expect("=")
+        paths: list[tuple[Polynomial, Polynomial, str]] = []
+        while True:
+            sign = self._signs()
+            top, bottom, delay = self._ratio(common)
+            signal = common or self._transform()
+            self.delays[signal] = delay
+            if any(signal == other for _, _, other in paths):
+                raise self._error(f"{signal} stands there twice; write one transfer function for each input")
+            paths.append(([(sign * c, n, o) for c, n, o in top], bottom, signal))
+            if self._peek()[0] != "symbol" or self._peek()[1] not in "+-":
+                break
+        if self._peek()[0] != "end":
+            raise self._syntax_error("'+', '-' or the end")
+        denominators: list[Polynomial] = []
+        for _, bottom, _ in paths:
+            if bottom not in denominators:
+                denominators.append(bottom)
+        whole = UNIT_POLYNOMIAL
+        for bottom in denominators:
+            whole = self._times(whole, bottom)
+        self.left = [Product(c, n, o, output) for c, n, o in whole]
+        for top, own, signal in paths:
+            scaled = top
+            for bottom in denominators:
+                scaled = scaled if bottom == own else self._times(scaled, bottom)
+            self.right += [Product(c, n, o, signal) for c, n, o in scaled]
+
+    def _transform(self) -> str:
+        """Parse a signal, with or without ``(s)`` behind it."""
+        kind, value, _ = self._peek()
+        if kind != "name":
+            raise self._syntax_error("the name of a signal")
+        self._take()
+        if self._sees("(", "s", ")"):
+            self._position += 3
+        self.plain.add(value)
+        return value
+
+    def _ratio(self, common: str | None) -> tuple[Polynomial, Polynomial, Value]:
+        """Parse numerator, denominator and delay of a transfer function up to its signal."""
+        top, bottom, divides, delay = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, 0.0
+        while True:
+            kind, value, _ = self._peek()
+            after = [self._peek(k)[1] for k in (1, 2, 3)]
+            if value in ("e", "exp") and after[0] in ("^", "("):
+                delay = self._exponential()
+            elif self._ends_ratio(kind, value, after, named=common is None):
+                return top, bottom, delay
+            elif divides:
+                bottom = self._times(bottom, self._factor())
+            else:
+                top = self._times(top, self._factor())
+            divides = self._accept("/")
+            if not divides:
+                self._accept("*")
+
+    @staticmethod
+    def _ends_ratio(kind: str, value: str, after: list[str], *, named: bool) -> bool:
+        """Whether a token ends a transfer function: the name of its signal, or the end of the term without one."""
+        if not named:
+            return kind == "end" or (kind == "symbol" and value in "+-")
+        last = after[0] in ("the end", "+", "-") or after == ["(", "s", ")"]
+        return kind == "name" and value not in ("s", "sqrt") and last
+
+    def _exponential(self) -> float:
+        """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, a delay [s]."""
+        _, value, at = self._take()
+        if value == "e":
+            self._take()
+        close = {"(": ")", "{": "}"}.get(self._take()[1])
+        if close is None or not self._accept("-") or self._peek()[0] != "number":
+            raise self._error(
+                f"an exponential at character {at + 1} is a known delay, as in e^(-0.1 s); estimate one by "
+                f"{parameter('delay')}"
+            )
+        delay = float(self._take()[1])
+        self._accept("*")
+        self._expect("s")
+        self._expect(close)
+        return delay
+
+    def _polynomial(self) -> Polynomial:
+        """Parse a sum of products of numbers, names and powers of s."""
+        found: Polynomial = []
+        while True:
+            sign = self._signs()
+            product = self._factor()
+            while self._peek()[0] in ("number", "name") or self._peek()[1] in ("(", "*"):
+                self._accept("*")
+                product = self._times(product, self._factor())
+            for c, name, order in product:
+                same = next((k for k, (_, n, o) in enumerate(found) if (n, o) == (None, order) and name is None), None)
+                if same is None:
+                    found.append((sign * c, name, order))
+                else:
+                    found[same] = (found[same][0] + sign * c, None, order)
+            if self._peek()[0] != "symbol" or self._peek()[1] not in "+-":
+                return [item for item in found if item[0] != 0.0] or UNIT_POLYNOMIAL
+
+    def _factor(self) -> Polynomial:
+        """Parse one factor of a transfer function."""
+        kind, value, at = self._peek()
+        if kind == "number":
+            self._take()
+            return [(float(value), None, Order())]
+        if value == "sqrt" and self._sees("sqrt", "(", "s", ")"):
+            self._position += 4
+            return [(1.0, None, Order(0.5))]
+        if kind == "name" and value not in FUNCTION_NAMES:
+            self._take()
+            if value != "s":
+                return [(1.0, value, Order())]
+            return [(1.0, None, self._order() if self._accept("^") else Order(1.0))]
+        if not self._accept("("):
+            raise self._syntax_error("a number, a coefficient, s or (…)")
+        inner = self._polynomial()
+        self._expect(")")
+        if not self._accept("^"):
+            return inner
+        kind, value, at = self._take()
+        if not (kind == "number" and value.isdigit() and 1 <= int(value) <= MAX_POLYNOMIAL_POWER):
+            raise self._error(
+                f"the power {value!r} of a polynomial at character {at + 1} is no whole number from 1 to "
+                f"{MAX_POLYNOMIAL_POWER}; only these give a sum of powers of s"
+            )
+        found = UNIT_POLYNOMIAL
+        for _ in range(int(value)):
+            found = self._times(found, inner)
+        return found
+
+    def _times(self, first: Polynomial, second: Polynomial) -> Polynomial:
+        """Multiply two polynomials; equal powers with known coefficients are added."""
+        found: dict[tuple[str | None, Order], float] = {}
+        out: Polynomial = []
+        for c1, n1, o1 in first:
+            for c2, n2, o2 in second:
+                if n1 is not None and n2 is not None:
+                    raise self._error(
+                        f"{n1}*{n2} is a product of two coefficients; multiply out, and give each product a name"
+                    )
+                name, order = n1 or n2, add_orders(o1, o2)
+                if name is None:
+                    found[None, order] = found.get((None, order), 0.0) + c1 * c2
+                else:
+                    out.append((c1 * c2, name, order))
+        known: Polynomial = [(c, n, o) for (n, o), c in found.items() if c != 0.0]
+        names = [name for _, name, _ in out]
+        twice = next((a for a, b in pairwise(sorted(filter(None, names))) if a == b), None)
+        if twice is not None:
+            raise self._error(f"{twice} stands in several terms once multiplied out; give each term a name of its own")
+        return known + out
+
+
+def add_orders(first: Order, second: Order) -> Order:
+    """Return the sum of two orders."""
+    weights = dict(first.weights)
+    for name, weight in second.weights:
+        weights[name] = weights.get(name, 0.0) + weight
+    return Order(
+        round(first.constant + second.constant, 9) + 0.0, tuple(sorted((n, w) for n, w in weights.items() if w))
+    )

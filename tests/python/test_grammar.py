@@ -1,0 +1,180 @@
+"""Equations as people write them: forms that mean the same, transfer functions, and texts that are printed and read."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import ftlm
+from ftlm.structure.grammar import MAX_POLYNOMIAL_POWER
+
+
+def same(first, second):
+    """Whether two structures have the same equations, delays, limits and offsets."""
+    terms = [
+        sorted((t.signal, str(t.order), str(t.coefficient), t.factor) for e in s.equations for t in e.terms)
+        for s in (first, second)
+    ]
+    rest = [
+        ([(e.output, e.order, e.friction) for e in s.equations], dict(s.delay), dict(s.free_delays), s.limits, s.offset)
+        for s in (first, second)
+    ]
+    return terms[0] == terms[1] and rest[0] == rest[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ("y'' + 2 y' + y = u", "D^2 y = -2 D y - 1 y + u"),
+        ("D^2 y + 0.5 D^0.5 y + y = 2 u", "D^2 y = -0.5 D^0.5 y - y + 2 u"),
+        ("dy/dt = -y + u", "D y = -y + u"),
+        ("d^2 y/dt^2 + 3 dy/dt = u", "D^2 y = -3 D y + u"),
+        ("d2y/dt2 = u - y", "D^2 y = u - y"),
+        ("d/dt y = -a y + b u", "D y = -a y + b u"),
+        ("D**1.5 y = −0.5 y + u", "D^1.5 y = -0.5 y + u"),
+        ("2 D y + 4 y = 6 u", "D y = -2 y + 3 u"),
+        ("-D y = 2 y - u", "D y = -2 y + u"),
+        ("D y + a y - b u = 0", "D y = -a y + b u"),
+        ("y + 2 D y = u", "D y = -0.5 y + 0.5 u"),
+        ("D y = 2 (u - y)", "D y = 2 u - 2 y"),
+        ("D y = -y/4 + 3/2 u", "D y = -0.25 y + 1.5 u"),
+        ("D^alpha y + a D^beta y = b u", "D^alpha y = -a D^beta y + b u"),
+        ("3 D y = 2 a y + 6 b u", "D y = 0.6666666666666666 a y + 2 b u"),
+        ("3 D y = D y - 4 y + u", "D y = -2 y + 0.5 u"),
+        ("D y(t) = a y(t) + b u(t)", "D y = a y + b u"),
+        ("D^2 y + fc*sign(D y) = u", "D^2 y = u - fc*sign(D y)"),
+        ("2 D^2 y = u - 0.5 sign(D y)", "D^2 y = 0.5 u - 0.25 sign(D y)"),
+        ("y = b/(s^alpha + a) u", "D^alpha y = -a y + b u"),
+        ("y = K/(0.5 s + 1) u", "D y = -2 y + 2 K u"),
+        ("y/u = 1/(s^2 + 2 s + 1)", "D^2 y = -2 D y - y + u"),
+        ("y(s) = 1/(s + 1)^2 u(s)", "D^2 y = -2 D y - y + u"),
+        ("y = 1/(sqrt(s) + 2) u - 3 s/(sqrt(s) + 2) v", "D^0.5 y = -2 y + u - 3 D v"),
+    ],
+)
+def test_forms_that_mean_the_same(text, plain):
+    read, expected = ftlm.equation(text), ftlm.equation(plain)
+    points = [{"a": 0.7, "b": 1.3, "K": 2.1}, {"a": -2.0, "b": 0.2, "K": 0.4}]
+    for values, orders in itertools.product(points, ({"alpha": 1.7, "beta": 0.6},)):
+        models = []
+        for structure in (read, expected):
+            known = structure.with_orders({n: orders[n] for n in structure.order_names})
+            known = known.with_coefficients({n: values.get(n, 0.5) for n in known.coefficient_names})
+            terms: dict[tuple[str, float], float] = {}
+            for t in known.equations[0].terms:
+                terms[t.signal, t.order.constant] = terms.get((t.signal, t.order.constant), 0.0) + t.fixed
+            models.append((known.equations[0].order.constant, known.equations[0].friction, terms))
+        assert models[0][0] == models[1][0]
+        assert (models[0][1] and models[0][1].law) == (models[1][1] and models[1][1].law)
+        assert models[0][2] == pytest.approx(models[1][2], rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "delay", "free"),
+    [
+        ("D y = a y + b u(t - 0.06)", {"u": 0.06}, {}),
+        ("D y = a y + b u(t - 0.06 s)", {"u": 0.06}, {}),
+        ("D y = a y + b u(t - 0:0.5)", {}, {"u": (0.0, 0.5)}),
+        ("D y = a y + b D^0.5 u(t - 0.1) + k u(t - 0.1)", {"u": 0.1}, {}),
+        ("D y = a y + b sat(u(t - 0.035 s), 0.94)", {"u": 0.035}, {}),
+        ("y = 1/(s + 1) e^(-0.1 s) u + exp(-0.2*s)/(s + 2) v", {"u": 0.1, "v": 0.2}, {}),
+    ],
+)
+def test_delays_are_read(text, delay, free):
+    read = ftlm.equation(text)
+    assert (dict(read.delay), dict(read.free_delays)) == (delay, free)
+
+
+def test_a_delay_is_given_once():
+    with pytest.raises(ftlm.ModelError, match=r"the delay of u is in the equation and in delay="):
+        ftlm.equation("D y = a y + b u(t - 0.1)", delay={"u": 0.2})
+
+
+def random_polynomial(rng, top):
+    """A random sum of powers of s as text and as function, of this highest order."""
+    orders = np.unique(np.r_[top, rng.uniform(0, top, int(rng.integers(0, 3))).round(2), 0.0])[::-1]
+    values = rng.uniform(0.2, 3, orders.size).round(3)
+    text = " + ".join(f"{c} s^{o}" if o else f"{c}" for c, o in zip(values.tolist(), orders.tolist(), strict=True))
+    return f"({text})", lambda s: sum(c * s**o for c, o in zip(values, orders, strict=True))
+
+
+def test_transfer_functions_have_the_response_of_their_formula():
+    rng = np.random.default_rng(3)
+    w = np.geomspace(0.01, 100, 9)
+    for _ in range(40):
+        (n1, f1), (n2, f2) = (random_polynomial(rng, round(rng.uniform(0.1, 0.9), 2)) for _ in range(2))
+        (d1, g1), (d2, g2) = (random_polynomial(rng, round(rng.uniform(1, 2), 2)) for _ in range(2))
+        power, delay = int(rng.integers(1, 3)), round(rng.uniform(0, 0.3), 3)
+        model = ftlm.Model(ftlm.equation(f"y = 2 {n1}/({d1}^{power}) e^(-{delay} s) u - {n2} {n1} / {d2} v"))
+        s = 1j * w
+        expected = np.stack([2 * f1(s) / g1(s) ** power * np.exp(-delay * s), -f2(s) * f1(s) / g2(s)], axis=1)
+        np.testing.assert_allclose(model.frequency_response(w)[0].T, expected, rtol=1e-9)
+
+
+NAMES = ("y", "u", "v")
+NUMBERS = st.floats(0.01, 50).map(lambda x: float(f"{x:.4g}"))
+INTERVALS = st.tuples(NUMBERS, NUMBERS).filter(lambda ends: ends[0] < ends[1])
+
+
+@st.composite
+def structures(draw):
+    """Structures with two inputs, delays, limits, friction and offsets, free or known."""
+    highest = draw(st.sampled_from(["2", "1.5", "alpha"]))
+    terms = []
+    for k, signal in enumerate(("y", "u", "v")):
+        orders = st.sampled_from(["0", "0.5", "beta", "(alpha-beta)"])
+        for n, order in enumerate(draw(st.lists(orders, min_size=1, max_size=2, unique=True))):
+            coefficient = draw(st.one_of(st.just(f"k{k}{n}"), NUMBERS.map(repr)))
+            sign = draw(st.sampled_from("+-"))
+            terms.append(f"{sign} {coefficient} {'' if order == '0' else f'D^{order} '}{signal}")
+    friction = draw(st.sampled_from(["", " - fc*sign(D y)", " - 0.5 sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"]))
+    limits = {}
+    delays = NUMBERS if friction else st.one_of(NUMBERS, INTERVALS)
+    delay = draw(st.dictionaries(st.just("v"), delays))
+    for kind, signal in (("saturation", "u"), ("dead_zone", "v")):
+        if draw(st.booleans()) and signal not in delay:
+            limits[kind] = {signal: draw(NUMBERS)}
+    offset = draw(st.sampled_from(["none", "constant", "ramp", "auto"]))
+    text = f"D^{highest} y = {' '.join(terms).removeprefix('+ ')}{friction}"
+    return ftlm.equation(text, delay=delay, offset=offset, **limits)
+
+
+@settings(max_examples=150, deadline=None)
+@given(structure=structures())
+def test_what_is_printed_is_read(structure):
+    assert same(ftlm.equation(str(structure)), structure)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("D y = a y^2 + u", "a power of y at character 10"),
+        ("D y = a y*u", "products of signals are not computed"),
+        ("D y = y*u", "y u in the equation of y is a product of signals"),
+        ("D y = sin(y) + u", r"sin(…) at character 7: of the functions of signals only"),
+        ("D y = a tanh(y) + u", "tanh(…) at character 9"),
+        ("m D^2 y + k y = u", "m multiplies the highest derivative; divide by it"),
+        ("D y = -y/tau + u", "'tau' at character 10 divides"),
+        ("D y = u/0", "'0' at character 9 divides"),
+        ("D y = k (u - y)", "k at character 7 multiplies a sum"),
+        ("y = 1/(T s + 1) u", "T multiplies the highest derivative"),
+        ("D y = a y + b u(t - Td)", "the delay Td of u is free"),
+        ("y = e^(-L s)/(s + 1) u", "an exponential at character 5 is a known delay"),
+        ("D y = a y + u + 0.5 u(t - 0.1)", "u has two delays"),
+        ("y = 1/(s + 1) u + 2/(s + 1) u", "u stands there twice"),
+        ("y = (a s + b)/((s + 1) (c s + 2)) u", "c stands in several terms once multiplied out"),
+        ("y = 1/(s + a) u + 1/(s + b) v", "a*b is a product of two coefficients"),
+        ("y = (s + 1) (a s + 1)/(s + 2) u", "a stands in several terms once multiplied out"),
+        (f"y = 1/(s + 1)^{MAX_POLYNOMIAL_POWER + 1} u", "no whole number from 1 to 10"),
+        ("y = 1/(s + 1", "expected ')' at character 13"),
+        ("D y - D y = u", "D^1 y cancels out"),
+        ("u = D y", "its left-hand side has no derivative"),
+        ("y' + c = u", "the offset 'c' at character 6 stands on the left-hand side"),
+        ("D y = a*3 y", "3 at character 9 follows the coefficient a"),
+    ],
+)
+def test_what_is_not_computed_is_refused_with_its_place(text, message):
+    with pytest.raises(ftlm.ModelError) as refused:
+        ftlm.equation(text)
+    assert message in str(refused.value)
