@@ -192,6 +192,18 @@ def test_numbers_that_move_together_are_named():
     assert found.model.estimate.covariance is None
 
 
+def test_a_model_of_an_inductance_has_no_time_response_and_says_so(tmp_path):
+    words, response, _, _ = CLOSED["cable"]
+    found = ftlm.identify_frequency(ftlm.FrequencyData.from_arrays(W, response), words)
+    found.report(tmp_path / "cable.html")
+    for call in (
+        lambda: found.model.step_response(np.arange(0, 1, 0.01)),
+        lambda: found.model.to_control(band=(0.1, 100)),
+    ):
+        with pytest.raises(ftlm.ModelError, match=r"order 1\.8 of I is (1 )?above alpha = 0\.8"):
+            call()
+
+
 def test_a_number_that_another_hides_is_said_and_their_ratio_holds():
     words = CLOSED["diffusion"][0]
     w = 2 * math.pi * np.geomspace(0.01, 1e4, 60)

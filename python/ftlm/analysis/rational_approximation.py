@@ -253,6 +253,11 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
         for term in item.terms:
             eta = round(item.order.constant - term.order.constant, 9)
             whole = math.ceil(eta)
+            if whole < 0:
+                raise ModelError(
+                    f"order {term.order.constant:g} of {term.signal} is {-eta:g} above alpha = {item.order.constant:g} "
+                    f"of {item.output}: a state-space system has no derivative of its input; use frequency_response()"
+                )
             key = (term.signal, round(whole - eta, 9))
             if key not in filters:
                 source = sources[term.signal]
