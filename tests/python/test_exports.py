@@ -104,6 +104,40 @@ def test_systems_of_python_control_become_models():
     assert str(cart) == str(model("D^2 y = 1 u"))
 
 
+def test_models_of_integer_orders_become_exact_transfer_functions_and_come_back():
+    rng = np.random.default_rng(8)
+    w = np.geomspace(0.05, 50, 12)
+    for _ in range(60):
+        order = int(rng.integers(1, 5))
+        text = [f"D^{order} y = "]
+        text += [f"{c:+.4f} D^{k} y " for k, c in enumerate(rng.standard_normal(order))]
+        zeros = int(rng.integers(0, order + 1))
+        text += [f"{c:+.4f} D^{k} {u} " for u in ("u", "v") for k, c in enumerate(rng.standard_normal(zeros + 1))]
+        delay = {"u": round(rng.uniform(0.01, 0.5), 3)} if rng.random() < 0.5 else {}
+        one = model("".join(text), delay=delay)
+        if delay:
+            with pytest.warns(UserWarning, match="the delay of u"):
+                system = one.to_tf()
+        else:
+            system = one.to_tf()
+        assert system.delay == delay
+        late = np.exp(-1j * w * np.array([[delay.get("u", 0.0)], [0.0]]))
+        exact = np.reshape(system(1j * w), (1, 2, -1)) * late
+        np.testing.assert_allclose(exact, one.frequency_response(w), rtol=1e-12)
+        back = ftlm.Model.from_control(system)
+        np.testing.assert_allclose(back.frequency_response(w), np.reshape(system(1j * w), (1, 2, -1)), rtol=1e-9)
+
+
+def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_not():
+    w = np.geomspace(0.1, 100, 9)
+    seen = model("D^2 y = -D y - 4 y + u", sensor_filter=ftlm.SensorFilter.low_pass(["y"]))
+    np.testing.assert_allclose(seen.to_tf()(1j * w), seen.frequency_response(w)[0, 0], rtol=1e-12)
+    with pytest.raises(ftlm.ModelError, match=r"order 1\.5 is no whole number .*to_control\(band=…\)"):
+        model("D^1.5 y = -y + u").to_tf()
+    with pytest.raises(ftlm.ModelError, match="the input u passes a sensor filter"):
+        model("D y = -y + u", sensor_filter=ftlm.SensorFilter.low_pass(["u"])).to_tf()
+
+
 @pytest.mark.parametrize(
     ("system", "options", "words"),
     [

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
+import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from ftlm._core import __version__
-from ftlm.analysis.frequency_response import check_no_input_nonlinearity, transfer_functions
+from ftlm.analysis.frequency_response import POWER_TOLERANCE, check_no_input_nonlinearity, transfer_functions
 from ftlm.analysis.rational_approximation import approximate, identifier
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
@@ -183,6 +185,80 @@ def export_text(
 #: Size of a Markov parameter, relative to its factors, below which it is rounding error.
 MARKOV_TOLERANCE = 1e-12
 _LABEL_PATTERN = re.compile(r"([A-Za-z]+)\[(\d+)\]")
+
+
+@check_arguments
+def to_tf(model: Model) -> Any:
+    """Return the exact transfer functions of a model of integer orders as a python-control system.
+
+    Parameters
+    ----------
+    model
+        A linear model of integer orders; equations are coupled.
+
+    Returns
+    -------
+    control.TransferFunction
+        With named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders is
+        included). Its attribute ``delay`` has the delay [s] of each input, which python-control's systems cannot have.
+
+    Warns
+    -----
+    UserWarning
+        Where an input has a delay.
+
+    Raises
+    ------
+    ModelError
+        A fractional order, friction, an input with saturation or dead zone, a filtered input, or python-control is not
+        installed.
+    """
+    try:
+        control = importlib.import_module("control")
+    except ImportError:
+        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+    check_no_input_nonlinearity(model, "a transfer function")
+    transfer = transfer_functions(model)
+    sensor = model.structure.sensor_filter
+    filtered = () if sensor is None else sensor.signals
+    behind = next((name for name in transfer.inputs if name in filtered), None)
+    if behind is not None:
+        raise ModelError(
+            f"the input {behind} passes a sensor filter, and its inverse is no transfer function; leave it out"
+        )
+    top = np.ones(1) if sensor is None else _descending(sensor.numerator)
+    bottom = np.ones(1) if sensor is None else _descending(sensor.denominator)
+    tops, bottoms = [], []
+    for output in transfer.outputs:
+        through, under = (top, bottom) if output in filtered else (np.ones(1), np.ones(1))
+        denominator = np.convolve(_descending(transfer.denominator[output]), under)
+        tops.append([np.convolve(_descending(transfer.numerators[output, u]), through) for u in transfer.inputs])
+        bottoms.append([denominator] * len(transfer.inputs))
+    names = {"inputs": list(transfer.inputs), "outputs": list(transfer.outputs)}
+    system = control.TransferFunction(tops, bottoms, name=identifier(model.structure.name), **names)
+    system.delay = {name: delay for name, delay in transfer.delay.items() if delay}
+    for name, delay in system.delay.items():
+        warnings.warn(
+            f"the delay of {name}, {delay:g} s, is not in the transfer function; it is in its attribute delay, and "
+            "to_control(band=…) approximates it",
+            UserWarning,
+            stacklevel=2,
+        )
+    return system
+
+
+def _descending(pairs: Sequence[tuple[float, float]]) -> Floats:
+    """Coefficients of a polynomial in descending powers from (coefficient, power) pairs; raise for other powers."""
+    broken = next((p for _, p in pairs if abs(p - round(p)) > POWER_TOLERANCE or p < -POWER_TOLERANCE), None)
+    if broken is not None:
+        raise ModelError(
+            f"order {broken:g} is no whole number from 0, so there is no exact transfer function of python-control; "
+            "to_control(band=…) approximates one"
+        )
+    values = np.zeros(1 + max((round(p) for _, p in pairs), default=0))
+    for value, power in pairs:
+        values[values.size - 1 - round(power)] += value
+    return values
 
 
 def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> Structure:

@@ -340,6 +340,12 @@ class Model:
 
         return to_control(self, band=band, order=order)
 
+    def to_tf(self) -> Any:
+        """Convert a model of integer orders to python-control, exactly; see :func:`ftlm.analysis.to_tf`."""
+        from ftlm.analysis.conversion import to_tf
+
+        return to_tf(self)
+
     @check_arguments
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model as JSON, atomically.
