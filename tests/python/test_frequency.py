@@ -219,6 +219,23 @@ def test_poles_of_any_orders_are_all_zeros_on_the_principal_sheet():
     assert len(set(counts)) >= 4
 
 
+def test_zeros_are_those_of_the_numerator():
+    np.testing.assert_allclose(model("D^3 y = -y + D^2 u + 3 D u + 2 u").zeros(), [-1, -2], rtol=1e-12)
+    assert not model("D^1.5 y = -y + D^0.5 u + 2 u").zeros().size  # s^0.5 = -2 is on another sheet
+    fractional = model("D^2 y = -y + D^1.37 u - D^0.4 u + 2 u").zeros()
+    assert fractional.size == zeros_inside({1.37: 1.0, 0.4: -1.0, 0.0: 2.0}, 100.0)
+    for s in fractional:
+        assert abs(s**1.37 - s**0.4 + 2) < 1e-9
+    coupled = model("D y = -y + 2 z + u; D z = -3 z - 4 y + D v")
+    np.testing.assert_allclose(coupled.zeros("y", "u"), [-3], rtol=1e-12)
+    for bad, words in (
+        ((), "the model has the outputs y, z; name one with output="),
+        (("w", "u"), "output 'w' is not"),
+    ):
+        with pytest.raises(ftlm.ModelError, match=words):
+            coupled.zeros(*bad)
+
+
 def test_stability_without_a_common_base_is_that_of_the_argument_principle():
     assert model("D^1.31 y = -2 D^0.4301 y - y + u").stability().method == "argument principle"
     assert model("D^1.3 y = -2 D^0.4 y - y + u").stability().base == pytest.approx(0.1)

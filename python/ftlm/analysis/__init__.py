@@ -8,7 +8,7 @@ from ftlm.analysis.frequency_response import (
     step_response,
     transfer_functions,
 )
-from ftlm.analysis.poles import Mode, Stability, SteadyState, dcgain, modes, poles, stability, steady_states
+from ftlm.analysis.poles import Mode, Stability, SteadyState, dcgain, modes, poles, stability, steady_states, zeros
 from ftlm.analysis.rational_approximation import Approximation, approximate, to_control
 
 __all__ = [
@@ -33,4 +33,5 @@ __all__ = [
     "to_control",
     "to_tf",
     "transfer_functions",
+    "zeros",
 ]

@@ -226,13 +226,13 @@ def to_tf(model: Model) -> Any:
         raise ModelError(
             f"the input {behind} passes a sensor filter, and its inverse is no transfer function; leave it out"
         )
-    top = np.ones(1) if sensor is None else _descending(sensor.numerator)
-    bottom = np.ones(1) if sensor is None else _descending(sensor.denominator)
+    top = np.ones(1) if sensor is None else _coefficients(sensor.numerator)
+    bottom = np.ones(1) if sensor is None else _coefficients(sensor.denominator)
     tops, bottoms = [], []
     for output in transfer.outputs:
         through, under = (top, bottom) if output in filtered else (np.ones(1), np.ones(1))
-        denominator = np.convolve(_descending(transfer.denominator[output]), under)
-        tops.append([np.convolve(_descending(transfer.numerators[output, u]), through) for u in transfer.inputs])
+        denominator = np.convolve(_coefficients(transfer.denominator[output]), under)
+        tops.append([np.convolve(_coefficients(transfer.numerators[output, u]), through) for u in transfer.inputs])
         bottoms.append([denominator] * len(transfer.inputs))
     names = {"inputs": list(transfer.inputs), "outputs": list(transfer.outputs)}
     system = control.TransferFunction(tops, bottoms, name=identifier(model.structure.name), **names)
@@ -247,7 +247,7 @@ def to_tf(model: Model) -> Any:
     return system
 
 
-def _descending(pairs: Sequence[tuple[float, float]]) -> Floats:
+def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
     """Coefficients of a polynomial in descending powers from (coefficient, power) pairs; raise for other powers."""
     broken = next((p for _, p in pairs if abs(p - round(p)) > POWER_TOLERANCE or p < -POWER_TOLERANCE), None)
     if broken is not None:

@@ -28,6 +28,7 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import with_error
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
@@ -165,27 +166,66 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     Orders with a common base q give a polynomial in s^q, whose roots are those of its companion matrix. Other orders:
     Newton's method in ln s, and the argument principle counts whether all zeros were found.
     """
-    every: list[complex] = []
-    for polynomial in characteristic(model, coupled=is_coupled(coupling)):
-        upper = zeros_of(polynomial, math.pi)
-        if not _whole_orders(polynomial):
-            upper = [w for w in upper if w.imag < math.pi - DISTINCT_ZERO_TOLERANCE]
-        if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
-            decades = int(MAX_LOG_FREQUENCY / math.log(10))
-            raise ModelError(
-                f"the poles are out of the range of numbers, 1e-{decades} to 1e{decades} rad/s: change the unit of time"
-                " or the coefficients"
-            )
-        found = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
-        if roots_in_base(polynomial) is None:
-            expected, on_cut = right_zeros(polynomial, math.pi)
-            if not on_cut and len(found) != expected:
-                raise ModelError(
-                    f"{len(found)} of {expected:.0f} poles were found (counted by the argument principle); use "
-                    "stability(), or round the orders to multiples of 0.01"
-                )
-        every += found
+    every = [s for p in characteristic(model, coupled=is_coupled(coupling)) for s in _principal_zeros(p, "poles")]
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
+
+
+@check_arguments
+def zeros(model: Model, output: str | None = None, input: str | None = None) -> Complex:
+    """Return the zeros of a transfer function on the principal sheet, for any orders.
+
+    Parameters
+    ----------
+    model
+        The model; its equations are coupled.
+    output, input
+        Names of the signals; default the only ones.
+
+    Returns
+    -------
+    ndarray of complex
+        Values of s [rad/s], ``|arg s| < pi`` (whole orders: ``<= pi``), slowest first, without those at the origin.
+        Zeros that a pole cancels are included.
+
+    Raises
+    ------
+    ModelError
+        A name that is not known, several signals and none named, or zeros out of the range of numbers.
+    """
+    transfer = transfer_functions(model)
+    chosen = []
+    for what, given, known in (("output", output, transfer.outputs), ("input", input, transfer.inputs)):
+        if given is None and len(known) != 1:
+            raise ModelError(f"the model has the {what}s {', '.join(known)}; name one with {parameter(what)}")
+        name = known[0] if given is None else given
+        if name not in known:
+            raise ModelError(f"{what} {name!r} is not in the model; known: {', '.join(known)}")
+        chosen.append(name)
+    numerator = {power: value for value, power in transfer.numerators[chosen[0], chosen[1]]}
+    found = _principal_zeros(numerator, "zeros") if numerator else []
+    return np.array(sorted(found, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
+
+
+def _principal_zeros(polynomial: Polynomial, what: str) -> list[complex]:
+    """Return the zeros of a sum of c s^p on the principal sheet, conjugates included; ``what`` names them in errors."""
+    upper = zeros_of(polynomial, math.pi)
+    if not _whole_orders(polynomial):
+        upper = [w for w in upper if w.imag < math.pi - DISTINCT_ZERO_TOLERANCE]
+    if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
+        decades = int(MAX_LOG_FREQUENCY / math.log(10))
+        raise ModelError(
+            f"the {what} are out of the range of numbers, 1e-{decades} to 1e{decades} rad/s: change the unit of time"
+            " or the coefficients"
+        )
+    found = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
+    if roots_in_base(polynomial) is None:
+        expected, on_cut = right_zeros(polynomial, math.pi)
+        if not on_cut and len(found) != expected:
+            raise ModelError(
+                f"{len(found)} of {expected:.0f} {what} were found (counted by the argument principle); round the"
+                " orders to multiples of 0.01"
+            )
+    return found
 
 
 def _whole_orders(polynomial: Polynomial) -> bool:

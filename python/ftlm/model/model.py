@@ -237,6 +237,12 @@ class Model:
 
         return poles(self, coupling=coupling)
 
+    def zeros(self, output: str | None = None, input: str | None = None) -> Complex:
+        """Return the zeros of a transfer function on the principal sheet [rad/s]; see :func:`ftlm.analysis.zeros`."""
+        from ftlm.analysis.poles import zeros
+
+        return zeros(self, output, input)
+
     @check_arguments
     def modes(self, *, coupling: str = "simulated") -> tuple[Mode, ...]:
         """Frequency, damping and time constant of every pole, for any orders; see :func:`ftlm.analysis.modes`."""
