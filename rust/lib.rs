@@ -12,7 +12,8 @@
 //!    with dry friction;
 //! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, limits and sensor filters, sampled on any grid;
 //! 7. [`order_search`]: orders by exhaustive search over an order grid;
-//! 8. [`simulate`], [`state_space`], [`signal::metrics`]: simulation, output and equation error, figures of merit;
+//! 8. [`simulate`], [`state_space`], [`output_samples`], [`signal::metrics`]: simulation by pulse means, exactly, and at
+//!    sample times in the limit for zero step; output and equation error, figures of merit;
 //!    [`signal::statistics`]: residual analysis.
 //!
 //! ```
@@ -68,6 +69,7 @@ pub mod state_space;
 pub mod estimation;
 pub mod friction;
 pub mod order_search;
+pub mod output_samples;
 pub mod recording;
 
 #[cfg(feature = "rig")]

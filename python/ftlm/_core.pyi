@@ -17,6 +17,7 @@ __all__ = [
     "JointProblem",
     "JointTimeScaling",
     "OrderSearch",
+    "OutputSimulation",
     "Points",
     "Recording",
     "StageSearch",
@@ -38,6 +39,7 @@ __all__ = [
     "filter_autocovariances",
     "filter_series",
     "fit_covariance",
+    "fit_initial_terms",
     "force_portable",
     "fractional_derivative",
     "fractional_integral",
@@ -72,8 +74,8 @@ __all__ = [
     "pulse_means",
     "refine_candidates",
     "respond",
-    "respond_and_units",
     "respond_with_initial",
+    "richardson_limit",
     "search",
     "search_join",
     "search_plan",
@@ -557,9 +559,6 @@ def respond(
     inputs: Sequence[bool],
     terms: Sequence[Sequence[tuple[float, float]]],
 ) -> _Matrix: ...
-def respond_and_units(
-    run: _Record, model: Sequence[_Equation], inputs: Sequence[bool], units: Sequence[tuple[int, float]]
-) -> tuple[_Matrix, _Matrix]: ...
 def respond_with_initial(
     run: _Record,
     model: Sequence[_Equation],
@@ -580,6 +579,46 @@ def explicit_euler(signals: _Floats, step: float, model: Sequence[_Equation], in
 def trace_errors(run: _Record, equation: _Structure, inputs: Sequence[bool], trace: _Floats) -> _Vector: ...
 def nyquist_margin(own_terms: Sequence[tuple[float, float]], step: float) -> float: ...
 def correlation(x: Sequence[_Floats], y: Sequence[_Floats], lags: int) -> tuple[_Vector, float, int]: ...
+def fit_initial_terms(
+    measured: _Floats,
+    driven: _Floats,
+    units: Sequence[tuple[int, float]],
+    columns: Sequence[_Floats],
+    has_level: bool,
+) -> tuple[_Matrix, list[list[tuple[float, float]]]]: ...
+def richardson_limit(
+    grids: Sequence[tuple[_Floats, Sequence[float]]], owners: Sequence[int]
+) -> tuple[_Matrix, _Vector, list[float]]: ...
+
+#: whether coefficients are fitted, (exponent, coefficient) by equation, whether levels are fitted as well
+_Terms: TypeAlias = tuple[bool, Sequence[Sequence[tuple[float, float]]], bool]
+
+@final
+class OutputSimulation:
+    def __new__(
+        cls,
+        /,
+        run: Recording,
+        model: Sequence[_Equation],
+        frictions: Sequence[tuple[int, tuple[float, float, float]]],
+        times: _Floats | None,
+    ) -> OutputSimulation: ...
+    def samples(
+        self, /, every: int, terms: _Terms, stop: Stop | None = None
+    ) -> tuple[_Matrix, list[list[tuple[float, float]]]]: ...
+    def refine(
+        self,
+        /,
+        terms: _Terms,
+        tolerance: float,
+        max_pulses: int,
+        long_record_intervals: int,
+        stop: Stop | None = None,
+    ) -> tuple[tuple[_Matrix, list[list[tuple[float, float]]]], int, _Vector]: ...
+    def fit_friction_terms(
+        self, /, start: _Initial, every: int, stop: Stop | None = None
+    ) -> list[list[tuple[float, float]]]: ...
+
 def interpolate_samples(means: _Floats, places: _Floats) -> _Matrix: ...
 def kink_correction(m: int, places: _Floats, jumps: tuple[_Floats, _Floats], order: float, step: float) -> _Vector: ...
 def metrics(measured: _Floats, residuals: _Floats) -> tuple[float, float, float, float]: ...

@@ -57,8 +57,9 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::simulation::{
-        correlation, equation_error, explicit_euler, interpolate_samples, kink_correction, metrics, nyquist_margin,
-        respond, respond_and_units, respond_with_initial, state_space_respond, trace_errors,
+        correlation, equation_error, explicit_euler, fit_initial_terms, interpolate_samples, kink_correction, metrics,
+        nyquist_margin, respond, respond_with_initial, richardson_limit, state_space_respond, trace_errors,
+        OutputSimulation,
     };
 
     #[pymodule_export]

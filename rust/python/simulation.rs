@@ -1,5 +1,7 @@
 //! Bindings of simulation, output and equation error, explicit Euler, metrics and correlations.
 
+use std::sync::Arc;
+
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
@@ -9,7 +11,11 @@ use super::convert::{
 };
 use super::errors::run_detached;
 use super::estimation::jumps_near;
-use crate::python::order_search::watch::run_interruptible;
+use super::recording::Recording;
+use crate::error::check_length;
+use crate::friction::FrictionLaw;
+use crate::output_samples::{self, InitialTerms, OutputSamples, Refinement};
+use crate::python::order_search::watch::{run_interruptible, Stop};
 use crate::signal::block_pulse::{Intersample, SampleInterpolation};
 use crate::simulate::{self, OutputFilter};
 use crate::state_space::{self, Input};
@@ -28,23 +34,6 @@ pub fn respond<'py>(
     let outputs =
         run_interruptible(py, record.m(), None, move |_| simulate::respond(&equations, &record, &to_vectors(terms)))?;
     stack_rows(py, &outputs)
-}
-
-#[pyfunction]
-#[allow(clippy::needless_pass_by_value)]
-#[allow(clippy::type_complexity)]
-pub fn respond_and_units<'py>(
-    py: Python<'py>,
-    run: RecordArg<'py>,
-    model: List<EquationArg>,
-    inputs: List<bool>,
-    units: List<(usize, f64)>,
-) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>)> {
-    let record = record(&run)?;
-    let equations = equations(model, record.len(), &inputs)?;
-    let (driven, units) =
-        run_interruptible(py, record.m(), None, move |_| simulate::respond_and_units(&equations, &record, &units))?;
-    Ok((stack_rows(py, &driven)?, stack_rows(py, &units.concat())?))
 }
 
 #[pyfunction]
@@ -209,4 +198,141 @@ pub fn kink_correction<'py>(
     let jumps = jumps_near(&readings, &jumps.0, &jumps.1)?;
     let lacking = run_detached(py, || Ok(readings.kink_corrections(&jumps, order, step)))?;
     Ok(PyArray1::from_vec(py, lacking))
+}
+
+/// (samples of the outputs as rows, (exponent, coefficient) of the initial terms by equation).
+type SamplesTuple<'py> = (Bound<'py, PyArray2<f64>>, Vec<Vec<(f64, f64)>>);
+
+fn samples_tuple<'py>(py: Python<'py>, found: OutputSamples) -> PyResult<SamplesTuple<'py>> {
+    Ok((stack_rows(py, &found.outputs)?, found.initial))
+}
+
+/// Model with known orders and coefficients on a recording.
+#[pyclass(module = "ftlm._core", frozen)]
+pub struct OutputSimulation {
+    inner: Arc<output_samples::OutputSimulation>,
+    /// Values of one pulse per sampling interval.
+    points: usize,
+}
+
+/// (whether coefficients are fitted, (exponent, coefficient) by equation, whether levels are fitted as well).
+type TermsArg = (bool, List<List<(f64, f64)>>, bool);
+
+fn initial_terms((fitted, terms, has_level): TermsArg) -> InitialTerms {
+    let terms = to_vectors(terms);
+    if fitted {
+        let exponents = terms.into_iter().map(|own| own.into_iter().map(|term| term.0).collect()).collect();
+        InitialTerms::Fitted { exponents, has_level }
+    } else {
+        InitialTerms::Given(terms)
+    }
+}
+
+#[pymethods]
+impl OutputSimulation {
+    #[new]
+    #[allow(clippy::needless_pass_by_value)]
+    fn new(
+        run: Py<Recording>,
+        model: List<EquationArg>,
+        frictions: List<(usize, (f64, f64, f64))>,
+        times: Option<PyReadonlyArray1<'_, f64>>,
+    ) -> PyResult<Self> {
+        let run = Arc::clone(&run.get().inner);
+        let equations = equations(model, run.channels().len(), &vec![true; run.channels().len()])?;
+        let law = |(place, (coulomb, stribeck, speed))| (place, FrictionLaw { coulomb, stribeck, speed });
+        let frictions = frictions.into_iter().map(law).collect();
+        let times = times.as_ref().map(|times| vector("sample times", times)).transpose()?;
+        let points = run.len().saturating_mul(run.channels().len());
+        super::errors::run_attached(|| {
+            let inner = Arc::new(output_samples::OutputSimulation::new(run, equations, frictions, times)?);
+            Ok(Self { inner, points })
+        })
+    }
+
+    /// Samples on a grid of `every` pulses per sampling interval, and initial terms.
+    #[pyo3(signature = (every, terms, stop=None))]
+    fn samples<'py>(
+        &self,
+        py: Python<'py>,
+        every: usize,
+        terms: TermsArg,
+        stop: Option<&Stop>,
+    ) -> PyResult<SamplesTuple<'py>> {
+        let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
+        let points = self.points.saturating_mul(every);
+        samples_tuple(py, run_interruptible(py, points, stop, move |_| inner.samples(every, &initial))?)
+    }
+
+    /// Samples in the limit for zero step, initial terms, pulses per sampling interval, and remaining change by output.
+    #[pyo3(signature = (terms, tolerance, max_pulses, long_record_intervals, stop=None))]
+    fn refine<'py>(
+        &self,
+        py: Python<'py>,
+        terms: TermsArg,
+        tolerance: f64,
+        max_pulses: usize,
+        long_record_intervals: usize,
+        stop: Option<&Stop>,
+    ) -> PyResult<(SamplesTuple<'py>, usize, Bound<'py, PyArray1<f64>>)> {
+        let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
+        let options = Refinement { tolerance, max_pulses, long_record_intervals };
+        // How far a simulation is refined is not known.
+        let found = run_interruptible(py, usize::MAX, stop, move |stop| inner.refine(&initial, options, stop))?;
+        Ok((samples_tuple(py, found.samples)?, found.refinement, PyArray1::from_vec(py, found.change)))
+    }
+
+    /// (exponent, coefficient) of the initial terms of a model with friction by equation, fitted on a grid.
+    #[pyo3(signature = (start, every, stop=None))]
+    fn fit_friction_terms(
+        &self,
+        py: Python<'_>,
+        start: InitialArg,
+        every: usize,
+        stop: Option<&Stop>,
+    ) -> PyResult<Vec<Vec<(f64, f64)>>> {
+        let (inner, initial) = (Arc::clone(&self.inner), initial(start)?);
+        run_interruptible(py, usize::MAX, stop, move |stop| inner.fit_friction_terms(initial, every, stop))
+    }
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn fit_initial_terms<'py>(
+    py: Python<'py>,
+    measured: PyReadonlyArray2<'py, f64>,
+    driven: PyReadonlyArray2<'py, f64>,
+    units: List<(usize, f64)>,
+    columns: List<PyReadonlyArray2<'py, f64>>,
+    has_level: bool,
+) -> PyResult<SamplesTuple<'py>> {
+    let (measured, driven) = (rows(&measured)?, rows(&driven)?);
+    let columns = columns.iter().map(rows).collect::<PyResult<Vec<_>>>()?;
+    let found = run_detached(py, || output_samples::fit_initial_terms(&measured, driven, &units, columns, has_level))?;
+    samples_tuple(py, found)
+}
+
+/// Limit for zero step of samples on grids of 1, 1/2, 1/4, … of a step: samples, change of each output, and the limits
+/// of numbers that belong to outputs `owners`.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
+pub fn richardson_limit<'py>(
+    py: Python<'py>,
+    grids: List<(PyReadonlyArray2<'py, f64>, List<f64>)>,
+    owners: List<usize>,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<f64>>, Vec<f64>)> {
+    let grids = grids.iter().map(|(samples, numbers)| Ok((rows(samples)?, numbers.to_vec())));
+    let grids = grids.collect::<PyResult<Vec<_>>>()?;
+    let found = run_detached(py, || {
+        for (samples, numbers) in &grids {
+            check_length(
+                "outputs of a grid",
+                grids[0].0.len().max(owners.iter().max().map_or(0, |o| o + 1)),
+                samples.len(),
+            )?;
+            check_length("numbers of a grid", owners.len(), numbers.len())?;
+        }
+        Ok(output_samples::richardson_limit(grids, &owners).unwrap_or_default())
+    })?;
+    Ok((stack_rows(py, &found.samples)?, PyArray1::from_vec(py, found.change), found.terms))
 }

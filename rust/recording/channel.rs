@@ -89,7 +89,7 @@ impl Channel {
     }
 
     /// Whether the signal is an input that is held between samples.
-    pub(super) fn is_held_input(&self) -> bool {
+    pub(crate) fn is_held_input(&self) -> bool {
         self.role == Role::Input(Intersample::Hold)
     }
 

@@ -127,7 +127,11 @@ impl Pulses {
         Record::new(self.step, self.means, self.filter)
     }
 
-    fn into_record_with_initial_state(mut self) -> Result<Record> {
+    /// Record with the filter transients and initial levels, if there are any.
+    ///
+    /// # Errors
+    /// As [`Record::new`].
+    pub fn into_record_with_initial_state(mut self) -> Result<Record> {
         let transient = std::mem::take(&mut self.has_transient);
         let (levels, responses) =
             (std::mem::take(&mut self.initial_levels), std::mem::take(&mut self.impulse_responses));
@@ -286,6 +290,12 @@ impl Recording {
     pub fn is_all_filtered(&self) -> bool {
         let simulated = |signal| (self.is_coupled || self.has_friction) && self.outputs.contains(&signal);
         self.channels.iter().enumerate().any(|(signal, channel)| channel.is_filtered && !simulated(signal))
+    }
+
+    /// Whether the samples have times of their own.
+    #[must_use]
+    pub fn has_nonuniform_samples(&self) -> bool {
+        self.times.is_some()
     }
 
     /// Whether outputs are compared at nonuniform sample times.
@@ -490,6 +500,52 @@ impl Recording {
                 let passed = run.outputs.iter().map(|&output| run.channels[output].is_filtered).collect();
                 experiment.with_filter(series, passed)
             }
+        }
+    }
+
+    /// All samples of each output to compare with, of a grid of `every` pulses per sampling interval; NaN for missing
+    /// samples.
+    ///
+    /// # Errors
+    /// As [`Recording::pulses`].
+    pub fn compared_rows(&self, every: usize) -> Result<Vec<Vec<f64>>> {
+        let outputs = self.outputs.iter().map(|&output| &self.channels[output]);
+        if let Some(times) = self.times.as_ref().filter(|_| self.compares_nonuniform_samples()) {
+            let last = self.duration() * (1.0 + TIME_TOLERANCE);
+            let known = times.partition_point(|time| *time <= last);
+            return Ok(outputs.map(|channel| channel.leading_part(0, known).nonuniform.unwrap_or_default()).collect());
+        }
+        if !self.is_all_filtered() || outputs.clone().all(|channel| channel.is_filtered) {
+            return Ok(outputs.map(|channel| channel.samples.clone()).collect());
+        }
+        let pulses = self.pulses((self.len() - 1).saturating_mul(every), true)?;
+        Ok(self.outputs.iter().map(|&output| self.compared_samples(output, &pulses, every, 1)).collect())
+    }
+
+    /// Recording of so many rows from rest, with a single unit sample of a signal (signal, row), or none.
+    pub(crate) fn unit_recording(&self, rows: usize, sample: Option<(usize, usize)>) -> Self {
+        let of = |(signal, channel): (usize, &Channel)| {
+            let mut samples = vec![0.0; rows];
+            if let Some((_, row)) = sample.filter(|(of, _)| *of == signal) {
+                samples[row] = 1.0;
+            }
+            Channel { samples, ..channel.leading_part(0, 0) }
+        };
+        let mut channels: Vec<Channel> = self.channels.iter().enumerate().map(of).collect();
+        channels.iter_mut().for_each(|channel| {
+            channel.nonlinearities.clear();
+            channel.nonuniform = None;
+        });
+        Self {
+            name: self.name.clone(),
+            times: None,
+            channels,
+            outputs: self.outputs.clone(),
+            filter: self.filter.clone(),
+            filter_states: 0,
+            is_at_rest: true,
+            free_inputs: Vec::new(),
+            ..*self
         }
     }
 

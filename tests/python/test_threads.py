@@ -7,7 +7,9 @@ import threading
 import numpy as np
 import pytest
 
+import ftlm
 from ftlm import _core
+from ftlm.simulation.output_samples import output_simulation
 from ftlm.utils.resources import interruptible_pool, stop_flag
 
 
@@ -133,3 +135,32 @@ def test_an_error_of_one_thread_stops_no_other_fit() -> None:
     with pytest.raises(ValueError, match="0"), interruptible_pool(1) as workers:
         list(workers.map(work, range(3)))
     assert not flags[0].is_set
+
+
+def slow_simulation() -> tuple[_core.OutputSimulation, tuple[bool, list, bool], int]:
+    """A simulation that is refined for minutes, and never converges."""
+    rows = 1 << 15
+    run = ftlm.Run.from_arrays(step=1.0, inputs={"u": np.ones(rows)}, outputs={"y": np.zeros(rows)})
+    model = ftlm.Model(ftlm.equation("D^0.7 y = -900 y + u"))
+    core, terms = output_simulation(model, run, {}, None, 1)
+    return core, terms, 1 << 24
+
+
+def test_a_simulation_on_another_thread_is_ended_within_its_grids() -> None:
+    """The flag is set by this thread while the other one computes, which does not hold the interpreter."""
+    core, terms, pulses = slow_simulation()
+    flag, ends = _core.Stop(), []
+
+    def work() -> None:
+        try:
+            core.refine(terms, 0.0, pulses, 1 << 60, flag)
+        except KeyboardInterrupt:
+            ends.append("ended")
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    flag.set()
+    for thread in threads:
+        thread.join()
+    assert ends == ["ended"] * 2

@@ -149,9 +149,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     Raises for missing signals, signals whose squares underflow, delays of outputs, and missing samples of inputs. Other
     missing samples are interpolated and must not be fitted.
     """
-    if structure.offset == "level":
-        # Deviations rest at 0, where an equation has no term for the level.
-        run, structure = deviations(run, structure)[0], replace(structure, offset="none")
+    run, structure = without_level(run, structure)
     _check_known_inputs(structure)
     initial = resolve_initial_conditions(run, structure)
     step, means, sensor, (transient, levels, responses) = recording(run, structure, initial).pulses(m, filtered)
@@ -170,14 +168,20 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     )
 
 
+def without_level(run: Run, structure: Structure) -> tuple[Run, Structure]:
+    """Return a run as deviations from the level of a structure, which its equations have no term for."""
+    if structure.offset != "level":
+        return run, structure
+    return deviations(run, structure)[0], replace(structure, offset="none")
+
+
 def recording(run: Run, structure: Structure, initial: Initial | None = None) -> _core.Recording:
     """Return a run as the core samples it for a structure, with ``initial`` or the structure's initial conditions.
 
     Free delays and limits are the core's to apply. Raises for missing signals, delays of outputs, and missing samples
     of inputs.
     """
-    if structure.offset == "level":
-        run, structure = deviations(run, structure)[0], replace(structure, offset="none")
+    run, structure = without_level(run, structure)
     _check_missing(run, structure)
     check_derivative_orders(run, structure)
     initial = resolve_initial_conditions(run, structure) if initial is None else initial
@@ -489,47 +493,6 @@ def has_nonuniform_samples(run: Run, structure: Structure) -> bool:
     False if an input parameter is free, or if all signals are filtered.
     """
     return run.sample_times is not None and not structure.free_inputs and not structure.all_filtered
-
-
-@dataclass(frozen=True, eq=False)
-class SampleTimes:
-    """Sample times of a run on its grid of pulses, with the original input samples.
-
-    Parameters
-    ----------
-    record
-        Pulse means of the run.
-    recording
-        The run.
-    times
-        Sample times [s since the first sample].
-    """
-
-    record: Record
-    recording: _core.Recording
-    times: Floats
-
-    @classmethod
-    def of(cls, run: Run, record: Record, structure: Structure, times: Floats) -> SampleTimes:
-        """Build for given times of a run; a uniformly sampled run has the samples of its grid."""
-        return cls(record, recording(run, structure, record.initial), times)
-
-    @property
-    def pulse_positions(self) -> Floats:
-        """Sample times in units of pulses."""
-        return np.asarray(np.minimum(self.times / self.record.step, float(self.record.m)))
-
-    def values(self, name: str) -> Floats | None:
-        """Values of a signal just after the sample times; None for a derived signal."""
-        return self.recording.values_at(self.record.signals.index(name), self.times)
-
-    def jump_correction(self, name: str, order: float) -> Floats | None:
-        """Correction to the pulse means of I^order of an input with jumps, at the sample times."""
-        jumps = self.recording.jumps(self.record.signals.index(name))
-        if jumps is None:
-            return None
-        jumps = (jumps[0] / self.record.step, jumps[1])
-        return _core.kink_correction(self.record.m, self.pulse_positions, jumps, order, self.record.step)
 
 
 def compared_times(run: Run, structure: Structure) -> Floats:

@@ -17,9 +17,9 @@ from ftlm.simulation.output_samples import (
     ORDER_TOLERANCE,
     OutputSamples,
     Terms,
-    fit_initial_terms,
     initial_names,
     measured_samples,
+    named_terms,
 )
 from ftlm.structure.structure import History
 from ftlm.utils.validation import Floats
@@ -149,5 +149,8 @@ def simulate_state_space(model: Model, run: Run, initial: Terms | None) -> Outpu
         known = [c for c in columns if c is not None]
         if len(known) < len(columns):
             return None
-        samples, terms = fit_initial_terms(model, measured_samples(model, run, 1), samples, names, known)
+        units = [(model.outputs.index(output), power) for output, power in names]
+        level, measured = model.structure.offset == "level", measured_samples(model, run, 1)
+        samples, found = _core.fit_initial_terms(measured, samples, units, known, level)
+        terms = named_terms(model, found)
     return OutputSamples(samples, terms, 1, np.zeros(len(model.outputs)))

@@ -1,436 +1,31 @@
-"""Step refinement of a simulation: Richardson extrapolation, and superposition for long records."""
+"""Step refinement of a simulation: samples in the limit for zero step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
-from msgspec import UNSET
-from numpy.typing import NDArray
 
-from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import ZERO_ORDER_HOLD, interpolate_gaps
-from ftlm.errors import ModelError
 from ftlm.model.model import Model
-from ftlm.simulation.discretization import MAX_M, apply_input_nonlinearity, has_nonuniform_samples, record
-from ftlm.simulation.initial_conditions import deviations, resolve_initial_conditions, resolve_start, start_score
+from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
+from ftlm.simulation.initial_conditions import deviations, resolve_start, start_score
 from ftlm.simulation.output_samples import (
-    FIRST_REFINEMENT,
     FRICTION_REFINEMENT,
-    LEVEL_EXPONENT,
-    ORDER_TOLERANCE,
     OutputSamples,
     Terms,
-    fit_initial_terms,
-    fit_initial_terms_with_friction,
-    friction_initial_terms,
-    initial_names,
+    add_levels,
     measured_samples,
+    named_terms,
     nonuniform_sample_times,
-    simulate_samples,
-    unit_samples,
+    output_simulation,
     with_initial_conditions,
 )
 from ftlm.simulation.state_space import simulate_state_space
-from ftlm.utils.validation import Floats
-
-#: Powers of the step in the error of a sample: 2 from the block-pulse scheme, 3 from extrapolation to a sample time,
-#: and 4 from the next term of both. A slope discontinuity t^eta adds powers in between, which these columns do not
-#: eliminate, but none of them increases the error by more than a small factor.
-ERROR_POWERS = (2, 3, 4)
-#: A column has the error of its power if halving the step reduced its change by at least this fraction of 2^power.
-MIN_POWER_RATIO = 0.5
-#: For an unknown power: minimum reduction of the change on halving the step (slightly below the square root of two),
-#: and minimum effective number of samples from which the reduction is estimated.
-MIN_REDUCTION_FACTOR, MIN_EFFECTIVE_SAMPLES = 1.4, 8.0
-#: Number of grids needed to estimate such a reduction factor and to test it.
-RATIO_TEST_GRIDS = 4
-
-
-def _relative_change(new: Floats, old: Floats) -> Floats:
-    moved, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
-    return np.asarray(np.where(moved == 0.0, 0.0, moved / size))
-
-
-@dataclass(frozen=True)
-class LimitEstimate:
-    """Estimate of the limit for zero step.
-
-    Parameters
-    ----------
-    samples
-        Extrapolated samples.
-    change
-        Change of each output on another halving, relative to its largest value; infinite before there are three grids.
-    initial_terms
-        Extrapolated initial terms.
-    """
-
-    samples: Floats
-    change: Floats
-    initial_terms: Floats
-
-
-@dataclass
-class RichardsonTable:
-    """Richardson table of grids of 1, 1/2, 1/4, … of a step; samples have the shape (outputs, N).
-
-    Parameters
-    ----------
-    rows
-        Last grids, finest last: the samples, then those with one power of the step after another eliminated.
-    initial_terms
-        The same for initial terms fitted on each grid.
-    changes
-        Change of each output in each column on the last two halvings, relative to its largest value; infinite for the
-        samples themselves.
-    measure
-        Function that gives this relative change between samples on a grid and on the previous one.
-    """
-
-    rows: list[list[Floats]] = field(default_factory=list)
-    initial_terms: list[list[Floats]] = field(default_factory=list)
-    changes: list[list[Floats]] = field(default_factory=list)
-    measure: Callable[[Floats, Floats], Floats] = _relative_change
-
-    def add(self, samples: Floats, beside: Floats | None = None) -> None:
-        """Add samples on the next grid; samples that are not finite restart the table."""
-        before = self.rows[-1] if self.rows else []
-        both = bool(before) and bool(np.all(np.isfinite(before[0])) and np.all(np.isfinite(samples)))
-        row = extrapolate_row(samples, before if both else [])
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            # Nobody asks for the samples themselves: what was taken away moves less.
-            moved = [unknown_change(samples.shape[0])] * min(len(row), len(before))
-            moved[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
-        numbers = np.zeros(0) if beside is None else beside
-        self.initial_terms = [*self.initial_terms, extrapolate_row(numbers, self.initial_terms[-1] if both else [])][
-            -RATIO_TEST_GRIDS:
-        ]
-        self.rows = [*self.rows, row][-RATIO_TEST_GRIDS:]
-        self.changes = [*self.changes, moved][-2:]
-
-    def estimate(self, owners: Sequence[int] = (), *, enough: float = 0.0) -> LimitEstimate:
-        """Return the estimate that another halving changes least; ``owners`` are the outputs of the initial terms.
-
-        If the change of a column is at most ``enough``, no other estimate is tried.
-        """
-        column, change = self.best_column
-        found = LimitEstimate(self.rows[-1][column], change, self.initial_terms[-1][column])
-        if len(self.rows) < RATIO_TEST_GRIDS or np.all(change <= enough):
-            return found
-        known = min(map(len, self.rows))
-        every = [found, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(known))]
-        return min(
-            (one for one in every if one is not None), key=lambda one: float(np.max(_nan_to_infinity(one.change)))
-        )
-
-    def _by_ratio(self, column: int, owners: NDArray[np.intp]) -> LimitEstimate | None:
-        """Extrapolate a column with an error of unknown power, if the previous grid gave a reduction factor as well.
-
-        Slope discontinuities t^eta add intermediate powers, and coinciding orders add logarithms, which the table does
-        not eliminate.
-        """
-        oldest, older, old, new = (row[column] for row in self.rows)
-        second, third = (row[column] for row in self.initial_terms[-2:])
-        before, now = remaining_change_ratio(oldest, older, old), remaining_change_ratio(older, old, new)
-        if before is None or now is None:
-            return None
-        with np.errstate(invalid="ignore", over="ignore"):
-            samples = new + now[:, None] * (new - old)
-            change = self.measure(samples, old + before[:, None] * (old - older))
-        return LimitEstimate(samples, change, third + now[owners] * (third - second))
-
-    @property
-    def best_column(self) -> tuple[int, Floats]:
-        """Column that another halving changes least, and its change relative to the largest value of each output.
-
-        Infinite before there are three grids.
-        """
-        row, last = self.rows[-1], self.changes[-1]
-        found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown_change(row[0].shape[0]))
-        for column in range(1, len(last)):
-            told = [(column, last[column])]
-            before = self.changes[0][column] if len(self.changes) > 1 and column < len(self.changes[0]) else None
-            if before is not None and column + 1 < len(row):
-                factor = 2.0 ** ERROR_POWERS[column]
-                # What is left of a column whose power shows is what the next column takes away.
-                if np.all(last[column] * (MIN_POWER_RATIO * factor) <= before):
-                    told.append((column + 1, last[column] / (factor - 1.0)))
-            found = min([found, *told], key=lambda pair: float(np.max(_nan_to_infinity(pair[1]))))
-        return found
-
-
-def extrapolate_row(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
-    """Return a row of the table from values on a grid and the row of twice its step."""
-    row = [fine]
-    with np.errstate(invalid="ignore", over="ignore"):
-        for power, before in zip(ERROR_POWERS, coarse, strict=False):
-            factor = 2.0**power
-            row.append((factor * row[-1] - before) / (factor - 1.0))
-    return row
-
-
-def remaining_change_ratio(older: Floats, old: Floats, new: Floats) -> Floats | None:
-    """Ratio of the remaining change to the last change of each output, for changes that shrink by a constant factor.
-
-    This is Aitken's method with one factor for all samples of an output. None if few samples change, or do not
-    converge.
-    """
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        now, before = new - old, old - older
-        size = np.max(np.abs(now), axis=1, keepdims=True, initial=0.0)
-        unit = now / np.where(size > 0.0, size, 1.0)
-        squares = np.sum(unit**2, axis=1)
-        still = squares == 0.0
-        ratio = np.where(still, np.inf, np.sum(unit * before, axis=1) / np.where(still, 1.0, squares * size[:, 0]))
-        if not np.all(ratio >= MIN_REDUCTION_FACTOR) or np.any(
-            squares**2 < MIN_EFFECTIVE_SAMPLES * np.sum(unit**4, axis=1)
-        ):
-            return None
-        return np.asarray(1.0 / (ratio - 1.0))
-
-
-def unknown_change(outputs: int) -> Floats:
-    """Return an infinite change of each output."""
-    return np.full(outputs, np.inf)
-
-
-def _nan_to_infinity(change: Floats) -> Floats:
-    """Replace NaN by infinity."""
-    return np.where(np.isnan(change), np.inf, change)
-
+from ftlm.utils.resources import stop_flag
 
 #: Minimum number of intervals of a long record. Below it, refinement of the whole grid costs no more.
 LONG_RECORD_INTERVALS = 1 << 14
-#: Pieces of a response start at its end divided by powers of this ratio, down to this minimum number of intervals.
-#: Halving the step on a piece costs as much as the whole response did.
-PIECE_RATIO, MIN_PIECE_INTERVALS = 8, 128
-#: Pulses per interval of the grids that cover the whole response. The coarsest grid is not used for the first piece,
-#: where responses jump with the inputs.
-FULL_GRID_REFINEMENTS = (1, 2, 4)
-#: Ratio of the second to the first half of a response above which the model is unstable and the sum loses its digits.
-MAX_GROWTH_RATIO = 1e3
-
-
-@dataclass
-class ResponsePiece:
-    """Piece of all responses, from one interval to before another, on its finest grid, and its limit for zero step."""
-
-    first: int
-    end: int
-    refinement: int
-    limit: RichardsonTable
-
-
-@dataclass(frozen=True)
-class SampleResponses:
-    """Simulation as a sum of responses: to every sample of the inputs, to first samples, and to initial terms.
-
-    Parameters
-    ----------
-    model
-        Model from rest, without input nonlinearities.
-    run
-        Run of which only names, step and intersample behavior are used.
-    inputs
-        Samples of the inputs, after input nonlinearities.
-    first_samples
-        First samples of the signals for which they act differently from later ones.
-    names
-        Output and power of the initial terms.
-    """
-
-    model: Model
-    run: Run
-    inputs: Mapping[str, Floats]
-    first_samples: Mapping[str, float]
-    names: Sequence[tuple[str, float]]
-
-    @property
-    def count(self) -> int:
-        """Number of outputs."""
-        return len(self.model.outputs)
-
-    @classmethod
-    def of(cls, model: Model, run: Run, names: Sequence[tuple[str, float]]) -> SampleResponses | None:
-        """Build for a run; None if superposition does not apply."""
-        structure = model.structure
-        outputs, coupled = model.outputs, structure.coupling == "simulated"
-        read = [(e, t) for e in model.equations for t in e.terms]
-        drivers = dict.fromkeys(
-            t.signal for e, t in read if t.signal != e.output and not (coupled and t.signal in outputs)
-        )
-        if structure.has_friction or run.sample_times is not None or structure.all_filtered:
-            return None
-        if any(name not in run for name in drivers) or any(
-            t.order.constant > e.order.constant + ORDER_TOLERANCE for e, t in read
-        ):
-            return None
-        late = {name for name in drivers if structure.delay.get(name, 0.0)}
-        direct = {t.signal for e, t in read if abs(t.order.constant - e.order.constant) <= ORDER_TOLERANCE}
-        if late and (late & direct or resolve_initial_conditions(run, structure) != "rest"):
-            # What acted before the run, and at its last sample, is no answer to one of its samples.
-            return None
-        every = {n: interpolate_gaps(apply_input_nonlinearity(run, structure, n)[n]) for n in drivers}
-        moving = {n: v for n, v in every.items() if v.any()}
-        ramps = [n for n in moving if n not in run.inputs or run.intersample[n] != ZERO_ORDER_HOLD]
-        still = replace(model, structure=replace(structure, initial="rest", input_nonlinearities=UNSET))
-        return cls(still, run, moving, {n: float(moving[n][0]) for n in ramps if moving[n][0]}, names)
-
-    def compute(self, every: int, intervals: int) -> Floats:
-        """Compute all responses on a grid, one block of rows per response; NaN if the equations are singular there."""
-        try:
-            return self._compute(every, intervals)
-        except ModelError:
-            # The grid happens to make the equations unsolvable.
-            rows = len(self.inputs) + len(self.first_samples) + len(self.names)
-            return np.full((rows * self.count, intervals + 1), np.nan)
-
-    def _compute(self, every: int, intervals: int) -> Floats:
-        blocks, first = [], []
-        for name in self.inputs:
-            ramp = name not in self.run.inputs or self.run.intersample[name] != ZERO_ORDER_HOLD
-            # What is linear in between rises to a sample before it falls.
-            rows = simulate_samples(self.model, self._unit(name, intervals + ramp, int(ramp)), every, {})[0]
-            blocks.append(rows[:, 1:] if ramp else rows)
-            if name in self.first_samples:
-                first.append(simulate_samples(self.model, self._unit(name, intervals, 0), every, {})[0] - blocks[-1])
-        more = unit_samples(self.model, self._unit("", intervals, 0), every, self.names) if self.names else []
-        return np.concatenate([*blocks, *first, *more]) if blocks or more else np.zeros((0, intervals + 1))
-
-    def _unit(self, name: str, intervals: int, row: int) -> Run:
-        """Return a run with a single unit sample of one signal."""
-
-        def of(signal: str) -> Floats:
-            out = np.zeros(intervals + 1)
-            if signal == name:
-                out[row] = 1.0
-            return out
-
-        run = self.run
-        return Run.from_arrays(
-            step=run.step,
-            inputs={n: of(n) for n in run.inputs},
-            outputs={n: of(n) for n in run.outputs},
-            intersample=run.intersample,
-        )
-
-    def superpose(self, answers: Floats, first: int, weights: Sequence[float]) -> Floats:
-        """Superpose responses from one interval on, shape (outputs, N - first).
-
-        The weights are those of the initial terms.
-        """
-        n = self.count
-        blocks = answers.reshape(-1, n, answers.shape[1])
-        out = np.zeros((n, self.run.length - first))
-        for block, samples in zip(blocks, self.inputs.values(), strict=False):
-            for i, row in enumerate(block):
-                if row.any():
-                    out[i] += _core.series_multiply(row, samples[: out.shape[1]], out.shape[1])
-        once = blocks[len(self.inputs) :]
-        for block, weight in zip(once, [*self.first_samples.values(), *weights], strict=True):
-            out[:, : answers.shape[1]] += weight * block
-        return out
-
-    def split(self, answers: Floats) -> tuple[Floats, list[Floats]]:
-        """Return the simulation without initial terms, and the responses to unit initial terms."""
-        units = answers.reshape(-1, self.count, answers.shape[1])[len(self.inputs) + len(self.first_samples) :]
-        return self.superpose(answers, 0, [0.0] * len(self.names)), list(units)
-
-
-def simulate_long(
-    model: Model, run: Run, initial: Terms | None, *, tolerance: float, max_m: int
-) -> OutputSamples | None:
-    """Simulate a long run as :func:`refined` does; None if superposition does not apply.
-
-    The initial conditions of the model are resolved. The refinement is that of the whole record.
-    """
-    own = run.length - 1
-    if own < LONG_RECORD_INTERVALS or FULL_GRID_REFINEMENTS[-1] * own > max_m or model.structure.has_friction:
-        return None
-    given = None if initial is None else [(o, p) for o in model.outputs for p in initial.get(o, {})]
-    names = initial_names(model, resolve_initial_conditions(run, model.structure)) if given is None else given
-    answers = SampleResponses.of(model, run, names)
-    if answers is None:
-        return None
-    grids = {every: answers.compute(every, own) for every in FULL_GRID_REFINEMENTS}
-    if not all(_decays(rows) for rows in list(grids.values())[1:]):
-        return None
-
-    def superpose_with_terms(rows: Floats) -> tuple[Floats, dict[str, dict[float, float]]]:
-        driven, units = answers.split(rows)
-        if initial is None and (names or model.structure.offset == "level"):
-            return fit_initial_terms(
-                model, measured_samples(model, run, FULL_GRID_REFINEMENTS[-1]), driven, names, units
-            )
-        kept = {o: dict((initial or {}).get(o, {})) for o in model.outputs}
-        return driven + sum((kept[o][p] * u for (o, p), u in zip(names, units, strict=True)), np.zeros(1)), kept
-
-    rough, terms = superpose_with_terms(grids[FULL_GRID_REFINEMENTS[-1]])
-    size = np.max(np.abs(rough), axis=1)
-    weights = [terms[o][p] for o, p in names]
-
-    def change_from(first: int) -> Callable[[Floats, Floats], Floats]:
-        def relative_output_change(new: Floats, old: Floats) -> Floats:
-            by = new - old
-            if not np.all(np.isfinite(by)):
-                return np.full(answers.count, np.inf)
-            most = np.max(np.abs(answers.superpose(by, first, weights)), axis=1)
-            return np.asarray(np.where(most == 0.0, 0.0, most / np.where(size > 0.0, size, 1e-300)))
-
-        return relative_output_change
-
-    pieces = []
-    for first, end in _piece_ranges(own):
-        limit = RichardsonTable(measure=change_from(first))
-        for every in FULL_GRID_REFINEMENTS[0 if first else 1 :]:
-            limit.add(grids[every][:, first:end])
-        pieces.append(ResponsePiece(first, end, FULL_GRID_REFINEMENTS[-1], limit))
-    del grids
-    change = _refine_pieces(pieces, answers, tolerance, max_m)
-    best = np.concatenate([p.limit.estimate().samples for p in pieces], axis=1)
-    outputs, terms = superpose_with_terms(best)
-    return OutputSamples(outputs, terms, pieces[-1].refinement, change)
-
-
-def _refine_pieces(pieces: Sequence[ResponsePiece], answers: SampleResponses, tolerance: float, max_m: int) -> Floats:
-    """Halve the step on pieces that have not converged; return the remaining change."""
-    while True:
-        changes = [p.limit.estimate().change for p in pieces]
-        left = np.asarray(sum(c[: answers.count] for c in changes))
-        restless = [
-            p
-            for p, c in zip(pieces, changes, strict=True)
-            if np.any(c > tolerance / len(pieces)) and 2 * p.refinement * p.end <= max_m
-        ]
-        if np.all(left <= tolerance) or not restless:
-            return left
-        widest = restless[-1]
-        every = 2 * widest.refinement
-        finer = answers.compute(every, widest.end - 1)
-        for piece in pieces:
-            if piece.end <= widest.end and 2 * piece.refinement == every:
-                piece.limit.add(finer[:, piece.first : piece.end])
-                piece.refinement = every
-
-
-def _piece_ranges(own: int) -> list[tuple[int, int]]:
-    """Return the ranges of the pieces of responses over a number of intervals."""
-    ends = [own + 1]
-    while ends[0] // PIECE_RATIO >= MIN_PIECE_INTERVALS:
-        ends.insert(0, ends[0] // PIECE_RATIO)
-    return list(zip([0, *ends[:-1]], ends, strict=True))
-
-
-def _decays(rows: Floats) -> bool:
-    """Whether responses do not grow so much that their sum loses its digits."""
-    if not np.all(np.isfinite(rows)):
-        return False
-    half = rows.shape[1] // 2
-    first, second = (np.max(np.abs(part), axis=1, initial=0.0) for part in (rows[:, :half], rows[:, half:]))
-    return bool(np.all(second <= MAX_GROWTH_RATIO * first))
 
 
 def simulate_refined(
@@ -445,7 +40,7 @@ def simulate_refined(
     """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
 
     Integer orders on uniform samples need no grid (:func:`ftlm.simulation.state_space.simulate_state_space`). A long
-    record is refined only as far as that moves it (:func:`simulate_long`).
+    record is refined only as far as that moves it by superposition of responses.
 
     Parameters
     ----------
@@ -469,9 +64,8 @@ def simulate_refined(
         rest = replace(model, structure=replace(model.structure, initial="rest"))
         still = _simulate_refined(rest, moved, None, tolerance, max_m, on_grid)
         free = still if _explains_as_well(model, moved, still, free) else free
-    terms = {o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in t.items()} for o, t in free.initial.items()}
-    reference = np.array([levels[o] for o in model.outputs])
-    return replace(free, outputs=free.outputs + reference[:, None], initial=terms)
+    outputs, terms = add_levels(model, levels, free.outputs, free.initial)
+    return replace(free, outputs=outputs, initial=terms)
 
 
 def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSamples) -> bool:
@@ -493,51 +87,11 @@ def _simulate_refined(
     exact = simulate_state_space(model, run, initial)
     if exact is not None:
         return exact
-    own = run.length - 1
-    every = FIRST_REFINEMENT
-    if initial is None and model.structure.has_friction:
-        # Level and velocity at the start are found by descent, whose ends scatter by more than steps move them.
-        rec = record(run, model.structure, FRICTION_REFINEMENT * own, filtered=False)
-        initial = friction_initial_terms(model, fit_initial_terms_with_friction(model, run, rec, FRICTION_REFINEMENT))
-    elif initial is None:
+    if initial is None and not model.structure.has_friction:
         model = with_initial_conditions(model, run)
-    long = simulate_long(model, run, initial, tolerance=tolerance, max_m=max_m)
-    if long is not None:
-        return long
     times = (
         run.time if on_grid and has_nonuniform_samples(run, model.structure) else nonuniform_sample_times(model, run)
     )
-    limit, lost = RichardsonTable(), 0
-    while True:
-        last = 2 * every * own > max_m
-        samples, terms = _simulate_grid(model, run, every, initial, times, last=lost == 1)
-        finite = bool(np.all(np.isfinite(samples)))
-        owners = [i for i, o in enumerate(model.outputs) for _ in terms[o]]
-        limit.add(samples, np.array([v for o in model.outputs for v in terms[o].values()]))
-        told = limit.estimate(owners, enough=tolerance)
-        # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
-        lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
-        if last or lost == 2 or np.all(told.change <= tolerance):
-            break
-        every *= 2
-    return OutputSamples(told.samples, _with_values(terms, told.initial_terms), every, told.change)
-
-
-def _with_values(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
-    """Return initial terms with the same outputs and exponents and other values."""
-    left = iter(values.tolist())
-    return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
-
-
-def _simulate_grid(
-    model: Model, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
-) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Simulate on one grid; NaN if the equations are singular there, unless it is the last grid."""
-    try:
-        return simulate_samples(model, run, every, initial, times)
-    except ModelError:
-        # An own coefficient c meets 1 = c h^alpha / gamma(alpha + 2) on one step, not on two.
-        if last:
-            raise
-        count = run.length if times is None else times.size
-        return np.full((len(model.outputs), count), np.nan), {o: {} for o in model.outputs}
+    core, terms = output_simulation(model, run, initial, times, FRICTION_REFINEMENT)
+    (outputs, found), refinement, change = core.refine(terms, tolerance, max_m, LONG_RECORD_INTERVALS, stop_flag())
+    return OutputSamples(outputs, named_terms(model, found), refinement, change)

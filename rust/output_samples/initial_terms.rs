@@ -1,0 +1,124 @@
+//! Initial terms of a simulation, by least squares on the measured samples.
+
+use super::richardson::{add_multiple, Rows};
+use crate::error::{check_length, Error, Result};
+use crate::linalg::dense;
+use crate::linalg::orthogonal::norm;
+use crate::signal::statistics::{inner, mean};
+
+/// Relative residual of the response to an initial term on the others, below which it is collinear, as in the joint fit.
+const COLLINEARITY_TOLERANCE: f64 = 1e-12;
+
+/// Samples of a simulation.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutputSamples {
+    /// Samples of each output, filtered if it was measured through the sensor filter; not finite if the model diverges.
+    pub outputs: Vec<Vec<f64>>,
+    /// (exponent, coefficient) of the initial terms of each equation.
+    pub initial: Vec<Vec<(f64, f64)>>,
+}
+
+/// Weight of an output: 1 over the standard deviation of its measured samples.
+pub(super) fn weight(measured: &[f64]) -> f64 {
+    let known: Vec<f64> = measured.iter().copied().filter(|v| !v.is_nan()).collect();
+    let level = mean(&known);
+    let deviation = mean(&known.iter().map(|v| (v - level) * (v - level)).collect::<Vec<_>>()).sqrt();
+    if deviation > 0.0 {
+        1.0 / deviation
+    } else {
+        1.0
+    }
+}
+
+/// Add the initial terms that fit measured samples best to the samples of a simulation from rest.
+///
+/// `columns` are the samples of all outputs for a unit of each term, `units` its equation and exponent. With `has_level`
+/// the level of each output, which no equation has a term for, is one more term, with the exponent ∞. Outputs are
+/// weighted by the inverse of their standard deviation. Missing samples are NaN and have no weight. Of collinear terms
+/// the solution of minimum norm is taken.
+///
+/// # Errors
+/// [`Error::Length`] for other numbers of samples or terms.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::output_samples::fit_initial_terms;
+/// let measured = vec![vec![1.0, 3.0, f64::NAN, 7.0]];
+/// let ramp = vec![vec![vec![0.0, 1.0, 2.0, 3.0]]];
+/// let found = fit_initial_terms(&measured, vec![vec![0.0; 4]], &[(0, 1.0)], ramp, true)?;
+/// assert!(found.outputs[0].iter().zip([1.0, 3.0, 5.0, 7.0]).all(|(a, b)| (a - b).abs() < 1e-12));
+/// assert!((found.initial[0][0].1 - 2.0).abs() < 1e-12 && (found.initial[0][1].1 - 1.0).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
+pub fn fit_initial_terms(
+    measured: &[Vec<f64>],
+    driven: Vec<Vec<f64>>,
+    units: &[(usize, f64)],
+    mut columns: Vec<Rows>,
+    has_level: bool,
+) -> Result<OutputSamples> {
+    let (n, count) = (driven.len(), driven.first().map_or(0, Vec::len));
+    check_length("responses to initial terms", units.len(), columns.len())?;
+    for rows in columns.iter().map(Vec::as_slice).chain([measured]) {
+        check_length("outputs", n, rows.len())?;
+        rows.iter().try_for_each(|row| check_length("samples of an output", count, row.len()))?;
+    }
+    let mut units = units.to_vec();
+    for i in 0..if has_level { n } else { 0 } {
+        units.push((i, f64::INFINITY));
+        columns.push((0..n).map(|j| vec![f64::from(u8::from(i == j)); count]).collect());
+    }
+    if units.iter().any(|(i, _)| *i >= n) {
+        let what = format!("an initial term of an equation beyond {n}");
+        return Err(Error::Structure { what, remedy: "number them from 0".into() });
+    }
+    let weights: Vec<f64> = measured.iter().map(|row| weight(row)).collect();
+    let weighted = |rows: &Rows| -> Vec<f64> {
+        let of = |((row, known), w): ((&Vec<f64>, &Vec<f64>), &f64)| -> Vec<f64> {
+            row.iter().zip(known).map(|(v, known)| if known.is_nan() { 0.0 } else { w * v }).collect()
+        };
+        rows.iter().zip(measured).zip(&weights).flat_map(of).collect()
+    };
+    let missing = measured.iter().zip(&driven).map(|(y, v)| y.iter().zip(v).map(|(y, v)| y - v).collect()).collect();
+    let mut scaled: Vec<Vec<f64>> = columns.iter().map(weighted).collect();
+    let sizes: Vec<f64> = scaled.iter().map(|column| norm(column)).collect();
+    let usable: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k].is_finite() && sizes[k] > 0.0).collect();
+    let mut tall: Vec<Vec<f64>> =
+        usable.iter().map(|&k| std::mem::take(&mut scaled[k]).into_iter().map(|v| v / sizes[k]).collect()).collect();
+    tall.push(weighted(&missing));
+    let mut values = vec![0.0; units.len()];
+    for (&k, value) in usable.iter().zip(minimum_norm_solution(&tall, COLLINEARITY_TOLERANCE)?) {
+        values[k] = value / sizes[k];
+    }
+    let (mut outputs, mut initial) = (driven, vec![Vec::new(); n]);
+    for ((&(i, exponent), value), column) in units.iter().zip(values).zip(&columns) {
+        initial[i].push((exponent, value));
+        if value != 0.0 {
+            outputs.iter_mut().zip(column).for_each(|(row, v)| add_multiple(row, value, v));
+        }
+    }
+    Ok(OutputSamples { outputs, initial })
+}
+
+/// Minimum-norm least-squares solution for the last of some columns; singular values below a share of the largest are
+/// zero.
+fn minimum_norm_solution(columns: &[Vec<f64>], share: f64) -> Result<Vec<f64>> {
+    let k = columns.len();
+    let factor = dense::triangular_factor(columns);
+    let mut square: Vec<Vec<f64>> = (0..k).map(|j| (0..k).map(|i| factor[i * k + j]).collect()).collect();
+    let target = square.pop().unwrap_or_default();
+    let mut solution = vec![0.0; square.len()];
+    if square.is_empty() {
+        return Ok(solution);
+    }
+    let lost = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
+    let found = dense::singular_values(&square).ok_or_else(lost)?;
+    let least = share * found.values[0];
+    for ((left, value), right) in
+        found.left.iter().zip(&found.values).zip(&found.right).filter(|((_, v), _)| **v > least)
+    {
+        add_multiple(&mut solution, inner(left, &target) / value, right);
+    }
+    Ok(solution)
+}

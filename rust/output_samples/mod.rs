@@ -1,0 +1,15 @@
+//! Output samples: simulation of a model on a recording, at its sample times, on one grid or in the limit for zero step.
+//!
+//! Pulse means of the outputs become samples by integrals from the left, and direct feedthrough by the values of its
+//! inputs at the samples. Initial terms are given, or fitted to the measured samples. The step is halved until
+//! Richardson extrapolation has converged; the responses of long records are refined only where they change.
+
+mod initial_terms;
+mod refinement;
+mod richardson;
+mod simulation;
+
+pub use initial_terms::{fit_initial_terms, OutputSamples};
+pub use refinement::{RefinedSamples, Refinement};
+pub use richardson::{richardson_limit, LimitEstimate};
+pub use simulation::{InitialTerms, OutputSimulation};

@@ -1,0 +1,342 @@
+//! Refinement of the step until samples have converged, and superposition of responses to single samples: long records
+//! are refined only where the responses change.
+
+use std::sync::Arc;
+
+use super::initial_terms::{fit_initial_terms, OutputSamples};
+use super::richardson::{add_multiple, combine, peak, relative_change, RichardsonTable, Rows};
+use super::simulation::{Grid, InitialTerms, OutputSimulation, ORDER_TOLERANCE};
+use crate::error::{Error, Kind, Result};
+use crate::parallel::Stop;
+use crate::recording::Role;
+use crate::series;
+use crate::signal::nonuniform::interpolate_gaps;
+
+/// Pulses per sampling interval of the coarsest grid. Two are the minimum for a sample that is independent of a jump of a
+/// held input at its time.
+const FIRST_REFINEMENT: usize = 2;
+/// Pieces of a response start at its end divided by powers of this ratio, down to this minimum number of intervals.
+/// Halving the step on a piece costs as much as the whole response did.
+const PIECE_RATIO: usize = 8;
+const MIN_PIECE_INTERVALS: usize = 128;
+/// Pulses per interval of the grids that cover the whole response. The coarsest grid is not used for the first piece,
+/// where responses jump with the inputs.
+const FULL_GRID_REFINEMENTS: [usize; 3] = [1, 2, 4];
+const FINEST_FULL_GRID: usize = 4;
+/// Ratio of the second to the first half of a response above which the model is unstable and the sum loses its digits.
+const MAX_GROWTH_RATIO: f64 = 1e3;
+
+/// Samples of a simulation in the limit for zero step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RefinedSamples {
+    /// The samples.
+    pub samples: OutputSamples,
+    /// Pulses per sampling interval of the finest grid.
+    pub refinement: usize,
+    /// Change of each output on halving the step, relative to its largest value; infinite before there are three grids.
+    pub change: Vec<f64>,
+}
+
+/// Options of a refinement.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Refinement {
+    /// Change, relative to the largest value of each output, that terminates.
+    pub tolerance: f64,
+    /// Largest number of pulses.
+    pub max_pulses: usize,
+    /// Number of sampling intervals from which on a record is simulated by superposition of responses.
+    pub long_record_intervals: usize,
+}
+
+impl OutputSimulation {
+    /// Samples in the limit for zero step: on refined grids, until another halving changes no output by more than the
+    /// tolerance, or until there are no more pulses.
+    ///
+    /// # Errors
+    /// As [`OutputSimulation::samples`], if the equations are singular on two grids in a row;
+    /// [`Error::Interrupted`] after a stop.
+    pub fn refine(&self, initial: &InitialTerms, options: Refinement, stop: &Stop) -> Result<RefinedSamples> {
+        if let Some(found) = refine_long_record(self, initial, options, stop)? {
+            return Ok(found);
+        }
+        let intervals = self.recording.len() - 1;
+        let (mut table, mut lost, mut every) = (RichardsonTable::default(), 0, FIRST_REFINEMENT);
+        loop {
+            stop.check()?;
+            let last = intervals.saturating_mul(2 * every) > options.max_pulses;
+            let OutputSamples { outputs, initial: terms } = match self.samples(every, initial) {
+                // An autoregressive coefficient c meets 1 = c h^α / Γ(α + 2) on one step, not on two.
+                Err(error) if error.kind() == Kind::Model && lost != 1 => self.unknown_samples(),
+                found => found?,
+            };
+            let finite = outputs.iter().flatten().all(|v| v.is_finite());
+            let owners = terms.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |_| i));
+            let values = terms.iter().flatten().map(|term| term.1).collect();
+            table.add(outputs, values, &relative_change);
+            let found = table.estimate(&owners.collect::<Vec<_>>(), options.tolerance, &relative_change);
+            let limit = found.ok_or_else(|| Error::Internal { what: "no grid of a simulation".into() })?;
+            // A stiff equation may have no stable scheme on a coarse grid. One that has none on two in a row has none.
+            lost = if finite || every == FIRST_REFINEMENT { 0 } else { lost + 1 };
+            if last || lost == 2 || limit.change.iter().all(|c| *c <= options.tolerance) {
+                let mut values = limit.terms.into_iter();
+                let initial = terms.into_iter().map(|own| {
+                    own.into_iter().zip(values.by_ref()).map(|((exponent, _), value)| (exponent, value)).collect()
+                });
+                let samples = OutputSamples { outputs: limit.samples, initial: initial.collect() };
+                return Ok(RefinedSamples { samples, refinement: every, change: limit.change });
+            }
+            every *= 2;
+        }
+    }
+
+    /// Samples of a grid on which the equations are singular.
+    fn unknown_samples(&self) -> OutputSamples {
+        let count = self.times.as_ref().map_or(self.recording.len(), Vec::len);
+        let n = self.equations.len();
+        OutputSamples { outputs: vec![vec![f64::NAN; count]; n], initial: vec![Vec::new(); n] }
+    }
+}
+
+/// Simulation as a sum of responses: to every sample of the inputs, to first samples, and to initial terms.
+struct SampleResponses<'a> {
+    simulation: &'a OutputSimulation,
+    /// Signal, samples behind its limits, and whether it is linear between samples, of each input that is not zero. The
+    /// first sample of a linear input acts differently from later ones.
+    inputs: Vec<(usize, Vec<f64>, bool)>,
+    /// Equation and exponent of the initial terms.
+    units: Vec<(usize, f64)>,
+    stop: &'a Stop,
+}
+
+/// Piece of all responses on its finest grid, and its limit for zero step.
+struct Piece {
+    first: usize,
+    end: usize,
+    refinement: usize,
+    limit: RichardsonTable,
+}
+
+impl<'a> SampleResponses<'a> {
+    /// Responses for a recording; None if superposition does not apply.
+    fn new(simulation: &'a OutputSimulation, units: Vec<(usize, f64)>, stop: &'a Stop) -> Option<Self> {
+        let OutputSimulation { recording, equations, frictions, times } = simulation;
+        let special = !frictions.is_empty() || recording.is_all_filtered() || recording.has_nonuniform_samples();
+        if special || times.is_some() || simulation.has_improper_term() {
+            return None;
+        }
+        let mut inputs: Vec<(usize, Vec<f64>, bool)> = Vec::new();
+        for structure in equations.iter().map(|e| &e.structure) {
+            for term in &structure.terms {
+                let channel = &recording.channels()[term.signal];
+                if term.signal == structure.output || simulation.simulated_output(term.signal).is_some() {
+                    continue;
+                }
+                let direct = (term.order - structure.order).abs() <= ORDER_TOLERANCE;
+                // Inputs before the run, and at its last sample, are no response to one of its samples.
+                let late = channel.delay.unwrap_or(0.0) > 0.0;
+                if channel.role == Role::Derived || (late && (direct || !recording.is_at_rest)) {
+                    return None;
+                }
+                let samples = interpolate_gaps(&recording.acting_samples(term.signal)).into_owned();
+                if inputs.iter().all(|(signal, ..)| *signal != term.signal) && samples.iter().any(|v| *v != 0.0) {
+                    inputs.push((term.signal, samples, !channel.is_held_input()));
+                }
+            }
+        }
+        Some(Self { simulation, inputs, units, stop })
+    }
+
+    fn outputs(&self) -> usize {
+        self.simulation.equations.len()
+    }
+
+    /// All responses on a grid, one block of rows per response; NaN if the equations are singular there.
+    fn compute(&self, every: usize, intervals: usize) -> Result<Rows> {
+        match self.try_compute(every, intervals) {
+            Err(error) if error.kind() == Kind::Model => {
+                let blocks = self.inputs.len() + self.first_samples().count() + self.units.len();
+                Ok(vec![vec![f64::NAN; intervals + 1]; blocks * self.outputs()])
+            }
+            found => found,
+        }
+    }
+
+    fn try_compute(&self, every: usize, intervals: usize) -> Result<Rows> {
+        let (mut rows, mut first) = (Vec::new(), Vec::new());
+        let rest = InitialTerms::Given(vec![Vec::new(); self.outputs()]);
+        for (signal, samples, is_linear) in &self.inputs {
+            self.stop.check()?;
+            // A signal that is linear between samples rises to a sample before it falls.
+            let ramp = usize::from(*is_linear);
+            let mut block = self.unit(Some((*signal, ramp)), intervals + ramp).samples(every, &rest)?.outputs;
+            if *is_linear {
+                for row in &mut block {
+                    row.remove(0);
+                }
+                if samples[0] != 0.0 {
+                    let whole = self.unit(Some((*signal, 0)), intervals).samples(every, &rest)?.outputs;
+                    first.extend(combine(&whole, &block, |w, b| w - b));
+                }
+            }
+            rows.extend(block);
+        }
+        rows.extend(first);
+        if !self.units.is_empty() {
+            self.stop.check()?;
+            let still = self.unit(None, intervals);
+            let grid = Grid::new(&still, every)?;
+            let (_, responses) = grid.rest_and_units(&self.units)?;
+            for (unit, means) in self.units.iter().zip(responses) {
+                rows.extend(grid.unit_samples(*unit, &means)?);
+            }
+        }
+        Ok(rows)
+    }
+
+    /// Simulation of a run from rest with a single unit sample of one signal.
+    fn unit(&self, sample: Option<(usize, usize)>, intervals: usize) -> OutputSimulation {
+        let recording = Arc::new(self.simulation.recording.unit_recording(intervals + 1, sample));
+        OutputSimulation { recording, ..self.simulation.clone() }
+    }
+
+    fn first_samples(&self) -> impl Iterator<Item = f64> + '_ {
+        self.inputs.iter().filter(|(_, samples, is_linear)| *is_linear && samples[0] != 0.0).map(|(_, s, _)| s[0])
+    }
+
+    /// Superpose responses from one interval on, with these coefficients of the initial terms.
+    fn superpose(&self, responses: &Rows, first: usize, terms: &[f64]) -> Rows {
+        let (n, count) = (self.outputs(), self.simulation.recording.len() - first);
+        let mut out = vec![vec![0.0; count]; n];
+        for (block, (_, samples, _)) in responses.chunks(n).zip(&self.inputs) {
+            for (sum, row) in out.iter_mut().zip(block).filter(|(_, row)| row.iter().any(|v| *v != 0.0)) {
+                add_multiple(sum, 1.0, &series::multiply(row, &samples[..count], count));
+            }
+        }
+        let weights = self.first_samples().chain(terms.iter().copied());
+        for (block, weight) in responses.chunks(n).skip(self.inputs.len()).zip(weights) {
+            out.iter_mut().zip(block).for_each(|(sum, row)| add_multiple(sum, weight, row));
+        }
+        out
+    }
+
+    /// Samples with the initial terms, which are given or fitted to the measured samples.
+    fn samples(&self, responses: &Rows, initial: &InitialTerms) -> Result<OutputSamples> {
+        let n = self.outputs();
+        match initial {
+            InitialTerms::Given(terms) => {
+                let values: Vec<f64> = terms.iter().flatten().map(|term| term.1).collect();
+                Ok(OutputSamples { outputs: self.superpose(responses, 0, &values), initial: terms.clone() })
+            }
+            InitialTerms::Fitted { has_level, .. } => {
+                let driven = self.superpose(responses, 0, &vec![0.0; self.units.len()]);
+                if self.units.is_empty() && !has_level {
+                    return Ok(OutputSamples { outputs: driven, initial: vec![Vec::new(); n] });
+                }
+                let columns = responses.chunks(n).skip(self.inputs.len() + self.first_samples().count());
+                let measured = self.simulation.recording.compared_rows(FINEST_FULL_GRID)?;
+                fit_initial_terms(&measured, driven, &self.units, columns.map(<[_]>::to_vec).collect(), *has_level)
+            }
+        }
+    }
+}
+
+/// Refine a long record as [`OutputSimulation::refine`] does; None if superposition does not apply.
+///
+/// The refinement is that of the whole record.
+fn refine_long_record(
+    simulation: &OutputSimulation,
+    initial: &InitialTerms,
+    options: Refinement,
+    stop: &Stop,
+) -> Result<Option<RefinedSamples>> {
+    let intervals = simulation.recording.len() - 1;
+    if intervals < options.long_record_intervals || FINEST_FULL_GRID.saturating_mul(intervals) > options.max_pulses {
+        return Ok(None);
+    }
+    let exponents = match initial {
+        InitialTerms::Given(terms) => terms.iter().map(|own| own.iter().map(|term| term.0).collect()).collect(),
+        InitialTerms::Fitted { exponents, .. } => exponents.clone(),
+    };
+    let Some(responses) = SampleResponses::new(simulation, simulation.unit_terms(&exponents)?, stop) else {
+        return Ok(None);
+    };
+    let grids = FULL_GRID_REFINEMENTS.iter().map(|&every| responses.compute(every, intervals));
+    let grids = grids.collect::<Result<Vec<_>>>()?;
+    if !grids[1..].iter().all(decays) {
+        return Ok(None);
+    }
+    let rough = responses.samples(&grids[grids.len() - 1], initial)?;
+    let sizes: Vec<f64> = rough.outputs.iter().map(|row| peak(row)).collect();
+    let mut terms: Vec<f64> = rough.initial.iter().flatten().filter(|t| t.0.is_finite()).map(|t| t.1).collect();
+    terms.resize(responses.units.len(), 0.0);
+    let measure = |first: usize, new: &Rows, old: &Rows| -> Vec<f64> {
+        let by = combine(new, old, |n, o| n - o);
+        if !by.iter().flatten().all(|v| v.is_finite()) {
+            return vec![f64::INFINITY; sizes.len()];
+        }
+        let moved = responses.superpose(&by, first, &terms);
+        let of = |(row, size): (&Vec<f64>, &f64)| match peak(row) {
+            0.0 => 0.0,
+            most => most / if *size > 0.0 { *size } else { 1e-300 },
+        };
+        moved.iter().zip(&sizes).map(of).collect()
+    };
+    let part =
+        |rows: &Rows, first: usize, end: usize| rows.iter().map(|row| row[first..end].to_vec()).collect::<Rows>();
+    let mut pieces = Vec::new();
+    for (first, end) in piece_ranges(intervals) {
+        let mut limit = RichardsonTable::default();
+        for rows in &grids[usize::from(first == 0)..] {
+            limit.add(part(rows, first, end), Vec::new(), &|new, old| measure(first, new, old));
+        }
+        pieces.push(Piece { first, end, refinement: FINEST_FULL_GRID, limit });
+    }
+    drop(grids);
+    let (count, share) = (pieces.len(), options.tolerance / pieces.len() as f64);
+    let (best, refinement, change) = loop {
+        let estimates =
+            pieces.iter().map(|piece| piece.limit.estimate(&[], 0.0, &|new, old| measure(piece.first, new, old)));
+        let lost = || Error::Internal { what: "no grid of a response".into() };
+        let estimates = estimates.collect::<Option<Vec<_>>>().ok_or_else(lost)?;
+        let of = |i: usize| estimates.iter().filter_map(|found| found.change.get(i)).sum::<f64>();
+        let change: Vec<f64> = (0..responses.outputs()).map(of).collect();
+        let widest = (0..count).rev().find(|&k| {
+            !estimates[k].change.iter().all(|c| *c <= share)
+                && (2 * pieces[k].refinement).saturating_mul(pieces[k].end) <= options.max_pulses
+        });
+        let widest = widest.filter(|_| !change.iter().all(|c| *c <= options.tolerance));
+        let Some((end, every)) = widest.map(|k| (pieces[k].end, 2 * pieces[k].refinement)) else {
+            let mut best = vec![Vec::new(); estimates[0].samples.len()];
+            for found in estimates {
+                best.iter_mut().zip(found.samples).for_each(|(row, more)| row.extend(more));
+            }
+            break (best, pieces[count - 1].refinement, change);
+        };
+        stop.check()?;
+        let finer = responses.compute(every, end - 1)?;
+        for piece in pieces.iter_mut().filter(|piece| piece.end <= end && 2 * piece.refinement == every) {
+            let (first, end) = (piece.first, piece.end);
+            piece.limit.add(part(&finer, first, end), Vec::new(), &|new, old| measure(first, new, old));
+            piece.refinement = every;
+        }
+    };
+    Ok(Some(RefinedSamples { samples: responses.samples(&best, initial)?, refinement, change }))
+}
+
+/// Ranges of the pieces of responses over a number of intervals.
+fn piece_ranges(intervals: usize) -> Vec<(usize, usize)> {
+    let ends = std::iter::successors(Some(intervals + 1), |end| Some(end / PIECE_RATIO));
+    let mut ends: Vec<usize> =
+        ends.enumerate().take_while(|(k, end)| *k == 0 || *end >= MIN_PIECE_INTERVALS).map(|(_, end)| end).collect();
+    ends.reverse();
+    let firsts = std::iter::once(0).chain(ends.iter().copied());
+    firsts.zip(ends.iter().copied()).collect()
+}
+
+/// Whether responses do not grow so much that their sum loses its digits.
+fn decays(rows: &Rows) -> bool {
+    rows.iter().all(|row| {
+        let (first, second) = row.split_at(row.len() / 2);
+        row.iter().all(|v| v.is_finite()) && peak(second) <= MAX_GROWTH_RATIO * peak(first)
+    })
+}

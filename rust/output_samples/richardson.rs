@@ -1,0 +1,209 @@
+//! Richardson table: limit of samples for zero step, from grids of 1, 1/2, 1/4, … of a step.
+
+/// Samples or pulse means of each output.
+pub(super) type Rows = Vec<Vec<f64>>;
+
+/// Powers of the step in the error of a sample: 2 from the block-pulse scheme, 3 from extrapolation to a sample time, 4
+/// from the next term of both. A slope discontinuity t^η adds powers in between, which these columns do not eliminate,
+/// but none of them increases the error by more than a small factor.
+const ERROR_POWERS: [i32; 3] = [2, 3, 4];
+/// A column has the error of its power if halving the step reduced its change by at least this fraction of 2^power.
+const MIN_POWER_RATIO: f64 = 0.5;
+/// For an unknown power: minimum reduction of the change on halving the step (slightly below the square root of two),
+/// and minimum effective number of samples from which the reduction is estimated.
+const MIN_REDUCTION_FACTOR: f64 = 1.4;
+const MIN_EFFECTIVE_SAMPLES: f64 = 8.0;
+/// Number of grids needed to estimate such a reduction factor and to test it.
+const RATIO_TEST_GRIDS: usize = 4;
+
+/// Change of each output from samples on a grid to those on the next, relative to its largest value.
+pub(super) type Measure<'a> = &'a dyn Fn(&Rows, &Rows) -> Vec<f64>;
+
+/// Largest absolute value; NaN if any value is.
+pub(super) fn peak(row: &[f64]) -> f64 {
+    row.iter().fold(0.0, |most: f64, v| if v.is_nan() || most.is_nan() { f64::NAN } else { most.max(v.abs()) })
+}
+
+/// Largest change of a row, relative to its largest value.
+pub(super) fn relative_change(new: &Rows, old: &Rows) -> Vec<f64> {
+    let of = |(moved, new): (Vec<f64>, &Vec<f64>)| match peak(&moved) {
+        0.0 => 0.0,
+        most => most / peak(new),
+    };
+    combine(new, old, |n, o| n - o).into_iter().zip(new).map(of).collect()
+}
+
+pub(super) fn combine(one: &Rows, other: &Rows, by: impl Fn(f64, f64) -> f64) -> Rows {
+    one.iter().zip(other).map(|(a, b)| a.iter().zip(b).map(|(a, b)| by(*a, *b)).collect()).collect()
+}
+
+pub(super) fn add_multiple(sum: &mut [f64], factor: f64, values: &[f64]) {
+    sum.iter_mut().zip(values).for_each(|(sum, v)| *sum += factor * v);
+}
+
+/// Estimate of the limit for zero step.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct LimitEstimate {
+    /// Samples in the limit.
+    pub samples: Vec<Vec<f64>>,
+    /// Change of each output on another halving, relative to its largest value; infinite before there are three grids.
+    pub change: Vec<f64>,
+    /// Initial terms in the limit.
+    pub terms: Vec<f64>,
+}
+
+impl LimitEstimate {
+    fn worst(&self) -> f64 {
+        worst(&self.change)
+    }
+}
+
+/// Largest change; infinite if one is unknown.
+fn worst(change: &[f64]) -> f64 {
+    change.iter().fold(0.0, |most: f64, c| if c.is_nan() { f64::INFINITY } else { most.max(*c) })
+}
+
+/// Samples on a grid, then those with one power of the step after another eliminated; initial terms as a row of their
+/// own; change of each column on halving the step.
+struct Grid {
+    columns: Vec<(Rows, Vec<f64>)>,
+    changes: Vec<Vec<f64>>,
+}
+
+/// Richardson table of the last grids, finest last.
+#[derive(Default)]
+pub(super) struct RichardsonTable {
+    grids: Vec<Grid>,
+}
+
+impl RichardsonTable {
+    /// Add samples and initial terms on the next grid; samples that are not finite restart the table.
+    pub(super) fn add(&mut self, samples: Rows, terms: Vec<f64>, measure: Measure<'_>) {
+        let finite = |rows: &Rows| rows.iter().flatten().all(|v| v.is_finite());
+        let unknown = vec![f64::INFINITY; samples.len()];
+        let before = self.grids.last().map_or(&[][..], |grid| &grid.columns);
+        let continues = before.first().is_some_and(|(rows, _)| finite(rows)) && finite(&samples);
+        let mut columns = vec![(samples, terms)];
+        for (power, (rows, terms)) in ERROR_POWERS.iter().zip(before).filter(|_| continues) {
+            let factor = 2.0_f64.powi(*power);
+            let less = |fine: f64, coarse: f64| (factor * fine - coarse) / (factor - 1.0);
+            let (fine, fine_terms) = &columns[columns.len() - 1];
+            let terms = fine_terms.iter().zip(terms).map(|(f, c)| less(*f, *c)).collect();
+            columns.push((combine(fine, rows, less), terms));
+        }
+        // The change of the samples themselves is not used: their extrapolation changes less.
+        let changes = columns.iter().zip(before).enumerate().map(|(k, ((new, _), (old, _)))| match k {
+            0 => unknown.clone(),
+            _ => measure(new, old),
+        });
+        let changes = changes.collect();
+        self.grids.push(Grid { columns, changes });
+        if self.grids.len() > RATIO_TEST_GRIDS {
+            self.grids.remove(0);
+        }
+    }
+
+    /// Estimate that another halving changes least; `owners` are the outputs of the initial terms.
+    ///
+    /// If the change of a column is at most `enough`, no other estimate is tried. None without grids.
+    pub(super) fn estimate(&self, owners: &[usize], enough: f64, measure: Measure<'_>) -> Option<LimitEstimate> {
+        let grid = self.grids.last()?;
+        let (column, change) = self.best_column(grid);
+        let (samples, terms) = grid.columns[column].clone();
+        let mut best = LimitEstimate { samples, change, terms };
+        if self.grids.len() < RATIO_TEST_GRIDS || best.change.iter().all(|c| *c <= enough) {
+            return Some(best);
+        }
+        for column in 0..self.grids.iter().map(|grid| grid.columns.len()).min().unwrap_or(0) {
+            if let Some(found) = self.estimate_by_ratio(column, owners, measure)
+                && found.worst() < best.worst()
+            {
+                best = found;
+            }
+        }
+        Some(best)
+    }
+
+    /// Extrapolate a column with an error of unknown power, if the previous grid gave a reduction factor as well.
+    ///
+    /// Slope discontinuities t^η add intermediate powers, and coinciding orders add logarithms, which the table does
+    /// not eliminate.
+    fn estimate_by_ratio(&self, column: usize, owners: &[usize], measure: Measure<'_>) -> Option<LimitEstimate> {
+        let [(oldest, _), (older, _), (old, second), (new, third)] =
+            [0, 1, 2, 3].map(|k| &self.grids[k].columns[column]);
+        let (before, now) = (remaining_change_ratios(oldest, older, old)?, remaining_change_ratios(older, old, new)?);
+        let ahead = |new: &Rows, old: &Rows, ratios: &[f64]| -> Rows {
+            let of =
+                |((n, o), r): ((&Vec<f64>, &Vec<f64>), &f64)| n.iter().zip(o).map(|(n, o)| n + r * (n - o)).collect();
+            new.iter().zip(old).zip(ratios).map(of).collect()
+        };
+        let samples = ahead(new, old, &now);
+        let change = measure(&samples, &ahead(old, older, &before));
+        let terms = third.iter().zip(second).zip(owners).map(|((t, s), &o)| t + now[o] * (t - s)).collect();
+        Some(LimitEstimate { samples, change, terms })
+    }
+
+    /// Column that another halving changes least, and its change.
+    fn best_column(&self, grid: &Grid) -> (usize, Vec<f64>) {
+        let count = grid.columns.len();
+        let mut best = (if count <= 2 { count - 1 } else { 1 }, vec![f64::INFINITY; grid.columns[0].0.len()]);
+        let older = self.grids.len().checked_sub(2).map_or(&[][..], |k| &self.grids[k].changes);
+        for (column, change) in grid.changes.iter().enumerate().skip(1) {
+            let mut found = vec![(column, change.clone())];
+            if let (Some(before), true) = (older.get(column), column + 1 < count) {
+                let factor = 2.0_f64.powi(ERROR_POWERS[column]);
+                // The next column eliminates the remaining error of a column that has the error of its power.
+                if change.iter().zip(before).all(|(c, b)| c * (MIN_POWER_RATIO * factor) <= *b) {
+                    found.push((column + 1, change.iter().map(|c| c / (factor - 1.0)).collect()));
+                }
+            }
+            for each in found {
+                if worst(&each.1) < worst(&best.1) {
+                    best = each;
+                }
+            }
+        }
+        best
+    }
+}
+
+/// Ratio of the remaining change to the last change of each output, for changes that shrink by a constant factor.
+///
+/// This is Aitken's method with one factor for all samples of an output. None if few samples change, or do not converge.
+fn remaining_change_ratios(older: &Rows, old: &Rows, new: &Rows) -> Option<Vec<f64>> {
+    let (now, before) = (combine(new, old, |n, o| n - o), combine(old, older, |n, o| n - o));
+    let of = |(now, before): (&Vec<f64>, &Vec<f64>)| {
+        let size = peak(now);
+        let unit: Vec<f64> = now.iter().map(|v| v / if size > 0.0 { size } else { 1.0 }).collect();
+        let squares: f64 = unit.iter().map(|u| u * u).sum();
+        if squares == 0.0 {
+            return Some(0.0);
+        }
+        let ratio = unit.iter().zip(before).map(|(u, b)| u * b).sum::<f64>() / (squares * size);
+        let fourth: f64 = unit.iter().map(|u| u.powi(4)).sum();
+        let few = squares * squares < MIN_EFFECTIVE_SAMPLES * fourth;
+        (ratio >= MIN_REDUCTION_FACTOR && !few).then(|| 1.0 / (ratio - 1.0))
+    };
+    now.iter().zip(&before).map(of).collect()
+}
+
+/// Limit for zero step of samples on grids of 1, 1/2, 1/4, … of a step, with numbers that belong to an output each.
+///
+/// The estimate is the column of the Richardson table, or its extrapolation by Aitken's method, that another halving of
+/// the step changes least. None without grids.
+///
+/// ```
+/// use ftlm::output_samples::richardson_limit;
+/// let grid = |h: f64| vec![(0..20).map(|k| f64::from(k).sin() + h * h * f64::from(k).cos()).collect::<Vec<f64>>()];
+/// let limit = richardson_limit([1.0, 0.5, 0.25].map(|h| (grid(h), Vec::new())), &[]).unwrap_or_default();
+/// assert!((limit.samples[0][7] - 7.0_f64.sin()).abs() < 1e-14 && limit.change[0] < 1e-14);
+/// ```
+#[must_use]
+pub fn richardson_limit(
+    grids: impl IntoIterator<Item = (Vec<Vec<f64>>, Vec<f64>)>,
+    owners: &[usize],
+) -> Option<LimitEstimate> {
+    let mut table = RichardsonTable::default();
+    grids.into_iter().for_each(|(samples, terms)| table.add(samples, terms, &relative_change));
+    table.estimate(owners, 0.0, &relative_change)
+}

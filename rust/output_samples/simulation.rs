@@ -1,0 +1,498 @@
+//! Simulation of a model on a recording: samples of its outputs on one grid.
+
+use std::sync::Arc;
+
+use super::initial_terms::{self, fit_initial_terms, OutputSamples};
+use super::richardson::{add_multiple, combine, Rows};
+use crate::equation::{AffineOrder, Equation, Filter, Initial};
+use crate::error::{check_length, Error, Result};
+use crate::estimation::output_error::{FreeEquation, Monomial, Settings};
+use crate::fractional::kernels::first_coefficient;
+use crate::friction::{self, Body, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
+use crate::linalg::small;
+use crate::parallel::Stop;
+use crate::recording::{Recording, Role, Sampling};
+use crate::regressors::Record;
+use crate::series;
+use crate::signal::block_pulse::{point_samples, SampleInterpolation};
+use crate::simulate;
+
+/// (exponent, coefficient) of the initial terms of each equation.
+type Terms = Vec<Vec<(f64, f64)>>;
+
+/// Difference below which two orders are equal.
+pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
+/// Order of integration from which on a slope discontinuity is resolved by the pulses.
+const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
+/// Maximum number of evaluations for level, velocity and offset of a run with friction, and relative change of the cost
+/// that terminates.
+const FRICTION_SETTINGS: Settings = Settings { evaluations: 60, tolerance: 1e-12 };
+
+/// Initial terms of a simulation. Exponents −1, −2, … are an impulse and its derivatives before the sensor filter, the
+/// exponent ∞ is the level of an output.
+#[derive(Debug, Clone, PartialEq)]
+pub enum InitialTerms {
+    /// (exponent, coefficient) of each equation.
+    Given(Vec<Vec<(f64, f64)>>),
+    /// Exponents of each equation, fitted to the measured samples by least squares.
+    Fitted {
+        /// Exponents.
+        exponents: Vec<Vec<f64>>,
+        /// Whether each output has an unknown level as well.
+        has_level: bool,
+    },
+}
+
+/// Model with known orders and coefficients on a recording.
+#[derive(Debug, Clone)]
+pub struct OutputSimulation {
+    pub(super) recording: Arc<Recording>,
+    pub(super) equations: Vec<Equation>,
+    pub(super) frictions: Vec<(usize, FrictionLaw)>,
+    pub(super) times: Option<Vec<f64>>,
+}
+
+impl OutputSimulation {
+    /// Equations of the outputs of a recording in their sequence, and the friction of some of them. `times` \[s\] are the
+    /// times of the samples; None for the uniform samples of the recording.
+    ///
+    /// # Errors
+    /// Equations that the recording cannot supply, or other outputs than its own.
+    ///
+    /// ```
+    /// use ftlm::equation::{Equation, Structure, Term};
+    /// use ftlm::output_samples::{InitialTerms, OutputSimulation, Refinement};
+    /// use ftlm::recording::{Channel, Recording, Role};
+    /// use ftlm::signal::block_pulse::Intersample;
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// // D^0.5 y = −y + u from y(0) = 0, and a step: 1 − e^t erfc(√t), 0.5724 at 1 s.
+    /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+    /// let plant = Equation::new(Structure { output: 0, order: 0.5, terms }, vec![-1.0, 1.0])?;
+    /// let u = Channel::new("u", vec![1.0; 21], Role::Input(Intersample::Hold));
+    /// let run = Recording::new("run", 0.05, None, vec![Channel::new("y", vec![0.0; 21], Role::Output), u], vec![0])?;
+    /// let simulation = OutputSimulation::new(run.into(), vec![plant], Vec::new(), None)?;
+    /// let rest = InitialTerms::Given(vec![Vec::new()]);
+    /// assert!((simulation.samples(4, &rest)?.outputs[0][20] - 0.5724).abs() < 1e-2);
+    /// let options = Refinement { tolerance: 1e-6, max_pulses: 1 << 16, long_record_intervals: 1 << 14 };
+    /// let found = simulation.refine(&rest, options, &ftlm::parallel::Stop::default())?;
+    /// assert!((found.samples.outputs[0][20] - 0.572_416_423_844_193).abs() < 1e-6);
+    /// # Ok(())
+    /// # }
+    /// ```
+    pub fn new(
+        recording: Arc<Recording>,
+        equations: Vec<Equation>,
+        frictions: Vec<(usize, FrictionLaw)>,
+        times: Option<Vec<f64>>,
+    ) -> Result<Self> {
+        equations.iter().try_for_each(|equation| equation.check(recording.channels().len()))?;
+        let own: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
+        if own != recording.outputs() {
+            let what = format!("equations of signals {own:?} for outputs {:?}", recording.outputs());
+            return Err(Error::Structure { what, remedy: "give one equation an output, in their sequence".into() });
+        }
+        Ok(Self { recording, equations, frictions, times })
+    }
+
+    /// Initial terms of a model with friction, fitted on a grid of `every` pulses per sampling interval.
+    ///
+    /// They affect when a body sticks and slides, so they are found by optimization, from level and velocity at the
+    /// start of the run.
+    ///
+    /// # Errors
+    /// As [`Recording::experiment`] and [`friction::fit_until`].
+    pub fn fit_friction_terms(&self, initial: Initial, every: usize, stop: &Stop) -> Result<Vec<Vec<(f64, f64)>>> {
+        let experiment = self.recording.experiment(Sampling { pulses_per_sample: every, ..Sampling::default() })?;
+        let weights: Vec<f64> = (self.recording.outputs().iter())
+            .map(|&output| initial_terms::weight(&self.recording.channels()[output].samples))
+            .collect();
+        let experiments = [experiment.with_weights(&weights, None)?];
+        let known = |factor: f64| Monomial { factor, powers: Vec::new() };
+        let order = |constant: f64| AffineOrder { constant, weights: Vec::new() };
+        let fixed = |Equation { structure, coefficients }: &Equation| FreeEquation {
+            output: structure.output,
+            order: order(structure.order),
+            terms: (structure.terms.iter().zip(coefficients))
+                .map(|(term, c)| (term.signal, order(term.order), known(*c)))
+                .collect(),
+        };
+        let law = |law: FrictionLaw| FreeFrictionLaw {
+            coulomb: known(law.coulomb),
+            stribeck: known(law.stribeck),
+            speed: known(law.speed),
+        };
+        let model = FrictionModel {
+            equations: self.equations.iter().map(fixed).collect(),
+            frictions: self.frictions.iter().map(|(place, friction)| (*place, law(*friction))).collect(),
+            inputs: Vec::new(),
+            order_bounds: Vec::new(),
+            coordinates: Vec::new(),
+            initial,
+            filtered: friction::filtered_outputs(&experiments),
+        };
+        let found = friction::fit_until(&model, &experiments, &Start::default(), FRICTION_SETTINGS, stop)?;
+        Ok(found.initial.into_iter().flatten().collect())
+    }
+
+    /// Samples on a grid of `every` pulses per sampling interval; not finite if the model diverges there.
+    ///
+    /// # Errors
+    /// As [`Recording::pulses`], [`simulate::respond`], [`Body::run`].
+    pub fn samples(&self, every: usize, initial: &InitialTerms) -> Result<OutputSamples> {
+        let grid = Grid::new(self, every)?;
+        let (units, has_level) = match initial {
+            InitialTerms::Given(terms) => {
+                check_length("initial terms", self.equations.len(), terms.len())?;
+                let outputs = grid.samples(&grid.respond(terms)?, terms, true)?;
+                return Ok(OutputSamples { outputs, initial: terms.clone() });
+            }
+            InitialTerms::Fitted { exponents, has_level } => (self.unit_terms(exponents)?, *has_level),
+        };
+        let rest = vec![Vec::new(); self.equations.len()];
+        let (means, responses) = grid.rest_and_units(&units)?;
+        let driven = grid.samples(&means, &rest, true)?;
+        if (units.is_empty() && !has_level) || !driven.iter().flatten().all(|v| v.is_finite()) {
+            return Ok(OutputSamples { outputs: driven, initial: rest });
+        }
+        let columns = units.iter().zip(responses).map(|(unit, means)| grid.unit_samples(*unit, &means));
+        let columns = columns.collect::<Result<Vec<_>>>()?;
+        fit_initial_terms(&self.recording.compared_rows(every)?, driven, &units, columns, has_level)
+    }
+
+    /// Equation and exponent of each initial term.
+    pub(super) fn unit_terms(&self, exponents: &[Vec<f64>]) -> Result<Vec<(usize, f64)>> {
+        check_length("exponents of the initial terms", self.equations.len(), exponents.len())?;
+        Ok(exponents.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |e| (i, *e))).collect())
+    }
+
+    /// Equation of a signal that is simulated, if a term takes it so.
+    pub(super) fn simulated_output(&self, signal: usize) -> Option<usize> {
+        self.equations.iter().position(|e| self.recording.is_coupled && e.structure.output == signal)
+    }
+
+    /// Whether a term is improper: above the order of its equation.
+    pub(super) fn has_improper_term(&self) -> bool {
+        let above = |e: &Equation| e.structure.terms.iter().any(|t| t.order > e.structure.order + ORDER_TOLERANCE);
+        self.equations.iter().any(above)
+    }
+}
+
+/// Coefficient of an initial term, 0 without one.
+fn coefficient(terms: &[(f64, f64)], exponent: f64) -> f64 {
+    terms.iter().find(|term| term.0 == exponent).map_or(0.0, |term| term.1)
+}
+
+/// Rows multiplied by a square matrix; the rows themselves without one.
+fn apply(matrix: Option<&Vec<f64>>, rows: Rows) -> Rows {
+    let (Some(matrix), n) = (matrix, rows.len()) else { return rows };
+    let of = |i: usize| {
+        let mut out = vec![0.0; rows[i].len()];
+        for (row, gain) in rows.iter().zip(&matrix[i * n..]) {
+            out.iter_mut().zip(row).for_each(|(sum, v)| *sum += gain * v);
+        }
+        out
+    };
+    (0..n).map(of).collect()
+}
+
+/// Gain of a sensor filter for a jump (degree 0), or jump of its response to the lowest derivative of an impulse that
+/// gives one; 0 if the orders of numerator and denominator differ by another number.
+fn leading_gain(filter: &Filter, degree: f64) -> f64 {
+    let of = |part: &[(f64, f64)]| {
+        let highest = part.iter().filter(|(c, _)| *c != 0.0).fold(0.0, |most: f64, (_, order)| most.max(*order));
+        (highest, part.iter().filter(|(_, order)| *order == highest).map(|(c, _)| c).sum::<f64>())
+    };
+    let ((top, above), (bottom, below)) = (of(&filter.numerator), of(&filter.denominator));
+    if (bottom - top - degree).abs() > ORDER_TOLERANCE {
+        0.0
+    } else {
+        above / below
+    }
+}
+
+/// Integer part of the difference of the orders of a filter's denominator and numerator.
+fn relative_degree(filter: &Filter) -> f64 {
+    let highest = |part: &[(f64, f64)]| part.iter().filter(|(c, _)| *c != 0.0).fold(0.0, |m: f64, t| m.max(t.1));
+    (highest(&filter.denominator) - highest(&filter.numerator) + ORDER_TOLERANCE).trunc()
+}
+
+/// Pulse means of a recording, and places of the samples among them.
+pub(super) struct Grid<'a> {
+    simulation: &'a OutputSimulation,
+    every: usize,
+    record: Record,
+    /// Series of the sensor filter of the simulated outputs; None if the record itself is filtered, or without one.
+    output_filter: Option<Vec<f64>>,
+    at: Option<SampleInterpolation>,
+}
+
+impl<'a> Grid<'a> {
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn new(simulation: &'a OutputSimulation, every: usize) -> Result<Self> {
+        let recording = &simulation.recording;
+        let filtered = recording.is_all_filtered();
+        let pulses = recording.pulses((recording.len() - 1).saturating_mul(every), filtered)?;
+        let is_simple = !simulation.frictions.is_empty();
+        let record = if is_simple { pulses.into_record()? } else { pulses.into_record_with_initial_state()? };
+        let (m, step) = (record.m(), record.step());
+        let filter = recording.filter.as_ref().filter(|_| !filtered);
+        let output_filter = filter.map(|filter| filter.series(m, step)).transpose()?;
+        let places = simulation.times.as_ref().map(|times| times.iter().map(|t| (t / step).min(m as f64)).collect());
+        let at = places.map(|places| SampleInterpolation::new(places, m)).transpose()?;
+        Ok(Self { simulation, every, record, output_filter, at })
+    }
+
+    /// Pulse means of the outputs before the sensor filter.
+    fn respond(&self, terms: &Terms) -> Result<Rows> {
+        let OutputSimulation { recording, equations, frictions, .. } = self.simulation;
+        if !frictions.is_empty() {
+            let body = Body { equations: equations.clone(), frictions: frictions.clone() };
+            return Ok(body.run(&self.record, terms)?.outputs);
+        }
+        if recording.is_coupled {
+            return simulate::respond(equations, &self.record, terms);
+        }
+        let alone = equations.iter().zip(terms).map(|(equation, own)| {
+            simulate::respond(std::slice::from_ref(equation), &self.record, std::slice::from_ref(own))
+        });
+        Ok(alone.collect::<Result<Vec<_>>>()?.concat())
+    }
+
+    /// Pulse means from rest, and for a unit of each initial term without inputs.
+    pub(super) fn rest_and_units(&self, units: &[(usize, f64)]) -> Result<(Rows, Vec<Rows>)> {
+        let OutputSimulation { recording, equations, .. } = self.simulation;
+        if recording.is_coupled {
+            return simulate::respond_and_units(equations, &self.record, units);
+        }
+        // Each equation alone: an initial term moves its own output.
+        let mut rest = Vec::with_capacity(equations.len());
+        let mut responses = vec![vec![vec![0.0; self.record.m()]; equations.len()]; units.len()];
+        for (i, equation) in equations.iter().enumerate() {
+            let own: Vec<usize> = (0..units.len()).filter(|&k| units[k].0 == i).collect();
+            let exponents: Vec<(usize, f64)> = own.iter().map(|&k| (0, units[k].1)).collect();
+            let (alone, rows) = simulate::respond_and_units(std::slice::from_ref(equation), &self.record, &exponents)?;
+            rest.extend(alone);
+            own.into_iter().zip(rows).for_each(|(k, row)| responses[k].splice(i..=i, row).for_each(drop));
+        }
+        Ok((rest, responses))
+    }
+
+    /// Samples for a unit of an initial term without inputs, from its pulse means.
+    pub(super) fn unit_samples(&self, (equation, exponent): (usize, f64), means: &Rows) -> Result<Rows> {
+        let mut terms = vec![Vec::new(); means.len()];
+        terms[equation].push((exponent, 1.0));
+        self.samples(means, &terms, false)
+    }
+
+    /// Samples from pulse means: integrals from the left, direct feedthrough with its value at the sample.
+    ///
+    /// The last two pulses before each sample time are extrapolated to it. No jump of a held input lies in them, so the
+    /// extrapolation crosses no slope discontinuity t^α of a jump. At nonuniform sample times, between which jumps may
+    /// lie anywhere, samples follow from the pulses around them and the kink correction.
+    fn samples(&self, means: &Rows, terms: &Terms, is_driven: bool) -> Result<Rows> {
+        let OutputSimulation { recording, equations, times, .. } = self.simulation;
+        let (n, m, every) = (means.len(), self.record.m(), self.every);
+        let count = times.as_ref().map_or(m / every + 1, Vec::len);
+        let mut system = identity(n);
+        let (mut now, mut start) = (vec![vec![0.0; count]; n], vec![vec![0.0]; n]);
+        // As long as the grid, so allocated only where something feeds through.
+        let mut drive: Option<Rows> = None;
+        let degree = recording.filter.as_ref().map_or(0.0, relative_degree);
+        let after_filter = |i: usize| {
+            recording.filter.as_ref().map_or(0.0, |f| coefficient(&terms[i], -degree) * leading_gain(f, degree))
+        };
+        for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
+            // The whole equation passes the filter, and so do the initial terms of its output. Of these the filter makes
+            // a jump of one.
+            start[i][0] = if self.record.is_filtered() { after_filter(i) } else { coefficient(&terms[i], 0.0) };
+            for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
+                if structure.integration(k).abs() > ORDER_TOLERANCE {
+                    continue;
+                }
+                if let Some(j) = self.simulation.simulated_output(term.signal) {
+                    system[i * n + j] -= c;
+                } else if is_driven {
+                    let drive = drive.get_or_insert_with(|| vec![vec![0.0; m]; n]);
+                    add_multiple(&mut drive[i], c, self.record.signal(term.signal));
+                    add_multiple(&mut now[i], c, &self.values_at_samples(term.signal)?);
+                }
+            }
+        }
+        let through = if system == identity(n) { None } else { Some(small::inverse(&system, n)?) };
+        let through = through.as_ref();
+        let (drive, now, start) =
+            (drive.map(|drive| apply(through, drive)), apply(through, now), apply(through, start));
+        let mut rest = match &drive {
+            Some(drive) => combine(means, drive, |mean, driven| mean - driven),
+            None => means.clone(),
+        };
+        let (mut gains, mut held) = (vec![1.0; n], vec![0.0; n]);
+        if let (Some(series), Some(filter)) = (&self.output_filter, &recording.filter) {
+            for i in 0..n {
+                if !self.is_filtered(equations[i].structure.output) || !means[i].iter().all(|v| v.is_finite()) {
+                    continue;
+                }
+                gains[i] = leading_gain(filter, 0.0);
+                if degree > 0.0 {
+                    held[i] = after_filter(i);
+                }
+                rest[i] = series::multiply(series, &means[i], m);
+                if let Some(drive) = &drive {
+                    add_multiple(&mut rest[i], -gains[i], &drive[i]);
+                }
+            }
+        }
+        let mut out = match (&self.at, times) {
+            (Some(at), Some(times)) => {
+                let mut kinks = apply(through, self.kink_corrections(at, terms, is_driven));
+                kinks.iter_mut().zip(&gains).filter(|(_, gain)| **gain != 1.0).for_each(|(row, _)| row.fill(0.0));
+                let mut out: Rows = rest.iter().map(|row| at.interpolate(row)).collect();
+                for (i, (row, kinks)) in out.iter_mut().zip(kinks).enumerate() {
+                    add_multiple(row, 1.0, &kinks);
+                    // At the very start nothing has been integrated yet.
+                    let begins = gains[i] * start[i][0] + held[i];
+                    row.iter_mut().zip(times).filter(|(_, t)| **t <= 0.0).for_each(|(v, _)| *v = begins);
+                }
+                out
+            }
+            _ => {
+                let improper = self.simulation.has_improper_term();
+                let early = if improper && is_driven { Some(self.early_responses()?) } else { None };
+                let of = |i: usize| {
+                    let row = &rest[i];
+                    let mut out = Vec::with_capacity(count);
+                    out.push(gains[i] * start[i][0] + held[i]);
+                    for (k, at) in (every..=m).step_by(every).enumerate() {
+                        out.push(if !improper || m < 3 {
+                            1.5 * row[at - 1] - 0.5 * row[at.saturating_sub(2)]
+                        } else if at == m {
+                            row[m - 1] + 0.5 * row[m - 2] - 0.5 * row[m - 3]
+                        } else {
+                            // A term above its equation's order differentiates, nearly as Tustin's rule does at one
+                            // above: pulses have a part of alternating sign, which those on both sides eliminate.
+                            let early = early.as_ref().filter(|_| gains[i] == 1.0).map_or(0.0, |early| early[i][k]);
+                            0.5 * (row[at - 1] + row[at]) - early
+                        });
+                    }
+                    out
+                };
+                (0..n).map(of).collect()
+            }
+        };
+        for ((row, gain), now) in out.iter_mut().zip(gains).zip(&now) {
+            add_multiple(row, gain, now);
+        }
+        Ok(out)
+    }
+
+    fn is_filtered(&self, signal: usize) -> bool {
+        self.simulation.recording.channels()[signal].is_filtered
+    }
+
+    /// Values of a signal just after the sample times.
+    fn values_at_samples(&self, signal: usize) -> Result<Vec<f64>> {
+        let OutputSimulation { recording, times, .. } = self.simulation;
+        let (channel, means) = (recording.channel(signal)?, self.record.signal(signal));
+        if let (Some(at), Some(times)) = (&self.at, times) {
+            return Ok(recording.values_at(signal, times).unwrap_or_else(|| at.interpolate(means)));
+        }
+        let filtered = self.record.is_filtered() && !channel.is_filtered;
+        if !filtered && channel.delay.unwrap_or(0.0) == 0.0 {
+            // Between two pulses there may be a slope discontinuity, which their mean rounds off.
+            return Ok(recording.acting_samples(signal).into_owned());
+        }
+        if filtered || !channel.is_held_input() {
+            return Ok(point_samples(means).into_iter().step_by(self.every).collect());
+        }
+        Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
+    }
+
+    /// Early part of the mean of the pulses on either side of each inner sample, by output.
+    ///
+    /// It is half of the response of the first pulse after a jump or a slope discontinuity of the inputs, of which only
+    /// the direct gain acts at the sample, as in the joint fit.
+    fn early_responses(&self) -> Result<Rows> {
+        let OutputSimulation { recording, equations, .. } = self.simulation;
+        let (n, m, every) = (equations.len(), self.record.m(), self.every);
+        let signals = recording.channels().len();
+        // First pulse, and direct gain.
+        let mut systems = [identity(n), identity(n)];
+        let mut driven = [vec![0.0; n * signals], vec![0.0; n * signals]];
+        let mut halves: Vec<Option<Vec<f64>>> = vec![None; signals];
+        for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
+            for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
+                let (eta, channel) = (structure.integration(k), recording.channel(term.signal)?);
+                let own =
+                    self.simulation.simulated_output(term.signal).or((term.signal == structure.output).then_some(i));
+                if own.is_none()
+                    && (channel.role == Role::Derived || (self.record.is_filtered() && !channel.is_filtered))
+                {
+                    // The filter made it smooth, or only its means are known.
+                    continue;
+                }
+                let gains = [first_coefficient(eta, self.record.step()), f64::from(eta.abs() <= ORDER_TOLERANCE)];
+                for ((system, driven), gain) in systems.iter_mut().zip(&mut driven).zip(gains) {
+                    match own {
+                        Some(j) => system[i * n + j] -= c * gain,
+                        None => driven[i * signals + term.signal] += c * gain,
+                    }
+                }
+                if own.is_none() && halves[term.signal].is_none() {
+                    let (means, sign) =
+                        (self.record.signal(term.signal), if channel.is_held_input() { 1.0 } else { -1.0 });
+                    let values = self.values_at_samples(term.signal)?;
+                    let half = (every..m).step_by(every).zip(&values[1..]);
+                    let half = half.map(|(at, value)| sign * (value - 0.5 * (means[at - 1] + means[at]))).collect();
+                    halves[term.signal] = Some(half);
+                }
+            }
+        }
+        let inverses = [small::inverse(&systems[0], n)?, small::inverse(&systems[1], n)?];
+        let gain = |way: usize, i: usize, signal: usize| -> f64 {
+            (0..n).map(|j| inverses[way][i * n + j] * driven[way][j * signals + signal]).sum()
+        };
+        let mut out = vec![vec![0.0; m / every - 1]; n];
+        for (signal, half) in halves.iter().enumerate() {
+            for (i, row) in out.iter_mut().enumerate() {
+                add_multiple(row, gain(0, i, signal) - gain(1, i, signal), half.as_deref().unwrap_or_default());
+            }
+        }
+        Ok(out)
+    }
+
+    /// Kink correction at nonuniform sample times: slope discontinuities of input jumps and of initial terms.
+    ///
+    /// It includes the direct path of a jump and one pass through the output's own terms, as in the joint fit.
+    fn kink_corrections(&self, at: &SampleInterpolation, terms: &Terms, is_driven: bool) -> Rows {
+        let OutputSimulation { recording, equations, .. } = self.simulation;
+        let step = self.record.step();
+        let mut out = vec![vec![0.0; at.len()]; equations.len()];
+        for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
+            for &(power, value) in terms[i].iter().filter(|(power, value)| *value != 0.0 && power.fract() != 0.0) {
+                let jump = at.jumps(&[0.0], &[value * libm::tgamma(power + 1.0)]);
+                add_multiple(&mut out[i], 1.0, &at.kink_corrections(&jump, power, step));
+            }
+            let known = |k: usize| self.simulation.simulated_output(structure.terms[k].signal).is_some();
+            let own: Vec<usize> =
+                (0..coefficients.len()).filter(|&k| structure.terms[k].signal == structure.output).collect();
+            for k in (0..coefficients.len()).filter(|&k| is_driven && !own.contains(&k) && !known(k)) {
+                let Some((times, sizes)) = recording.jumps(structure.terms[k].signal) else { continue };
+                let jumps = at.jumps(&times.iter().map(|time| time / step).collect::<Vec<_>>(), &sizes);
+                for path in std::iter::once(vec![k]).chain(own.iter().map(|&other| vec![k, other])) {
+                    let order: f64 = path.iter().map(|&k| structure.order - structure.terms[k].order).sum();
+                    if order <= ORDER_TOLERANCE || (path.len() > 1 && order >= SMOOTH_INTEGRATION_ORDER) {
+                        continue;
+                    }
+                    let gain: f64 = path.iter().map(|&k| coefficients[k]).product();
+                    add_multiple(&mut out[i], gain, &at.kink_corrections(&jumps, order, step));
+                }
+            }
+        }
+        out
+    }
+}
+
+/// Row-major identity matrix.
+fn identity(n: usize) -> Vec<f64> {
+    (0..n * n).map(|k| f64::from(u8::from(k % (n + 1) == 0))).collect()
+}
