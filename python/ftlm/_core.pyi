@@ -58,6 +58,7 @@ __all__ = [
     "least_squares",
     "long_run_covariance",
     "metrics",
+    "minimize",
     "multi_innovation",
     "multi_innovation_estimate",
     "nonuniform_means",
@@ -324,6 +325,16 @@ def least_squares(
     fixed: Sequence[float | None],
     terms: _Initial,
 ) -> _Estimate: ...
+def minimize(
+    residuals: Callable[[_Floats], _Floats],
+    jacobian: Callable[[_Floats], _Floats],
+    start: _Floats,
+    rows: _Floats,
+    limits: _Floats,
+    *,
+    signal_norm: float = 0.0,
+    evaluations: int = 120,
+) -> tuple[_Floats, float, str, int, list[int]]: ...
 def projected_errors(
     runs: Sequence[_Record],
     equation: _Structure,
