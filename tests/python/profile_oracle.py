@@ -542,22 +542,6 @@ def _tangent(attempt: Iterate, i: int) -> Floats:
     return np.insert(others, i, 1.0)
 
 
-def is_lower_on_finer_grid(grid: Objective, before: Floats, after: Floats) -> bool:
-    """Whether a point has a lower cost than another one on the next finer grid as well.
-
-    The points are only evaluated there, because a mode of the scheme would otherwise adapt to that grid.
-    """
-    finer, costs = grid.finer, []
-    for values in (before, after):
-        orders, coefficients, inputs = grid.problem.split(values.tolist())
-        try:
-            there = finer.minimize(Iterate(orders, coefficients, "finer grid", {}, inputs), 1, plain=True)
-        except FtlmError:
-            return False
-        costs.append(float(there.outcome["cost"]))
-    return costs[1] < costs[0]
-
-
 def likelihood_of(result: Identification) -> ProfileLikelihood:
     """Return the profile likelihood around the optimum of an output-error result."""
     if result.fit is None or result.task is None:
