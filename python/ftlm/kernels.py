@@ -22,7 +22,15 @@ from ftlm.fractional_calculus import haar_inverse
 from ftlm.fractional_calculus import haar_transform as haar
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import as_floats, check_choice, check_pulses, real_number, short_repr, whole_number
+from ftlm.utils.validation import (
+    as_floats,
+    check_choice,
+    check_pulses,
+    check_threads,
+    real_number,
+    short_repr,
+    whole_number,
+)
 
 __all__ = [
     "Candidates",
@@ -480,7 +488,9 @@ class Candidates:
                 )
         scores = np.full(len(table), np.inf)
         known = np.all(np.isfinite(found), axis=1)
-        scores[known] = self._points[norm].scores(np.hstack([table, found])[known], float(limit), threads)
+        scores[known] = self._points[norm].scores(
+            np.hstack([table, found])[known], real_number("limit", limit), check_threads(threads)
+        )
         return scores, found
 
     @check_arguments
