@@ -446,6 +446,26 @@ class Sound:
             self.one(None, _core.Stop()),
         )
 
+    def state_of_fit(self):
+        """Problem, runs and the state of a fit."""
+        problem, runs, values = self.sampled()
+        shares = ("weights", [1.0]), ("shares", None), ("every", self.one(1, 2)), ("settled", self.one(True, False))
+        numbers = np.array(values)
+        return problem, runs, {"estimate": numbers, "on_grid": numbers, **dict(shares), "steady": self.one(True, False)}
+
+    def profile_intervals(self):
+        options = {"threads": self.one(1, 2), "evaluations": self.one(1, 20), "budget": self.one(None, (40, 1))}
+        return *self.state_of_fit(), self.one(None, [0]), 1.96, options
+
+    def cost_surface(self):
+        return *self.state_of_fit(), [0, 1], [0.1, 0.1], self.one(1, 3), {"refit": self.one(True, False)}
+
+    def minimize(self):
+        rows, limits = self.one(([[1.0, 1.0]], [1.0]), (np.zeros((0, 2)), []))
+        options = {"evaluations": self.one(1, 20), "signal_norm": self.one(0.0, 1.0)}
+        callbacks = (lambda v: v - 1.0), (lambda v: np.eye(len(v)))
+        return *callbacks, np.zeros(2), np.array(rows), np.array(limits), options
+
     def joint_multistart_values(self):
         problem, runs, values = self.sampled()
         return _core.refine_candidates(problem, runs, [1.0], 1, [(values, "here")], 1), ()
@@ -829,7 +849,10 @@ NAMED = {
     "block_pulse_kernel",
     "block_pulse_kernels",
     "certify",
+    "cost_surface",
+    "minimize",
     "operational_matrix",
+    "profile_intervals",
     "series_multiply",
     "series_divide",
 }

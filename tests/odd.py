@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
-from ftlm import analysis, control, rig
+from ftlm import analysis, control, kernels, rig
 from ftlm.sklearn import FractionalRegressor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "python"))
@@ -134,6 +134,7 @@ def objects():
         "control.PidDesign": design,
         "control.Realisation": lqg.realisation,
         "control.Shaper": control.input_shaper(-2 + 17j),
+        "kernels.Candidates": kernels.Candidates(np.stack([U, T]), [0, 1], step=STEP),
         "rig.ArmParameters": rig.ArmParameters.of("effective"),
         "rig.StageParameters": rig.ArmParameters.of("effective").stage1,
         "rig.Excitation": rig.Excitation(),
@@ -292,6 +293,10 @@ def own_arguments(sound):
         "kernels.toeplitz_apply": {"kernel": U, "x": T},
         "kernels.toeplitz_solve": {"kernel": U, "b": T},
         "kernels.multi_innovation": {"Q": np.stack([U, T], axis=1), "m": T, "prior_covariance": 1e6},
+        "kernels.Candidates.__init__": {"signals": np.stack([U, T]), "terms": [0, 1]},
+        "kernels.Candidates.coefficients": {"orders": [[1.0, 0.0, 0.0]]},
+        "kernels.Candidates.score": {"orders": [[1.0, 0.0, 0.0]]},
+        "kernels.Candidates.free_run": {"orders": [[1.0, 0.0, 0.0]], "coefficients": [[-1.0, 2.0]]},
         "kernels.errors": {"measured": T, "predicted": U},
         "kernels.pulse_means": {"samples": T},
         "plot.landscape": {"result": sound["search"]},
@@ -337,6 +342,7 @@ MADE_BY_CALLERS = {
     "ftlm": "Equation Term Order OrderGrid Friction Stribeck Structure Model FrequencyData GeneticAlgorithm Layout "
     "InstrumentalVariables LeastSquares MultiInnovation OutputError LinkParameters",
     "control": "FractionalPid DiscretePid JointControllers Lqg",
+    "kernels": "Candidates",
     "rig": "ArmParameters StageParameters Excitation Limits Streaming",
     "sklearn": "FractionalRegressor",
 }

@@ -32,6 +32,7 @@ __all__ = [
     "certify",
     "chi_squared",
     "correlation",
+    "cost_surface",
     "covariance_of",
     "delay_samples",
     "equation_error",
@@ -60,6 +61,7 @@ __all__ = [
     "least_squares",
     "long_run_covariance",
     "metrics",
+    "minimize",
     "multi_innovation",
     "multi_innovation_estimate",
     "nonuniform_means",
@@ -69,6 +71,7 @@ __all__ = [
     "output_error",
     "panic_on_purpose",
     "point_samples",
+    "profile_intervals",
     "projected_errors",
     "pulse_mean_rows",
     "pulse_means",
@@ -326,6 +329,16 @@ def least_squares(
     fixed: Sequence[float | None],
     terms: _Initial,
 ) -> _Estimate: ...
+def minimize(
+    residuals: Callable[[_Floats], _Floats],
+    jacobian: Callable[[_Floats], _Floats],
+    start: _Floats,
+    rows: _Floats,
+    limits: _Floats,
+    *,
+    signal_norm: float = 0.0,
+    evaluations: int = 120,
+) -> tuple[_Floats, float, str, int, list[int]]: ...
 def projected_errors(
     runs: Sequence[_Record],
     equation: _Structure,
@@ -408,6 +421,13 @@ class _Named(TypedDict):
     #: coefficient, sign, factors
     laws: Sequence[tuple[str, float, Sequence[str]]]
     hints: _Hints
+
+class _Profile(TypedDict):
+    intervals: list[tuple[int, float, float, list[tuple[float, float]], int]]
+    lower_optimum: _Vector | None
+    lower_on_finer_grid: bool
+    incomplete: list[int]
+    evaluations: int
 
 class _JointFit(TypedDict):
     shares: list[_Matrix] | None
@@ -502,6 +522,31 @@ def joint_fit(
     progress: Callable[[int, int], object] | None = None,
     stop: Stop | None = None,
 ) -> _JointFit | None: ...
+def profile_intervals(
+    problem: JointProblem,
+    runs: Sequence[Recording],
+    fit: Mapping[str, Any],
+    parameters: Sequence[int] | None,
+    width: float,
+    *,
+    budget: tuple[int, int] | None = None,
+    threads: int = 1,
+    evaluations: int = 120,
+    progress: Callable[[int, int], object] | None = None,
+    stop: Stop | None = None,
+) -> _Profile: ...
+def cost_surface(
+    problem: JointProblem,
+    runs: Sequence[Recording],
+    fit: Mapping[str, Any],
+    pair: tuple[int, int],
+    halves: tuple[float, float],
+    points: int,
+    *,
+    refit: bool = True,
+    evaluations: int = 20,
+    stop: Stop | None = None,
+) -> tuple[float, _Vector, _Vector, _Matrix]: ...
 
 @final
 class JointTimeScaling:

@@ -98,13 +98,25 @@ pub fn closed_form(
     let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let Regression { columns, target, starts, .. } = &regression;
     let prior = vec![innovation.prior_covariance; columns.len()];
-    let (columns, target) = weighted_rows(columns.clone(), target.clone(), starts, innovation.length, &prior);
+    let (solution, dropped) =
+        weighted_solution((columns, target, starts), innovation.length, &prior, regression.free_count())?;
+    regression.estimate(&solution, &dropped)
+}
+
+/// Solution of the weighted rows with those of the prior, and the dependent columns. The first `needed` must not be.
+fn weighted_solution(
+    (columns, target, starts): (&[Vec<f64>], &[f64], &[usize]),
+    length: usize,
+    prior: &[f64],
+    needed: usize,
+) -> Result<(Vec<f64>, Vec<usize>)> {
+    let (columns, target) = weighted_rows(columns.to_vec(), target.to_vec(), starts, length, prior);
     // With a prior no column is linearly dependent in exact arithmetic.
     let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
-    if let Some(&index) = dropped.iter().find(|&&d| d < regression.free_count()) {
-        return Err(Error::Singular { index, count: columns.len() });
+    match dropped.iter().find(|&&column| column < needed) {
+        Some(&index) => Err(Error::Singular { index, count: columns.len() }),
+        None => Ok((solution, dropped)),
     }
-    regression.estimate(&solution, &dropped)
 }
 
 /// Rows times the square roots of their weights, and below them those of the prior.
@@ -152,13 +164,8 @@ fn weighted_rows(
 /// ```
 pub fn estimate(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<Vec<f64>> {
     check_problem(columns, target, length, prior_covariance)?;
-    let (rows, outputs) =
-        weighted_rows(columns.to_vec(), target.to_vec(), &[0, target.len()], length, prior_covariance);
-    let (solution, dropped) = least_squares::solve(&rows, &outputs, 0)?;
-    match dropped.first() {
-        Some(&index) => Err(Error::Singular { index, count: columns.len() }),
-        None => Ok(solution),
-    }
+    let starts = [0, target.len()];
+    Ok(weighted_solution((columns, target, &starts), length, prior_covariance, columns.len())?.0)
 }
 
 /// Coefficients after every step of the recursion (44) on m = Q X, as in [`estimate`]. O(M k³).
@@ -173,18 +180,30 @@ pub fn path(
     stop: &Stop,
 ) -> Result<Vec<Vec<f64>>> {
     check_problem(columns, target, length, prior_covariance)?;
+    run_recursion((columns, target, &[0, target.len()]), length, prior_covariance, stop)
+}
+
+/// Coefficients after every step of the recursion through records that begin at `starts`.
+fn run_recursion(
+    (columns, target, starts): (&[Vec<f64>], &[f64], &[usize]),
+    length: usize,
+    prior_covariance: &[f64],
+    stop: &Stop,
+) -> Result<Vec<Vec<f64>>> {
     let mut state = Recursion::with_prior(&vec![0.0; columns.len()], prior_covariance)?;
     let rows: Vec<Vec<f64>> = (0..target.len()).map(|i| columns.iter().map(|c| c[i]).collect()).collect();
-    (0..target.len())
-        .map(|newest| {
+    let mut trace = Vec::with_capacity(target.len());
+    for pair in starts.windows(2) {
+        for newest in pair[0]..pair[1] {
             stop.check()?;
-            let oldest = (newest + 1).saturating_sub(length);
+            let oldest = (newest + 1).saturating_sub(length).max(pair[0]);
             state
                 .step((oldest..=newest).rev().map(|i| (rows[i].as_slice(), target[i])))
                 .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;
-            Ok(state.coefficients().to_vec())
-        })
-        .collect()
+            trace.push(state.coefficients().to_vec());
+        }
+    }
+    Ok(trace)
 }
 
 fn check_problem(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<()> {
@@ -213,22 +232,13 @@ pub fn recursion(
     innovation: &Innovation,
 ) -> Result<(Estimate, Vec<Vec<f64>>)> {
     let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
-    let k = regression.columns.len();
-    let mut state = Recursion::new(&vec![0.0; k], innovation.prior_covariance)?;
-    let end = regression.target.len();
-    let matrix: Vec<Vec<f64>> = (0..end).map(|i| regression.columns.iter().map(|c| c[i]).collect()).collect();
-    let mut trace = Vec::with_capacity(end);
-    for pair in regression.starts.windows(2) {
-        for newest in pair[0]..pair[1] {
-            let oldest = (newest + 1).saturating_sub(innovation.length).max(pair[0]);
-            let innovations = (oldest..=newest).rev().map(|i| (matrix[i].as_slice(), regression.target[i]));
-            state
-                .step(innovations)
-                .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;
-            trace.push(regression.estimate(state.coefficients(), &[])?.coefficients);
-        }
-    }
-    Ok((regression.estimate(state.coefficients(), &[])?, trace))
+    let Regression { columns, target, starts, .. } = &regression;
+    let prior = vec![innovation.prior_covariance; columns.len()];
+    let steps = run_recursion((columns, target, starts), innovation.length, &prior, &Stop::default())?;
+    let zeros = vec![0.0; columns.len()];
+    let last = regression.estimate(steps.last().unwrap_or(&zeros), &[])?;
+    let coefficients = |step: &Vec<f64>| Ok(regression.estimate(step, &[])?.coefficients);
+    Ok((last, steps.iter().map(coefficients).collect::<Result<_>>()?))
 }
 
 fn regression_in_basis(

@@ -252,6 +252,44 @@ pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     Some(solved.iter().copied().collect())
 }
 
+/// Nonnegative least squares: minimize ‖Σ xⱼ columnⱼ − target‖ for x ≥ 0, by active sets.
+///
+/// Lawson & Hanson, doi:10.1137/1.9781611971217, §23.3. A dependent column gets 0.
+///
+/// ```
+/// let found = ftlm::linalg::small::nonnegative_solution(&[vec![1.0, 0.0], vec![0.0, 1.0]], &[2.0, -1.0]);
+/// assert!((found[0] - 2.0).abs() < 1e-15 && found[1] == 0.0);
+/// ```
+#[must_use]
+pub fn nonnegative_solution(columns: &[Vec<f64>], target: &[f64]) -> Vec<f64> {
+    let n = columns.len();
+    let matrix = DMatrix::from_fn(target.len(), n, |i, j| columns[j][i]);
+    let target = DVector::from_column_slice(target);
+    let (mut x, mut positive) = (DVector::<f64>::zeros(n), Vec::new());
+    for _ in 0..3 * n {
+        let gradient = matrix.tr_mul(&(&target - &matrix * &x));
+        let rounding = |j: usize| 10.0 * f64::EPSILON * matrix.column(j).norm() * target.norm();
+        let rises = (0..n).filter(|j| !positive.contains(j) && gradient[*j] > rounding(*j));
+        let Some(next) = rises.max_by(|&i, &j| gradient[i].total_cmp(&gradient[j])) else { break };
+        positive.push(next);
+        while let Ok(solved) = matrix.select_columns(&positive).svd(true, true).solve(&target, PIVOT_FLOOR) {
+            // The last share of the way on which no value becomes negative.
+            let ends = positive.iter().zip(&solved).filter(|(_, to)| **to <= 0.0).map(|(&j, to)| x[j] / (x[j] - to));
+            let share = ends.fold(1.0, f64::min);
+            positive.iter().zip(&solved).for_each(|(&j, to)| x[j] += share * (to - x[j]));
+            if share == 1.0 {
+                break;
+            }
+            positive.retain(|&j| x[j] > f64::EPSILON * x.amax());
+            (0..n).filter(|j| !positive.contains(j)).for_each(|j| x[j] = 0.0);
+        }
+        if x[next] == 0.0 {
+            break;
+        }
+    }
+    x.iter().copied().collect()
+}
+
 /// Solve `R x = c` for upper-triangular row-major R, k × k with row stride `stride`.
 #[must_use]
 pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {

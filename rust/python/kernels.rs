@@ -105,6 +105,29 @@ pub fn block_pulse_kernels<'py>(
     PyArray1::from_vec(py, values).reshape([count, m])
 }
 
+/// Change of the rows of one kernel, one after another, by that kernel.
+type KernelWork = fn(&[f64], &mut [f64], &Stop) -> Result<()>;
+
+/// Apply `work` to rows and the first columns of their Toeplitz matrices; `groups` has the number of each row's matrix.
+fn with_kernels<'py>(
+    py: Python<'py>,
+    first_columns: &PyReadonlyArray2<'py, f64>,
+    (name, array): (&str, &PyReadonlyArray2<'py, f64>),
+    groups: List<usize>,
+    work: KernelWork,
+) -> PyResult<Matrix<'py>> {
+    let (first, mut batch) = (Batch::new("kernel", first_columns)?, Batch::new(name, array)?);
+    let (count, size) = (batch.count(), batch.values.len());
+    let batch = run_interruptible(py, size, None, move |stop| {
+        check_length("kernel", batch.width, first.width)?;
+        batch.change_groups(&groups, first.count(), stop, |group, block| {
+            work(&first.values[group * first.width..][..first.width], block, stop)
+        })?;
+        Ok(batch)
+    })?;
+    batch.into_matrix(py, count)
+}
+
 /// Products of lower triangular Toeplitz matrices with rows; `groups` has the number of the matrix of each row.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
@@ -114,17 +137,10 @@ pub fn toeplitz_apply<'py>(
     x: PyReadonlyArray2<'py, f64>,
     groups: List<usize>,
 ) -> PyResult<Matrix<'py>> {
-    let (first, mut batch) = (Batch::new("kernel", &first_columns)?, Batch::new("x", &x)?);
-    let (count, size) = (batch.count(), batch.values.len());
-    let batch = run_interruptible(py, size, None, move |stop| {
-        check_length("kernel", batch.width, first.width)?;
-        batch.change_groups(&groups, first.count(), stop, |group, block| {
-            series::multiply_signals(&first.values[group * first.width..][..first.width], block);
-            Ok(())
-        })?;
-        Ok(batch)
-    })?;
-    batch.into_matrix(py, count)
+    with_kernels(py, &first_columns, ("x", &x), groups, |kernel, block, _| {
+        series::multiply_signals(kernel, block);
+        Ok(())
+    })
 }
 
 /// Solutions of lower triangular Toeplitz systems; `groups` has the number of the matrix of each right-hand side.
@@ -136,22 +152,13 @@ pub fn toeplitz_solve<'py>(
     b: PyReadonlyArray2<'py, f64>,
     groups: List<usize>,
 ) -> PyResult<Matrix<'py>> {
-    let (first, mut batch) = (Batch::new("kernel", &first_columns)?, Batch::new("b", &b)?);
-    let (count, size) = (batch.count(), batch.values.len());
-    let batch = run_interruptible(py, size, None, move |stop| {
-        check_length("kernel", batch.width, first.width)?;
-        let width = batch.width;
-        batch.change_groups(&groups, first.count(), stop, |group, block| {
-            let divisor = &first.values[group * width..][..width];
-            block.chunks_exact_mut(width).try_for_each(|row| {
-                stop.check()?;
-                row.copy_from_slice(&series::divide(row, divisor)?);
-                Ok(())
-            })
-        })?;
-        Ok(batch)
-    })?;
-    batch.into_matrix(py, count)
+    with_kernels(py, &first_columns, ("b", &b), groups, |kernel, block, stop| {
+        block.chunks_exact_mut(kernel.len()).try_for_each(|row| {
+            stop.check()?;
+            row.copy_from_slice(&series::divide(row, kernel)?);
+            Ok(())
+        })
+    })
 }
 
 /// Means of sampled signals over m equal pulses, one signal a row.

@@ -9,6 +9,7 @@ mod friction;
 mod joint_fit;
 mod kernels;
 mod operators;
+mod optimization;
 mod order_search;
 mod recording;
 mod simulation;
@@ -47,10 +48,13 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::joint_fit::{
-        autocovariances, chi_squared, covariance_of, filter_autocovariances, fit_covariance, is_white, joint_fit,
-        joint_multistart, long_run_covariance, refine_candidates, whitening_filter, JointMultistart, JointProblem,
-        JointTimeScaling,
+        autocovariances, chi_squared, cost_surface, covariance_of, filter_autocovariances, fit_covariance, is_white,
+        joint_fit, joint_multistart, long_run_covariance, profile_intervals, refine_candidates, whitening_filter,
+        JointMultistart, JointProblem, JointTimeScaling,
     };
+
+    #[pymodule_export]
+    use crate::python::optimization::minimize;
 
     #[pymodule_export]
     use crate::python::recording::{nonuniform_means, Experiment, Recording};

@@ -32,6 +32,8 @@ LQG = control.lqg(
 OBSERVER = LQG.controller.observer
 MOVE = control.point_to_point(0.3, 0.5)
 EQUATION = ftlm.equation("D^2 y = a1 D y + a0 y + b0 u")
+TUPLES = kernels.Candidates(np.stack([np.sin(T), U]), [0, 1], step=STEP)
+ORDER_TUPLES = np.array([[1.0, 0.0, 0.0], [1.5, 0.5, 0.0]])
 DATA = ftlm.FrequencyData(W, analysis.frequency_response(MODEL, W)[0, 0])
 
 
@@ -139,6 +141,18 @@ CALLS = {
         (lambda x: kernels.multi_innovation(x, T, prior_covariance=1e6), np.stack([U, T], axis=1)),
         (lambda x: kernels.multi_innovation(np.stack([U, T], axis=1), x, prior_covariance=1e6), T),
         (lambda x: kernels.multi_innovation(np.stack([U, T], axis=1), T, prior_covariance=x), np.array([1.0, 2.0])),
+    ],
+    "kernels.Candidates.coefficients": [
+        (TUPLES.coefficients, ORDER_TUPLES),
+        (lambda x: TUPLES.coefficients(ORDER_TUPLES, p=3, prior_covariance=x, rows="time"), np.array([1.0, 2.0])),
+    ],
+    "kernels.Candidates.score": [
+        (TUPLES.score, ORDER_TUPLES),
+        (lambda x: TUPLES.score(ORDER_TUPLES, x), np.array([[-1.0, 2.0], [-2.0, 1.0]])),
+    ],
+    "kernels.Candidates.free_run": [
+        (lambda x: TUPLES.free_run(x, np.array([[-1.0, 2.0], [-2.0, 1.0]])), ORDER_TUPLES),
+        (lambda x: TUPLES.free_run(ORDER_TUPLES, x), np.array([[-1.0, 2.0], [-2.0, 1.0]])),
     ],
     "kernels.errors": [(lambda x: kernels.errors(x, U), T), (lambda x: kernels.errors(T, x), U)],
     "plot.bode": [(lambda x: plot.bode(MODEL, x), W)],

@@ -10,14 +10,15 @@ import warnings
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
+from scipy.optimize import minimize as scipy_minimize
 from typer.testing import CliRunner
 
 import circuits
 import ftlm
 import ftlm.plot
+from ftlm import _core
 from ftlm.cli.main import app
 from ftlm.estimation.frequency_domain import ResponseProblem
-from ftlm.estimation.levenberg_marquardt import constrained_least_squares
 
 ARC = "D^alpha U = a U + r D^alpha I + b I"
 W = np.geomspace(0.06, 6e4, 60)
@@ -248,34 +249,69 @@ def test_an_order_ends_on_the_bound_of_its_lattice_and_says_so():
 def test_damped_least_squares_keeps_to_its_inequalities():
     """Minimum of (x - 3)^2 + (y - 1)^2 with x + y <= 2 and x <= 1.2, by hand: at (1.2, 0.8)."""
 
-    def residuals(v):
-        return np.array([v[0] - 3.0, v[1] - 1.0]), np.eye(2)
-
     rows, limits = np.array([[1.0, 1.0], [1.0, 0.0]]), np.array([2.0, 1.2])
-    ended = constrained_least_squares(
-        residuals, lambda v: float(np.sum(residuals(v)[0] ** 2)), np.zeros(2), rows, limits
+    values, cost, status, _, active = _core.minimize(
+        lambda v: v - [3.0, 1.0], lambda v: np.eye(2), np.zeros(2), rows, limits
     )
-    np.testing.assert_allclose(ended.values, [1.2, 0.8], atol=1e-9)
-    assert sorted(ended.active_constraints) == [0, 1]
-    assert ended.converged
+    np.testing.assert_allclose(values, [1.2, 0.8], atol=1e-9)
+    assert cost == pytest.approx(1.8**2 + 0.2**2)
+    assert (status, active) == ("converged", [0, 1])
 
 
 def test_a_wall_that_is_met_on_the_way_is_let_go():
     """From (0, -1) the way to (2, 2) along a bent valley meets x <= 1 + y first; the end lies within."""
 
-    def residuals(v):
-        x, y = v
-        return np.array([x - 2.0, 3.0 * (y - x * x / 2)]), np.array([[1.0, 0.0], [-3.0 * x, 3.0]])
-
-    ended = constrained_least_squares(
-        residuals,
-        lambda v: float(np.sum(residuals(v)[0] ** 2)),
+    values, _, _, _, active = _core.minimize(
+        lambda v: np.array([v[0] - 2.0, 3.0 * (v[1] - v[0] ** 2 / 2)]),
+        lambda v: np.array([[1.0, 0.0], [-3.0 * v[0], 3.0]]),
         np.array([0.0, -1.0]),
         np.array([[1.0, -1.0]]),
         np.array([1.0]),
     )
-    np.testing.assert_allclose(ended.values, [2.0, 2.0], atol=1e-7)
-    assert ended.active_constraints == ()
+    np.testing.assert_allclose(values, [2.0, 2.0], atol=1e-7)
+    assert active == []
+
+
+def test_constrained_optima_are_those_of_scipy():
+    """Random Rosenbrock-like problems under random constraints, beside SciPy's SLSQP."""
+    rng = np.random.default_rng(3)
+    bounded = 0
+    for _ in range(40):
+        matrix, target = rng.standard_normal((6, 3)), rng.standard_normal(6)
+        rows, limits = rng.standard_normal((5, 3)), rng.uniform(0.0, 0.5, 5)
+
+        def residuals(v, matrix=matrix, target=target):
+            return matrix @ (v + 0.3 * v**2) - target
+
+        def jacobian(v, matrix=matrix):
+            return matrix * (1.0 + 0.6 * v)
+
+        values, cost, status, _, active = _core.minimize(residuals, jacobian, np.zeros(3), rows, limits)
+        assert status == "converged"
+        assert np.all(rows @ values <= limits + 1e-9)
+        within = {"type": "ineq", "fun": lambda v, rows=rows, limits=limits: limits - rows @ v}
+        other = scipy_minimize(
+            lambda v, residuals=residuals: np.sum(residuals(v) ** 2),
+            values,
+            method="SLSQP",
+            constraints=within,
+            options={"ftol": 1e-13},
+        )
+        assert cost <= other.fun * (1.0 + 1e-7)
+        np.testing.assert_allclose((limits - rows @ values)[active], 0.0, atol=1e-8)
+        bounded += bool(active)
+    assert bounded > 10
+
+
+def test_an_exception_of_the_residuals_is_passed_on():
+    def broken(_):
+        raise ZeroDivisionError("on purpose")
+
+    arguments = (np.zeros(1), np.zeros((0, 1)), np.zeros(0))
+    with pytest.raises(ZeroDivisionError, match="on purpose"):
+        _core.minimize(broken, broken, *arguments)
+    with pytest.raises(ftlm.DataError, match="a row of the Jacobian has length 2, but 1 is needed"):
+        _core.minimize(lambda v: v, lambda v: np.eye(2)[:1], *arguments)
 
 
 def scipys(response):

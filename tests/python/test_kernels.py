@@ -12,6 +12,8 @@ import ftlm
 from ftlm import kernels
 
 STEP = 0.1
+PAIR = kernels.Candidates(np.ones((2, 4)), [1], step=STEP)
+SHORT = kernels.Candidates(np.ones((2, 6)), [1], step=STEP)
 ORDERS = np.array([0.0, 0.5, 1.3, 2.0])
 
 
@@ -138,6 +140,86 @@ def test_two_threads_compute_what_one_does():
     np.testing.assert_array_equal(found[0], found[1])
 
 
+def candidates(m=64, seed=4):
+    """An equation with an own term and two inputs, and order tuples around the one that made the output."""
+    rng = np.random.default_rng(seed)
+    u, v = np.repeat(rng.standard_normal((2, m // 8)), 8, axis=1)
+    forced = 2.0 * kernels.integrate(u, 1.6, step=STEP) + 0.5 * kernels.integrate(v, 1.2, step=STEP)
+    divisor = 0.8 * kernels.block_pulse_kernel(0.7, m, step=STEP)
+    divisor[0] += 1.0
+    y = kernels.toeplitz_solve(divisor, forced) + 0.01 * rng.standard_normal(m)
+    tuples = np.array([[1.6, 0.9, 0.0, 0.4], [1.5, 0.9, 0.0, 0.4], [1.6, 0.5, 0.1, 0.1], [0.9, 0.2, 0.0, 0.3]])
+    return kernels.Candidates([u, y, v], [1, 0, 2], output=1, step=STEP), np.stack([u, y, v]), tuples
+
+
+@pytest.mark.parametrize("rows", ["haar", "time"])
+@pytest.mark.parametrize(("p", "prior"), [(0, np.inf), (1, 1e6), (7, 1e6), (7, 1.0), (7, [1e-3, 1.0, 1e9])])
+def test_coefficients_of_candidates_are_those_of_dense_columns(p, prior, rows):
+    model, signals, tuples = candidates()
+    turn = kernels.haar if rows == "haar" else np.asarray
+    found = model.coefficients(tuples, p=p, prior_covariance=prior, rows=rows)
+    for order, own in zip(tuples, found, strict=True):
+        columns = [
+            kernels.integrate(signals[row], order[0] - order[1 + j], step=STEP) for j, row in enumerate([1, 0, 2])
+        ]
+        columns, output = turn(np.stack(columns)).T, turn(signals[1])
+        if p:
+            expected = kernels.multi_innovation(columns, output, p, prior_covariance=prior)
+        else:
+            expected = np.linalg.lstsq(columns, output, rcond=None)[0]
+        np.testing.assert_allclose(own, expected, rtol=1e-9)
+    # What is kept between calls changes nothing.
+    again = model.coefficients(tuples[::-1], p=p, prior_covariance=prior, rows=rows)
+    np.testing.assert_allclose(again[::-1], found, rtol=1e-12)
+    fresh = candidates()[0].coefficients(tuples[2:], p=p, prior_covariance=prior, rows=rows)
+    np.testing.assert_allclose(fresh, found[2:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("norm", ["l1", "l2"])
+def test_scores_of_candidates_are_errors_of_their_simulations(norm):
+    model, signals, tuples = candidates()
+    scores, numbers = model.score(tuples, norm=norm)
+    simulated = model.free_run(tuples, numbers)
+    for order, own, outputs in zip(tuples, numbers, simulated, strict=True):
+        gaps = order[0] - order[1:]
+        divisor = np.eye(64) - own[0] * dense(kernels.block_pulse_kernel(gaps[0], 64, step=STEP))
+        forced = own[1] * kernels.integrate(signals[0], gaps[1], step=STEP)
+        forced = forced + own[2] * kernels.integrate(signals[2], gaps[2], step=STEP)
+        np.testing.assert_allclose(outputs, np.linalg.solve(divisor, forced), rtol=1e-9, atol=1e-12)
+    each = kernels.errors(signals[1], simulated)[:, 0 if norm == "l1" else 1]
+    np.testing.assert_allclose(scores, each, rtol=1e-9)
+    assert scores.argmin() == 0
+    limited, same = model.score(tuples, numbers, norm=norm, limit=float(scores.min() * 1.01), threads=2)
+    np.testing.assert_array_equal(np.isfinite(limited), scores <= scores.min() * 1.01)
+    assert same is numbers or np.array_equal(same, numbers)
+
+
+def test_candidates_agree_with_identify(small_run):
+    structure = ftlm.equation("D^alpha y = a1 D^beta y + a0 y + b u", initial="rest")
+    structure = structure.with_orders({"alpha": [1.7, 1.8], "beta": [0.5, 0.6]})
+    method = ftlm.MultiInnovation(innovation_length=7, prior_covariance=1e6)
+    found = ftlm.identify(small_run, structure, method=method, m=256)
+    y, u = (kernels.pulse_means(small_run[n], 256, hold=n == "u") for n in "yu")
+    model = kernels.Candidates([y, u], [0, 0, 1], step=small_run.duration / 256)
+    orders = [[alpha, beta, 0.0, 0.0] for alpha in (1.7, 1.8) for beta in (0.5, 0.6)]
+    scores, coefficients = model.score(orders, p=7, prior_covariance=1e6)
+    best = int(scores.argmin())
+    assert orders[best][:2] == pytest.approx([found.orders["alpha"], found.orders["beta"]])
+    np.testing.assert_allclose(coefficients[best], [found.coefficients[n] for n in ("a1", "a0", "b")], rtol=1e-9)
+
+
+def test_candidates_without_an_estimate_are_marked():
+    model = kernels.Candidates([np.ones(8), np.ones(8)], [1, 1], step=STEP)
+    scores, numbers = model.score([[0.5, 0.1, 0.1], [0.5, 0.1, 0.2]])
+    assert np.isnan(numbers[0]).all()
+    assert np.isinf(scores[0])
+    assert np.isfinite(numbers[1]).all()
+    none = model.score(np.zeros((0, 3)))
+    assert none[0].shape == (0,)
+    assert none[1].shape == (0, 2)
+    assert model.free_run(np.zeros((0, 3)), np.zeros((0, 2))).shape == (0, 8)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -158,6 +240,17 @@ def test_two_threads_compute_what_one_does():
         (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), prior_covariance=[1.0] * 3), "prior_covariance"),
         (lambda: kernels.errors(np.ones(3), np.ones(4)), r"\(3,\), predicted \(4,\)"),
         (lambda: kernels.block_pulse_kernel(0.5, 0, step=STEP), "m"),
+        (lambda: kernels.Candidates(np.ones(4), [0], step=STEP), r"signals has shape \(4,\)"),
+        (lambda: kernels.Candidates(np.ones((2, 4)), [2], step=STEP), "terms = 2 is no row of 2 signals"),
+        (lambda: kernels.Candidates(np.ones((2, 4)), [], step=STEP), "terms is empty|terms. is empty"),
+        (lambda: PAIR.coefficients([0.5, 0.1]), r"orders has shape \(2,\); give \(N, 2\)"),
+        (lambda: PAIR.coefficients([[0.5, 0.1], [0.5, 0.6]]), r"orders 1 of 2 are \[0.5, 0.6\] \(1 such"),
+        (lambda: PAIR.coefficients([[0.5, 0.1]], p=-1), "p = -1 is no whole number from 0"),
+        (lambda: PAIR.coefficients([[0.5, 0.1]], prior_covariance=0.0), "prior_covariance is not positive"),
+        (lambda: PAIR.coefficients([[0.5, 0.1]], rows="fourier"), "rows = 'fourier' is not known"),
+        (lambda: SHORT.coefficients([[0.5, 0.1]], p=7), "power of two"),
+        (lambda: PAIR.score([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\); give \(1, 1\)"),
+        (lambda: PAIR.free_run([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\)"),
     ],
 )
 def test_wrong_arguments_are_refused_in_words(call, words):

@@ -7,6 +7,8 @@ import pytest
 
 import ftlm
 from ftlm.estimation.cost_surface import correlated_orders, output_error_landscape
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Iterate, Objective
 from ftlm.svg.heat_map import heat_map
 
 WORDS = "D^alpha y = a D^nu y + c y + b u"
@@ -40,6 +42,31 @@ def test_refitted_the_cost_is_that_of_the_covariance(fit):
     assert np.all((ratio > 0.4) & (ratio < 2.5))
     assert np.corrcoef(np.log(found.scores.ravel()), np.log(wanted.ravel()))[0, 1] > 0.9
     assert found.other_orders_note.startswith("All other numbers refitted")
+
+
+def test_costs_are_those_of_residuals_after_a_linear_step(fit):
+    found = output_error_landscape(fit)
+    joint, task = fit.fit, fit.task
+    problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
+    weights = [1.0 / joint.noise[o] for o in task.structure.outputs]
+    grid = Objective(problem, task.runs, weights, joint.refinement)
+
+    def at(values, evaluations):
+        orders, coefficients, inputs = problem.split(values.tolist())
+        return grid.minimize(Iterate(orders, coefficients, "", {}, inputs), evaluations, plain=True)
+
+    best = at(joint.values, 20)
+    pair = [problem.names.index(n) for n in found.names]
+    others = np.delete(best.outcome["jacobian"], pair, axis=0).T
+    for row, column in ((0, 0), (3, 8), (10, 5)):
+        values = best.values
+        values[pair] = found.x[column], found.y[row]
+        residuals = at(values, 1).outcome["residuals"]
+        step = np.linalg.lstsq(others, residuals, rcond=None)[0]
+        cost = np.sum((residuals - others @ step) ** 2)
+        wanted = found.scores[row, column] - found.scores.min()
+        center = np.sum(best.outcome["residuals"] ** 2)
+        assert cost - center == pytest.approx(wanted, rel=1e-5, abs=1e-4 * center)
 
 
 def test_held_the_cost_is_never_lower(fit):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,19 +15,17 @@ from scipy.optimize import brentq, least_squares
 from scipy.signal import lfilter, lsim
 
 import ftlm
+from ftlm import _core
 from ftlm.estimation import confidence_intervals as profiling
-from ftlm.estimation.confidence_intervals import (
-    ProfileLikelihood,
-    half_width,
-    likelihood_of,
-    nonlinear_parameters,
-    profile_intervals,
-)
+from ftlm.estimation.confidence_intervals import ProfileResult, half_width, profile_intervals
+from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.model_checks import identifiability_findings
-from ftlm.estimation.objective import Iterate
-from ftlm.estimation.output_error import Loss
+from ftlm.estimation.output_error import JointFit, Loss, fit_state
 from ftlm.report.html_report import model_page
+from ftlm.simulation.discretization import recording
 from measured import DATA, needs_data
+from profile_oracle import likelihood_of, nonlinear_parameters
+from profile_oracle import profile_intervals as intervals_in_python
 
 THRESHOLD = 1.959963984540054**2
 STEP = 0.05
@@ -49,6 +46,62 @@ def switched(rows: int, every: int, seed: int = 100) -> np.ndarray:
 def quadratic(run: ftlm.Run, words: str, loss: Loss = "squares") -> ftlm.Identification:
     method = ftlm.OutputError(intervals="quadratic", loss=loss)
     return ftlm.identify(run, ftlm.equation(words, initial="rest"), method=method, threads=1)
+
+
+def problem_of(result: ftlm.Identification) -> FreeProblem:
+    assert result.fit is not None
+    return FreeProblem.of(replace(result.task.structure, initial=result.fit.initial))
+
+
+def intervals_of(
+    result: ftlm.Identification, *, most: int | None = None, fit: JointFit | None = None, **options: int
+) -> ProfileResult:
+    """Intervals of all free parameters by the core, with a budget of simulations, around another optimum."""
+    problem, budget = problem_of(result), None if most is None else (most, 0)
+    assert result.fit is not None
+    joint = result.fit if fit is None else fit
+    return profile_intervals(joint, problem, result.task.runs, problem.names, 0.95, budget=budget, **options)
+
+
+def one_error_beside(result: ftlm.Identification) -> JointFit:
+    """The fit as if it had ended a standard error beside the optimum."""
+    valley = likelihood_of(result)
+    assert result.fit is not None
+    return replace(result.fit, finest_grid_values=valley.best.values + valley.errors)
+
+
+# ---------------------------------------------------------------------------------------------- the program in NumPy
+
+
+@pytest.mark.parametrize(
+    ("words", "truth", "noise", "options"),
+    [
+        ("D^2 y = c D y + a y + b u", (-26.0, -25.0, 25.0), 0.8, {}),
+        ("D^2 y = c D y + a y + b u", (-26.0, -25.0, 25.0), 0.1, {"loss": "huber", "colour": 0.8}),
+        ("D^alpha y = a D^nu y + c y + b u", (-3.0, -25.0, 25.0), 0.2, {}),
+        ("D^2 y = c D y + a y + b u", (-2.0, -25.0, 25.0), 0.3, {"delay": {"u": (0.0, 0.3)}}),
+    ],
+)
+def test_the_core_finds_what_the_program_in_numpy_finds(
+    words: str, truth: tuple[float, ...], noise: float, options: dict
+) -> None:
+    u = switched(240, 15)
+    run = record(fast_pole(*truth, u), u, noise, 4, colour=options.get("colour", 0.0))
+    structure = ftlm.equation(words, initial="rest", delay=options.get("delay"))
+    method = ftlm.OutputError(intervals="quadratic", loss=options.get("loss", "squares"))
+    found = ftlm.identify(run, structure, method=method, threads=1)
+    valley = likelihood_of(found)
+    ours, theirs = intervals_of(found), intervals_in_python(valley, valley.names, 0.95)
+    assert list(ours.intervals) == list(theirs.intervals)
+    for name, own in ours.intervals.items():
+        other = theirs.intervals[name]
+        # Refits end at their tolerance, where rounding decides on a last step.
+        width = other.high - other.low if math.isfinite(other.high - other.low) else valley.errors.max()
+        np.testing.assert_allclose((own.low, own.high), (other.low, other.high), rtol=1e-9, atol=1e-9 * width)
+        np.testing.assert_allclose(own.points, other.points, rtol=1e-6, atol=1e-6)
+        assert own.evaluations == other.evaluations
+    chosen = profile_intervals(found.fit, problem_of(found), found.task.runs, None, 0.95)
+    assert list(chosen.intervals) == nonlinear_parameters(valley, 0.95)
 
 
 # ------------------------------------------------------------------------------------------------ closed forms
@@ -260,12 +313,14 @@ def test_progress_counts_ends_and_stops_the_work(found: ftlm.Identification) -> 
 
     with pytest.raises(KeyboardInterrupt):
         found.profile(threads=2, progress=interrupt)
-    stop = threading.Event()
+    stop = _core.Stop()
     stop.set()
-    search = likelihood_of(found).search_bound(0, 1.0, half_width(0.95), stop)
-    next(search)
+    problem = problem_of(found)
+    runs = [recording(run, problem.structure) for run in found.task.runs]
     with pytest.raises(KeyboardInterrupt):
-        search.send(1000)
+        _core.profile_intervals(problem.core, runs, fit_state(found.fit, problem), [0], half_width(0.95), stop=stop)
+    with pytest.raises(ftlm.ModelError, match="parameter 3 of 3; count them from 0"):
+        _core.profile_intervals(problem.core, runs, fit_state(found.fit, problem), [3], half_width(0.95))
 
 
 def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
@@ -302,21 +357,17 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
 
 
 def test_what_one_end_does_not_need_goes_to_the_others(found: ftlm.Identification) -> None:
-    valley = likelihood_of(found)
-    free = profile_intervals(valley, valley.names, 0.95)
+    free = intervals_of(found)
     took = {n: i.evaluations for n, i in free.intervals.items()}
     # Dealt out evenly alone, this budget would not do for the number that takes most.
     scarce = sum(took.values()) + 8 * len(took)
     assert max(took.values()) > scarce / len(took)
-    dealt = profile_intervals(valley, valley.names, 0.95, most=scarce)
+    dealt = intervals_of(found, most=scarce)
     assert dealt.incomplete_names == ()
     for name, interval in dealt.intervals.items():
         # A refit that was cut short goes on from where it was, by other steps.
         assert (interval.low, interval.high) == pytest.approx((free.intervals[name].low, free.intervals[name].high))
-    assert (
-        max(took, key=took.__getitem__)
-        in profile_intervals(valley, valley.names, 0.95, most=max(took.values())).incomplete_names
-    )
+    assert max(took, key=took.__getitem__) in intervals_of(found, most=max(took.values())).incomplete_names
 
 
 def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
@@ -344,62 +395,50 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
 def test_a_lower_optimum_on_the_way_is_gone_on_from(bent: ftlm.Run) -> None:
     u = bent["u"]
     plain = quadratic(record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9), "D^2 y = c D y + a y + b u")
-    valley = likelihood_of(plain)
-    names = list(plain.parameter_values)
-    right = profile_intervals(valley, names, 0.95).intervals
-    # As if the fit had ended a standard error beside the optimum.
-    orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-    beside = valley.grid.minimize(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
-    there = profile_intervals(replace(valley, best=beside, shift=valley.shift), names, 0.95)
+    right = intervals_of(plain).intervals
+    there = intervals_of(plain, fit=one_error_beside(plain), evaluations=1)
     assert there.lower_optimum is not None
-    np.testing.assert_allclose(there.lower_optimum, valley.best.values, rtol=1e-3)
+    assert there.lower_on_finer_grid
+    assert plain.fit is not None
+    np.testing.assert_allclose(there.lower_optimum, plain.fit.finest_grid_values, rtol=1e-3)
+    shift = dict(zip(plain.fit.names, plain.fit.values - plain.fit.finest_grid_values, strict=True))
     for name, own in there.intervals.items():
-        i = valley.names.index(name)
-        shifted = (right[name].low - valley.shift[i], right[name].high - valley.shift[i])
+        shifted = (right[name].low - shift[name], right[name].high - shift[name])
         np.testing.assert_allclose((own.low, own.high), shifted, rtol=2e-3)
 
 
 def test_a_budget_holds_for_every_optimum_on_the_way(bent: ftlm.Run) -> None:
     u = bent["u"]
     plain = quadratic(record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9), "D^2 y = c D y + a y + b u")
-    valley = likelihood_of(plain)
-    names = list(plain.parameter_values)
-    orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-    beside = valley.grid.minimize(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
-    apart = replace(valley, best=beside)
-    free = profile_intervals(apart, names, 0.95)
+    names, apart = tuple(plain.parameter_values), {"fit": one_error_beside(plain), "evaluations": 1}
+    free = intervals_of(plain, **apart)
     # It went on from a lower optimum; what it took until there counts.
     assert free.lower_optimum is not None
     assert free.evaluations > sum(i.evaluations for i in free.intervals.values())
     # As many as all ends are begun with: the way down leaves too few of them for the ends around the lower optimum.
-    least = profiling.MIN_BUDGET_PER_BOUND * 2 * len(names)
-    scarce = profile_intervals(apart, names, 0.95, most=least)
+    least = 10 * 2 * len(names)
+    scarce = intervals_of(plain, most=least, **apart)
     assert 0 < scarce.evaluations <= least
     assert scarce.lower_optimum is not None
-    assert scarce.incomplete_names == tuple(names)
-    assert profile_intervals(valley, names, 0.95, most=least).incomplete_names == ()
+    assert scarce.incomplete_names == names
+    assert intervals_of(plain, most=least).incomplete_names == ()
     # The first way down is the last that is followed, whatever the threads.
-    assert profile_intervals(apart, names, 0.95, threads=3).evaluations == free.evaluations
+    assert intervals_of(plain, threads=3, **apart).evaluations == free.evaluations
 
 
 def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     u = bent["u"]
     run = record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9)
     right = quadratic(run, "D^2 y = c D y + a y + b u")
-    at, calls = ProfileLikelihood.at.__func__, []
+    calls = []
 
-    def beside(cls: type[ProfileLikelihood], grid: object, values: np.ndarray, shift: np.ndarray) -> ProfileLikelihood:
-        valley = at(cls, grid, values, shift)
-        calls.append(values)
-        # The first is on a coarser grid, which is not taken here.
-        if len(calls) > 2:
-            return valley
-        orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
-        off = valley.grid.minimize(Iterate(orders, coefficients, "beside", {}, delays), 1, plain=True)
-        return replace(valley, best=off)
+    def beside(joint: JointFit, *arguments: object, **options: int) -> ProfileResult:
+        calls.append(joint)
+        if len(calls) > 1:
+            return profile_intervals(joint, *arguments, **options)
+        return profile_intervals(one_error_beside(right), *arguments, **options, evaluations=1)
 
-    monkeypatch.setattr(profiling.ProfileLikelihood, "at", classmethod(beside))
-    monkeypatch.setattr(profiling, "MAX_OPTIMUM_SHIFT_ERRORS", -1.0)
+    monkeypatch.setattr(profiling, "profile_intervals", beside)
     structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
     same = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
     # The fit was right all the while: its residuals do not fall, and its starts stay told.
@@ -407,8 +446,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     assert same.fit.starts == right.fit.starts
     calls.clear()
     # As if it had been lower: of one optimum found twice rounding decides which is.
-    monkeypatch.setattr("ftlm.estimation.confidence_intervals.MIN_NOISE_REDUCTION", -1.0)
-    monkeypatch.setattr("ftlm.estimation.confidence_intervals.is_lower_on_finer_grid", lambda *_: True)
+    monkeypatch.setattr(profiling, "MIN_NOISE_REDUCTION", -1.0)
     again = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
     assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
     assert "from a lower optimum" in again.details()
@@ -460,7 +498,7 @@ def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification)
 
 def test_warnings_follow_the_profile(found: ftlm.Identification) -> None:
     assert found.fit is not None
-    problem = likelihood_of(found).grid.problem
+    problem = problem_of(found)
     before = identifiability_findings(replace(found.fit, profiles={}), problem)
     after = identifiability_findings(found.fit, problem)
     assert [f for f in before if (f.code, f.parameter) == ("not_different_from_0", "c")]

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ftlm.errors import FtlmError, ModelError
+from ftlm import _core
+from ftlm.errors import ModelError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.objective import Iterate, Objective
-from ftlm.estimation.output_error import JointFit
-from ftlm.estimation.result import Identification, Task
+from ftlm.estimation.output_error import fit_state
+from ftlm.estimation.result import Identification
+from ftlm.simulation.discretization import recording
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.linalg import dot, projections, thin_svd
-from ftlm.utils.validation import Floats
+from ftlm.utils.resources import stop_flag
 
 #: Points on each axis of the cost surface, and its half-width in standard errors.
 POINTS_PER_AXIS, HALF_WIDTH_ERRORS = 11, 4.0
@@ -87,76 +87,27 @@ def output_error_landscape(
     errors = joint.standard_errors
     if not all(0 < errors[n] < math.inf for n in (first, second)):
         return None
-    around = CostSurface.of(joint, task, (first, second), refit=refit)
-    bounds = dict(zip(around.grid.problem.orders, around.grid.problem.bounds, strict=True))
-    axes = []
-    for name, k in zip((first, second), around.at, strict=True):
-        low, high = (
-            around.center[k] - HALF_WIDTH_ERRORS * errors[name],
-            around.center[k] + HALF_WIDTH_ERRORS * errors[name],
-        )
-        axes.append(np.linspace(max(low, bounds[name][0]), min(high, bounds[name][1]), POINTS_PER_AXIS))
-    scores = np.array([[around.cost(x, y) for x in axes[0]] for y in axes[1]])
-    least = min(around.residual_sum_of_squares(around.best), float(scores.min()))
+    problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
+    least, x, y, costs = _core.cost_surface(
+        problem.core,
+        [recording(run, problem.structure) for run in task.runs],
+        {**fit_state(joint, problem), "steady": False},
+        (problem.names.index(first), problem.names.index(second)),
+        (HALF_WIDTH_ERRORS * errors[first], HALF_WIDTH_ERRORS * errors[second]),
+        POINTS_PER_AXIS,
+        refit=refit,
+        evaluations=OPTIMUM_EVALUATIONS,
+        stop=stop_flag(),
+    )
+    least = min(least, float(costs.min()))
     kept = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
     i, j = names.index(first), names.index(second)
     return Landscape(
         (first, second),
-        axes[0],
-        axes[1],
-        1.0 + scores - least,
+        x,
+        y,
+        1.0 + costs - least,
         kept,
         "1 + increase of the weighted sum of squares",
         float(joint.correlation[i, j]),
     )
-
-
-@dataclass(frozen=True)
-class CostSurface:
-    """Cost surface around the optimum of a joint fit."""
-
-    grid: Objective
-    best: Iterate
-    at: list[int]
-    basis: Floats | None
-
-    @classmethod
-    def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> CostSurface:
-        """Return the surface around the optimum of the finest grid, close to the estimate."""
-        problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
-        weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
-        grid = Objective(problem, task.runs, weights, joint.refinement, robust_weights=joint.robust_weights)
-        best = _minimize_from(grid, joint.values, OPTIMUM_EVALUATIONS)
-        at = [problem.names.index(n) for n in names]
-        others = np.delete(np.asarray(best.outcome["jacobian"]), at, axis=0)
-        size = np.linalg.norm(others, axis=1, keepdims=True)
-        spanned = refit and bool(others.size)
-        scaled = others / np.where(size > 0, size, 1.0)
-        return cls(grid, best, at, thin_svd(scaled.T)[0].T if spanned else None)
-
-    @property
-    def center(self) -> Floats:
-        """Parameters at the optimum."""
-        return self.best.values
-
-    def residual_sum_of_squares(self, attempt: Iterate) -> float:
-        """Return the residual sum of squares after one linear step of all other parameters."""
-        residuals = np.asarray(attempt.outcome["residuals"])
-        if self.basis is not None:
-            residuals = residuals - self.basis.T @ projections(self.basis.T, residuals)
-        return dot(residuals, residuals)
-
-    def cost(self, x: float, y: float) -> float:
-        """Return the sum of squares at two parameter values; infinite if the simulation is not finite."""
-        values = self.center.copy()
-        values[self.at] = x, y
-        try:
-            return self.residual_sum_of_squares(_minimize_from(self.grid, values, 1))
-        except FtlmError:
-            return math.inf
-
-
-def _minimize_from(grid: Objective, values: Floats, evaluations: int) -> Iterate:
-    """Minimize the cost from given parameters."""
-    orders, coefficients, inputs = grid.problem.split(values.tolist())
-    return grid.minimize(Iterate(orders, coefficients, "landscape", {}, inputs), evaluations, plain=True)

@@ -13,10 +13,10 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import ArrayLike, NDArray
 
+from ftlm import _core
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.frequency_result import FrequencyIdentification
-from ftlm.estimation.levenberg_marquardt import LeastSquaresResult, constrained_least_squares
 from ftlm.estimation.model_checks import (
     SAME_MODEL_POWER,
     SECOND_OPTIMUM_LOG_LIKELIHOOD,
@@ -619,7 +619,7 @@ def identify_frequency(
     course.advance_to(STARTS_END_FRACTION)
     fits = []
     for values in begun:
-        fits.append(_fit(racing, values, *racing.constraints()[:2], RESIDUAL_FLOOR_RATIO**2 * total))
+        fits.append(_fit(racing, values))
         course.advance_to(
             STARTS_END_FRACTION + (MULTISTART_END_FRACTION - STARTS_END_FRACTION) * len(fits) / len(begun)
         )
@@ -634,15 +634,15 @@ def identify_frequency(
         f.cost <= first.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
     )
     # A last race from where the best ended, so that what a wall had cut goes on.
-    best = _fit_again(problem, racing, first, total)
+    best = _fit_again(problem, racing, first)
     if racing is problem and first.cost < best.cost:
         best = first
     course.advance_to(1.0)
     held = [words[k] for k in best.active_constraints]
     at_limit = [n for n in problem.exponents if exponent_bound(n) in held]
-    if at_limit and not _is_bound_significant(problem, records, best, kind, RESIDUAL_FLOOR_RATIO**2 * total):
+    if at_limit and not _is_bound_significant(problem, records, best, kind):
         held = [text for text in held if text not in map(exponent_bound, at_limit)]
-    ends = [f if racing is problem else _fit_again(problem, racing, f, total) for f in _near_optima(fits, racing, kind)]
+    ends = [f if racing is problem else _fit_again(problem, racing, f) for f in _near_optima(fits, racing, kind)]
     result = _result(
         problem,
         records,
@@ -797,22 +797,34 @@ def _user_start(
     return [begun]
 
 
-def _fit(problem: ResponseProblem, values: Floats, rows: Floats, limits: Floats, floor: float) -> LeastSquaresResult:
-    def cost(numbers: Floats) -> float:
-        left, _ = problem.residuals(numbers, slopes=False)
-        return float(left @ left)
+@dataclass(frozen=True)
+class ResponseFit:
+    """Optimum of a response problem: parameters, sum of squares, convergence, active constraints."""
 
-    if not math.isfinite(cost(values)):
-        return LeastSquaresResult(values, math.inf, False, 1, ())
-    return constrained_least_squares(problem.residuals, cost, values, rows, limits, floor=floor)
+    values: Floats
+    cost: float
+    converged: bool
+    active_constraints: Sequence[int]
 
 
-def _fit_again(
-    problem: ResponseProblem, other: ResponseProblem, end: LeastSquaresResult, total: float
-) -> LeastSquaresResult:
+def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
+    rows, limits, _ = problem.constraints()
+    size = math.sqrt(sum(float(np.sum(np.abs(r.response * r.weight) ** 2)) for r in problem.records))
+
+    def residuals(numbers: Floats) -> Floats:
+        return problem.residuals(numbers, slopes=False)[0]
+
+    if not np.all(np.isfinite(residuals(values))):
+        return ResponseFit(values, math.inf, False, ())
+    found, cost, status, _, active = _core.minimize(
+        residuals, lambda numbers: problem.residuals(numbers)[1], values, rows, limits, signal_norm=size
+    )
+    return ResponseFit(found, cost, status == "converged", active)
+
+
+def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
     """Fit from the end of a fit of another problem with the same parameters."""
-    values = problem.in_problem_units(other.in_seconds(end.values))
-    return _fit(problem, values, *problem.constraints()[:2], RESIDUAL_FLOOR_RATIO**2 * total)
+    return _fit(problem, problem.in_problem_units(other.in_seconds(end.values)))
 
 
 def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) -> float:
@@ -822,7 +834,7 @@ def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) 
     return 0.5 * count * math.log(max(cost, 1e-300) / max(best, 1e-300))
 
 
-def _near_optima(fits: Sequence[LeastSquaresResult], problem: ResponseProblem, kind: str) -> list[LeastSquaresResult]:
+def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
     """Return ends of the multistart that are nearly as likely as the best, one for each response."""
     ranked = sorted(fits, key=lambda f: f.cost)
     kept, seen = [], [problem.residuals(ranked[0].values, slopes=False)[0]]
@@ -839,11 +851,11 @@ def _near_optima(fits: Sequence[LeastSquaresResult], problem: ResponseProblem, k
 
 
 def _is_bound_significant(
-    problem: ResponseProblem, records: Sequence[FrequencyData], best: LeastSquaresResult, kind: str, floor: float
+    problem: ResponseProblem, records: Sequence[FrequencyData], best: ResponseFit, kind: str
 ) -> bool:
     """Whether exponents above their bound explain an impedance better than chance does, at 99 %."""
     free = ResponseProblem(problem.structure, records, [r.weight for r in problem.records], bound_exponents=False)
-    beyond = _fit(free, best.values, *free.constraints()[:2], floor)
+    beyond = _fit(free, best.values)
     count = 2 * sum(r.frequency.size for r in problem.records)
     return 2.0 * _log_likelihood_difference(best.cost, beyond.cost, kind, count) > chi_squared_99(1)
 
@@ -851,13 +863,13 @@ def _is_bound_significant(
 def _result(
     problem: ResponseProblem,
     records: list[FrequencyData],
-    best: LeastSquaresResult,
+    best: ResponseFit,
     kind: str,
     reached: tuple[int, int],
     held: list[str],
     *,
     exact: bool,
-    ends: Sequence[LeastSquaresResult] = (),
+    ends: Sequence[ResponseFit] = (),
 ) -> FrequencyIdentification:
     left, slopes = problem.residuals(best.values)
     steep = problem.slopes_in_seconds(best.values, slopes)

@@ -124,11 +124,6 @@ class Objective:
             for run, share in zip(self.runs, shares, strict=True)
         ]
 
-    @cached_property
-    def finer(self) -> Objective:
-        """The same objective with half the step."""
-        return replace(self, every=2 * self.every)
-
     def minimize(
         self,
         attempt: Iterate,

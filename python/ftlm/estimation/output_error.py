@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from msgspec import UnsetType
@@ -375,6 +375,21 @@ def fit_output_error(
         initial_terms=found["initial_terms"],
         unstable_optimum=None if found["growth"] is None else UnstableOptimum(*found["growth"]),
     )
+
+
+def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:
+    """Return a fit in the form in which the core takes up its objective."""
+    # If an unstable optimum was left, its valley is not that of the fit.
+    steady = joint.unstable_optimum is not None and not joint.unstable_optimum.is_accepted
+    return {
+        "estimate": joint.values,
+        "on_grid": joint.finest_grid_values,
+        "weights": [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs],
+        "shares": joint.robust_weights,
+        "every": joint.refinement,
+        "settled": joint.step_converged,
+        "steady": steady,
+    }
 
 
 def start_from_values(problem: FreeProblem, values: Mapping[str, float]) -> Iterate:

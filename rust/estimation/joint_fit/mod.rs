@@ -15,6 +15,7 @@ pub mod multistart;
 pub mod objective;
 pub mod parameter_set;
 pub mod problem;
+pub mod profile;
 pub mod progress;
 pub mod reweighting;
 pub mod stability_preference;

@@ -12,9 +12,12 @@ use crate::error::Result;
 use crate::linalg::dense;
 use crate::linalg::orthogonal::norm;
 use crate::linalg::small::{self, back_substitute};
+use crate::signal::statistics::inner;
 
 /// Smallest damping; below it the rounding error of the factor dominates.
 pub(crate) const MIN_DAMPING: f64 = 1e-12;
+/// Distance from a linear constraint, in the change of the residuals relative to their norm, up to which it is active.
+const ACTIVE_CONSTRAINT_TOLERANCE: f64 = 1e-9;
 
 /// Linearization of a problem at a point: R of [J | e] with J in coordinates and unit columns, and the free parameters.
 ///
@@ -29,6 +32,8 @@ pub(crate) struct LinearizedProblem {
     gradient: Vec<f64>,
     /// Distances from the bounds, in scaled steps.
     distance_to_bounds: Vec<(f64, f64)>,
+    /// Linear inequality constraints on scaled steps: unit normal, and largest product with a step.
+    constraints: Vec<(Vec<f64>, f64)>,
     /// True for parameters excluded from the steps.
     is_fixed: Vec<bool>,
     /// Number of eliminated parameters.
@@ -67,6 +72,15 @@ impl LinearizedProblem {
         let scaled = |(down, up): (f64, f64), scale: f64| (down * scale, up * scale);
         let distance_to_bounds: Vec<(f64, f64)> =
             order.iter().zip(&scales).map(|(&i, &scale)| scaled(problem.distance_to_bounds(point, i), scale)).collect();
+        let constraints = (problem.constraints(point).into_iter())
+            .map(|(normal, room)| {
+                let unscaled = |(&i, &scale): (&usize, &f64)| if scale > 0.0 { normal[i] / scale } else { 0.0 };
+                let turned: Vec<f64> = order.iter().zip(&scales).map(unscaled).collect();
+                let size = norm(&turned);
+                let (size, room) = if size > 0.0 { (size, room / size) } else { (1.0, f64::INFINITY) };
+                (turned.iter().map(|v| v / size).collect(), room)
+            })
+            .collect();
         let is_fixed = (distance_to_bounds.iter().zip(&gradient).enumerate())
             .map(|(place, (&(down, up), &g))| {
                 let out = if g > 0.0 { down <= 0.0 } else { up <= 0.0 };
@@ -79,22 +93,45 @@ impl LinearizedProblem {
             scales,
             gradient,
             distance_to_bounds,
+            constraints,
             is_fixed,
             eliminated_count,
             norm: norm(residuals),
         }
     }
 
-    /// Largest gradient component of a free parameter.
+    /// Largest gradient component of a free parameter, without what points out of active constraints.
     pub(crate) fn max_gradient(&self) -> f64 {
-        self.gradient.iter().zip(&self.is_fixed).filter(|(_, held)| !**held).fold(0.0, |a, (g, _)| a.max(g.abs()))
+        let mut gradient = self.gradient.clone();
+        for (k, multiplier) in self.active_constraints() {
+            gradient.iter_mut().zip(&self.constraints[k].0).for_each(|(g, n)| *g += multiplier * n);
+        }
+        gradient.iter().zip(&self.is_fixed).filter(|(_, held)| !**held).fold(0.0, |a, (g, _)| a.max(g.abs()))
+    }
+
+    /// True if a linear inequality constrains the steps.
+    pub(crate) fn is_constrained(&self) -> bool {
+        !self.constraints.is_empty()
+    }
+
+    /// Constraints against which the gradient pushes, with their multipliers.
+    pub(crate) fn active_constraints(&self) -> Vec<(usize, f64)> {
+        let near = |k: &usize| self.constraints[*k].1 <= ACTIVE_CONSTRAINT_TOLERANCE * self.norm;
+        let active: Vec<usize> = (0..self.constraints.len()).filter(near).collect();
+        let free = |values: &[f64]| values.iter().zip(&self.is_fixed).map(|(v, f)| if *f { 0.0 } else { *v }).collect();
+        let normals: Vec<Vec<f64>> = active.iter().map(|&k| free(&self.constraints[k].0)).collect();
+        let downhill: Vec<f64> = self.gradient.iter().map(|g| -g).collect();
+        let multipliers = small::nonnegative_solution(&normals, &free(&downhill));
+        active.into_iter().zip(multipliers).filter(|(_, multiplier)| *multiplier > 0.0).collect()
     }
 
     /// Minimize ‖J s + e‖² + λ‖s‖² over the free parameters within bounds; return the step and its relative decrease of
     /// the cost.
     pub(crate) fn damped_step_and_decrease(&self, damping: f64) -> (Vec<f64>, f64) {
         let step = self
-            .step_within_bounds(|held| Some(triangular_damped_step(&self.r, held, self.eliminated_count, damping)))
+            .step_within_bounds(|held| {
+                Some(triangular_damped_step(&self.r, held, self.eliminated_count, damping, &self.constraints))
+            })
             .unwrap_or_default();
         let falls = self.predicted_decrease(&step, 0);
         (step, falls)
@@ -209,8 +246,14 @@ impl LinearizedProblem {
 
 /// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for fixed parameters.
 ///
-/// Eliminated parameters have the smallest damping.
-fn triangular_damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<f64> {
+/// Eliminated parameters have the smallest damping. Constraints hold normal · s ≤ room.
+fn triangular_damped_step(
+    r: &[f64],
+    held: &[bool],
+    projected: usize,
+    damping: f64,
+    constraints: &[(Vec<f64>, f64)],
+) -> Vec<f64> {
     let (k, free) = (held.len(), (0..held.len()).filter(|&j| !held[j]).collect::<Vec<_>>());
     if free.is_empty() {
         return vec![0.0; k];
@@ -235,9 +278,47 @@ fn triangular_damped_step(r: &[f64], held: &[bool], projected: usize, damping: f
     let q = dense::triangular_factor(&columns);
     let stride = free.len() + 1;
     let rhs: Vec<f64> = (0..free.len()).map(|i| q[i * stride + free.len()]).collect();
+    let mut solved = back_substitute(&q, stride, &rhs);
+    let own: Vec<(Vec<f64>, f64)> =
+        constraints.iter().map(|(normal, room)| (free.iter().map(|&j| normal[j]).collect(), room.max(0.0))).collect();
+    if own.iter().any(|(normal, room)| inner(normal, &solved) > *room) {
+        solved = constrained_solution(&q, stride, &rhs, &own);
+    }
     let mut step = vec![0.0; k];
-    free.iter().zip(back_substitute(&q, stride, &rhs)).for_each(|(&j, s)| step[j] = s);
+    free.iter().zip(solved).for_each(|(&j, s)| step[j] = s);
     step
+}
+
+/// Minimize ‖R x − rhs‖ for upper-triangular R under normal · x ≤ room, where x = 0 is feasible.
+///
+/// In z = R x − rhs it is a problem of least distance, which nonnegative least squares solve (Lawson & Hanson,
+/// doi:10.1137/1.9781611971217, §23.4).
+fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(Vec<f64>, f64)]) -> Vec<f64> {
+    let (k, size) = (rhs.len(), norm(rhs));
+    let unconstrained = back_substitute(r, stride, rhs);
+    let columns: Vec<Vec<f64>> = (constraints.iter())
+        .filter(|(normal, room)| room.is_finite() && normal.iter().any(|v| *v != 0.0))
+        .map(|(normal, room)| {
+            // −R⁻ᵀ normal, with the distance from the constraint below it.
+            let mut column: Vec<f64> = Vec::with_capacity(k + 1);
+            for i in 0..k {
+                let before: f64 = (0..i).map(|l| r[l * stride + i] * column[l]).sum();
+                column.push((-normal[i] - before) / r[i * stride + i]);
+            }
+            let length = norm(&column);
+            column.push((inner(normal, &unconstrained) - room) / size);
+            column.iter().map(|v| v / length).collect()
+        })
+        .collect();
+    let mut target = vec![0.0; k + 1];
+    target[k] = 1.0;
+    let weights = small::nonnegative_solution(&columns, &target);
+    let mut rest: Vec<f64> = target.iter().map(|v| -v).collect();
+    for (column, weight) in columns.iter().zip(&weights) {
+        rest.iter_mut().zip(column).for_each(|(v, c)| *v += weight * c);
+    }
+    let moved: Vec<f64> = rhs.iter().zip(&rest).map(|(b, v)| b - size * v / rest[k]).collect();
+    back_substitute(r, stride, &moved)
 }
 
 /// Nonlinear least-squares problem.
@@ -290,6 +371,11 @@ pub trait Problem {
     /// Distance of a parameter from its lower and upper bound, in its coordinate.
     fn distance_to_bounds(&self, _point: &Self::Point, _parameter: usize) -> (f64, f64) {
         (f64::INFINITY, f64::INFINITY)
+    }
+
+    /// Linear inequality constraints on steps from a point: normal, in the coordinates, and largest product with a step.
+    fn constraints(&self, _point: &Self::Point) -> Vec<(Vec<f64>, f64)> {
+        Vec::new()
     }
 
     /// True if the cost can have kinks along a parameter, so that its gradient need not vanish at a minimum.

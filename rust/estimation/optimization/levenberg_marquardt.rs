@@ -2,7 +2,8 @@
 //!
 //! Columns are scaled by the column norms of the Jacobian. Steps follow from a QR factor of [J | e] with the damping
 //! below it. A rejected step costs no Jacobian. The problem defines the coordinates and bounds of its parameters.
-//! Parameters at an active bound are excluded from step and gradient.
+//! Parameters at an active bound are excluded from step and gradient. Under linear inequality constraints a step solves
+//! the damped linear problem within them.
 //!
 //! If Gauss–Newton predicts the decrease of the cost badly, secant updates of the second-order part are used. Along an
 //! ill-conditioned valley, several steps are extrapolated.
@@ -329,7 +330,10 @@ impl<P: Problem> Search<'_, P> {
                     (at.point, at.evaluation, at.cost, at.jacobian, at.trusted) =
                         (next, found, reached, slopes, trusts);
                     let told = linear.predicted_decrease(&step, first);
-                    at.curvature.select_model(told, told - linear.curvature_change(&step, &at.curvature), self.gain);
+                    if !linear.is_constrained() {
+                        let with = told - linear.curvature_change(&step, &at.curvature);
+                        at.curvature.select_model(told, with, self.gain);
+                    }
                     at.before = Some((steps.clone(), linear.gradient_by_parameter()));
                     if self.gain >= ACCEPTABLE_GAIN_RATIO * falls {
                         at.damping = (at.damping / DAMPING_FACTOR).max(MIN_DAMPING);

@@ -53,7 +53,7 @@ impl JointMultistart {
 }
 
 /// Runs as source of a fit.
-fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
+pub(super) fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
     let outputs: Vec<usize> = free.structure.equations.iter().map(|e| e.output).collect();
     recordings(runs, free.structure.signals.len(), &outputs, free.structure.inputs.len())
 }

@@ -1,0 +1,194 @@
+//! Profile likelihood of a joint fit: bounds of the intervals on which the cost rises by no more than the noise explains.
+//!
+//! At each value of one parameter all others are refitted (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al.,
+//! doi:10.1093/bioinformatics/btp358). [`ProfileLikelihood`] is the cost around an optimum, [`BoundSearch`] one bound.
+
+mod bound_search;
+mod likelihood;
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::channel;
+
+use super::progress::ProgressListener;
+use crate::error::Result;
+use crate::parallel::pool;
+use crate::signal::statistics::median;
+
+pub use bound_search::{BoundSearch, Interval, Outcome};
+pub use likelihood::{CostSurface, FitState, ProfileLikelihood, MAX_REFIT_EVALUATIONS};
+
+use bound_search::MAX_REFITS_PER_BOUND;
+
+/// Largest relative error of a bound of the Wald interval, from one linear step of all other parameters. Above it the
+/// parameter is profiled.
+const MAX_QUADRATIC_ERROR: f64 = 0.1;
+/// Smallest budget of simulations with which the search for a bound continues.
+const MIN_BUDGET_PER_BOUND: usize = 10;
+/// A lower optimum is reported if the sum of squares falls by more than this fraction of one standard error's rise.
+const MIN_COST_REDUCTION: f64 = 0.1;
+/// Largest number of lower optima from which the search continues.
+const MAX_LOWER_OPTIMA: usize = 5;
+
+/// Which parameters are profiled, how far, and with which resources.
+#[derive(Debug, Clone)]
+pub struct ProfileSettings {
+    /// Parameters; None for those whose Wald interval is inaccurate.
+    pub parameters: Option<Vec<usize>>,
+    /// Half-width of the interval, in standard deviations.
+    pub width: f64,
+    /// Budget of simulations for all bounds, and the least one with which each bound is begun; None for no limit.
+    pub budget: Option<(usize, usize)>,
+    /// Threads; results do not depend on it.
+    pub threads: usize,
+}
+
+/// Profile-likelihood intervals, and any lower optimum found on the way.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ProfileResult {
+    /// Interval of each profiled parameter.
+    pub intervals: Vec<(usize, Interval)>,
+    /// Parameters of an optimum with a significantly lower cost than the fit.
+    pub lower_optimum: Option<Vec<f64>>,
+    /// True if that optimum is lower on the next finer grid as well.
+    pub lower_on_finer_grid: bool,
+    /// Parameters whose profile needed more simulations than allowed.
+    pub incomplete: Vec<usize>,
+    /// Total number of simulations.
+    pub evaluations: usize,
+}
+
+/// Compute profile-likelihood intervals around an optimum.
+///
+/// Each bound is searched from the optimum independently. After a lower optimum the search starts again around it. The
+/// budget is distributed evenly, and the unused part goes to the bounds that are not found yet. A parameter that the
+/// data do not determine has the whole line as its interval. Progress is (bounds found, all bounds).
+///
+/// # Errors
+/// [`Error::Interrupted`](crate::error::Error::Interrupted), those of the listener, and of a covariance.
+pub fn profile_intervals(
+    start: ProfileLikelihood<'_>,
+    settings: &ProfileSettings,
+    report: &ProgressListener<'_>,
+) -> Result<ProfileResult> {
+    let parameters = match &settings.parameters {
+        Some(given) => given.clone(),
+        None => {
+            let mut inaccurate = Vec::new();
+            for i in 0..start.size() {
+                if start.nonlinearity(i, settings.width)? > MAX_QUADRATIC_ERROR {
+                    inaccurate.push(i);
+                }
+            }
+            inaccurate
+        }
+    };
+    if settings.budget.is_some_and(|(most, least)| least.saturating_mul(2 * parameters.len()) > most) {
+        return Ok(ProfileResult { incomplete: parameters, ..ProfileResult::default() });
+    }
+    let (cost, mut around, mut spent) = (start.cost(), start, 0);
+    let mut bounds = Vec::new();
+    for _ in 0..MAX_LOWER_OPTIMA {
+        let budget = settings.budget.map(|(most, _)| most.saturating_sub(spent));
+        let found = search_bounds(&around, &parameters, settings, budget, report)?;
+        (bounds, spent) = (found.bounds, spent + found.evaluations);
+        let Some(lower) = found.lower else { break };
+        // The limit for step 0 of another optimum is not known.
+        around = around.moved_to(&lower)?;
+    }
+    let units: Vec<f64> = around.units.iter().copied().filter(|unit| unit.is_finite()).collect();
+    let falls = !units.is_empty() && 2.0 * (cost - around.cost()) > MIN_COST_REDUCTION * median(units);
+    let mut result = ProfileResult { evaluations: spent, ..ProfileResult::default() };
+    if falls {
+        result.lower_optimum = Some(around.values());
+        result.lower_on_finer_grid = around.is_lower_on_finer_grid()?;
+    }
+    for i in parameters {
+        let own: Vec<&(usize, Option<Interval>)> = bounds.iter().filter(|(of, _)| *of == i).collect();
+        if own.iter().any(|(_, found)| found.is_none()) {
+            result.incomplete.push(i);
+            continue;
+        }
+        let sides = own.into_iter().filter_map(|(_, found)| found.clone());
+        let whole = sides.reduce(Interval::intersect).unwrap_or_else(Interval::whole_line);
+        result.intervals.push((i, whole.shift(around.shift[i], around.bounds()[i])));
+    }
+    Ok(result)
+}
+
+/// Bounds that were found, the optimum below that ended the search, and the number of simulations.
+struct FoundBounds {
+    bounds: Vec<(usize, Option<Interval>)>,
+    lower: Option<Vec<f64>>,
+    evaluations: usize,
+}
+
+/// Search both bounds of every identifiable parameter.
+///
+/// The search stops at the first lower optimum, because the other bounds would belong to the wrong optimum.
+fn search_bounds(
+    around: &ProfileLikelihood<'_>,
+    parameters: &[usize],
+    settings: &ProfileSettings,
+    budget: Option<usize>,
+    report: &ProgressListener<'_>,
+) -> Result<FoundBounds> {
+    let sides = parameters.iter().filter(|&&i| around.is_identifiable(i)).flat_map(|&i| [(i, -1.0), (i, 1.0)]);
+    let mut searches: Vec<BoundSearch> =
+        sides.map(|(i, side)| BoundSearch::new(around, i, side, settings.width)).collect();
+    let total = searches.len();
+    let mut bounds: Vec<(usize, Option<Interval>)> = searches.iter().map(|search| (search.parameter, None)).collect();
+    let (workers, first_lower) = (pool(settings.threads.max(1))?, AtomicUsize::new(usize::MAX));
+    let mut took = vec![0; total];
+    let mut lower = None;
+    while bounds.iter().any(|(_, found)| found.is_none()) {
+        let open = bounds.iter().filter(|(_, found)| found.is_none()).count();
+        // In whole rounds, so that what a bound may take does not depend on the number of threads.
+        let share = budget.map_or(2 * MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND, |most| {
+            most.saturating_sub(took.iter().sum()) / open
+        });
+        if share < MIN_BUDGET_PER_BOUND {
+            break;
+        }
+        let (send, receive) = channel();
+        let mut outcomes: Vec<Option<Outcome>> = (0..total).map(|_| None).collect();
+        workers.in_place_scope(|scope| {
+            for (k, search) in searches.iter_mut().enumerate().filter(|(k, _)| bounds[*k].1.is_none()) {
+                let (send, allowed, first_lower) = (send.clone(), took[k] + share, &first_lower);
+                scope.spawn(move |_| {
+                    let found = search.advance(around, allowed, &|| first_lower.load(Ordering::Relaxed) < k);
+                    if matches!(found, Ok(Outcome::Lower(_))) {
+                        first_lower.fetch_min(k, Ordering::Relaxed);
+                    }
+                    drop(send.send((k, found)));
+                });
+            }
+            drop(send);
+            let mut done = total - open;
+            for (k, found) in receive {
+                let found = found.inspect_err(|_| around.stop().set())?;
+                if let Outcome::Found(_) = found {
+                    done += 1;
+                    report(done, total).inspect_err(|_| around.stop().set())?;
+                }
+                outcomes[k] = Some(found);
+            }
+            Ok(())
+        })?;
+        for (k, outcome) in outcomes.into_iter().enumerate() {
+            let Some(outcome) = outcome else { continue };
+            took[k] = searches[k].evaluations();
+            match outcome {
+                Outcome::Found(interval) => bounds[k].1 = Some(interval),
+                Outcome::Paused => {}
+                Outcome::Lower(values) => {
+                    lower = Some(values);
+                    break;
+                }
+            }
+        }
+        if lower.is_some() {
+            break;
+        }
+    }
+    Ok(FoundBounds { bounds, lower, evaluations: took.iter().sum() })
+}

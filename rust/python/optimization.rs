@@ -1,0 +1,132 @@
+//! Binding of Levenberg–Marquardt for residuals that Python computes.
+
+use std::cell::RefCell;
+
+use numpy::{PyArray1, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+
+use super::convert::{copy_vector, rows, vector};
+use super::errors::run_attached;
+use super::estimation::status;
+use crate::error::{check_length, Error, Result};
+use crate::estimation::optimization::damped_step::{LinearizedProblem, Problem};
+use crate::estimation::optimization::levenberg_marquardt::{minimize as find_minimum, Settings};
+use crate::signal::statistics::inner;
+
+/// Excess over a constraint that rounding of a step causes: relative to the step, and for values of about 1.
+const CONSTRAINT_TOLERANCE: f64 = 1e-9;
+const CONSTRAINT_ROUNDING: f64 = 1e-14;
+
+/// Relative decrease of the sum of squares by a full step at convergence, somewhat above rounding.
+const COST_REDUCTION_TOLERANCE: f64 = 1e-14;
+
+/// Residuals and Jacobian by Python callbacks, under rows · values ≤ limits.
+struct CallbackProblem<'py> {
+    residuals: Bound<'py, PyAny>,
+    jacobian: Bound<'py, PyAny>,
+    rows: Vec<Vec<f64>>,
+    limits: Vec<f64>,
+    signal_norm: f64,
+    /// Exception of a callback.
+    raised: RefCell<Option<PyErr>>,
+}
+
+impl<'py> CallbackProblem<'py> {
+    /// Result of a callback at these values.
+    fn call<T>(
+        &self,
+        callback: &Bound<'py, PyAny>,
+        values: &[f64],
+        convert: impl Fn(Bound<'py, PyAny>) -> PyResult<T>,
+    ) -> Result<T> {
+        let argument = PyArray1::from_slice(callback.py(), values);
+        callback.call1((argument,)).and_then(convert).map_err(|error| {
+            *self.raised.borrow_mut() = Some(error);
+            Error::Interrupted
+        })
+    }
+}
+
+impl Problem for CallbackProblem<'_> {
+    type Point = Vec<f64>;
+    type Evaluation = Vec<f64>;
+
+    fn evaluate(&self, point: &Vec<f64>) -> Result<Vec<f64>> {
+        self.call(&self.residuals, point, |found| {
+            copy_vector("residuals", &found.extract::<PyReadonlyArray1<'_, f64>>()?)
+        })
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Vec<f64>) -> &'a [f64] {
+        evaluation
+    }
+
+    fn jacobian(&self, point: &Vec<f64>, evaluation: &Vec<f64>) -> Result<Vec<Vec<f64>>> {
+        let found = self.call(&self.jacobian, point, |found| rows(&found.extract::<PyReadonlyArray2<'_, f64>>()?))?;
+        check_length("rows of the Jacobian", evaluation.len(), found.len())?;
+        found.iter().try_for_each(|row| check_length("a row of the Jacobian", point.len(), row.len()))?;
+        if let Some(index) = found.iter().position(|row| row.iter().any(|v| !v.is_finite())) {
+            return Err(Error::Diverged { what: "Jacobian".into(), index });
+        }
+        Ok((0..point.len()).map(|k| found.iter().map(|row| row[k]).collect()).collect())
+    }
+
+    fn apply_step(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
+        let mut share: f64 = 1.0;
+        for (row, room) in self.constraints(point) {
+            let towards = inner(&row, steps);
+            let size: f64 = row.iter().zip(steps).map(|(a, s)| (a * s).abs()).sum();
+            if towards - room > CONSTRAINT_TOLERANCE * size + CONSTRAINT_ROUNDING {
+                share = share.min(room / towards);
+            }
+        }
+        let next: Vec<f64> = point.iter().zip(steps).map(|(x, s)| x + share * s).collect();
+        let moved = steps.iter().zip(&next).map(|(s, x)| (share * s).abs() / x.abs().max(f64::MIN_POSITIVE));
+        (next.clone(), moved.fold(0.0, f64::max))
+    }
+
+    fn constraints(&self, point: &Vec<f64>) -> Vec<(Vec<f64>, f64)> {
+        let room = |(row, limit): (&Vec<f64>, &f64)| (row.clone(), (limit - inner(row, point)).max(0.0));
+        self.rows.iter().zip(&self.limits).map(room).collect()
+    }
+
+    fn signal_norm(&self, _: &Vec<f64>) -> f64 {
+        self.signal_norm
+    }
+}
+
+/// Values, sum of squares, termination status, number of evaluations, active constraints.
+type MinimumTuple<'py> = (Bound<'py, PyArray1<f64>>, f64, &'static str, usize, Vec<usize>);
+
+/// Minimize a sum of squares from a feasible initial guess under rows · values ≤ limits.
+#[pyfunction]
+#[pyo3(signature = (residuals, jacobian, start, rows, limits, *, signal_norm=0.0, evaluations=120))]
+#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+pub fn minimize<'py>(
+    py: Python<'py>,
+    residuals: Bound<'py, PyAny>,
+    jacobian: Bound<'py, PyAny>,
+    start: PyReadonlyArray1<'py, f64>,
+    rows: PyReadonlyArray2<'py, f64>,
+    limits: PyReadonlyArray1<'py, f64>,
+    signal_norm: f64,
+    evaluations: usize,
+) -> PyResult<MinimumTuple<'py>> {
+    let (start, limits) = (vector("start", &start)?, vector("limits", &limits)?);
+    let rows = super::convert::rows(&rows)?;
+    check_length("limits", rows.len(), limits.len())?;
+    rows.iter().try_for_each(|row| check_length("a row of the constraints", start.len(), row.len()))?;
+    let problem = CallbackProblem { residuals, jacobian, rows, limits, signal_norm, raised: RefCell::new(None) };
+    let found = run_attached(|| {
+        let found = find_minimum(&problem, start, Settings { evaluations, tolerance: COST_REDUCTION_TOLERANCE })?;
+        let linear = LinearizedProblem::at(&problem, &found.point, &found.jacobian, &found.evaluation, false);
+        let active = linear.active_constraints().into_iter().map(|(k, _)| k).collect::<Vec<_>>();
+        Ok((found, active))
+    });
+    if let Some(error) = problem.raised.take() {
+        return Err(error);
+    }
+    let (found, active) = found?;
+    let values = PyArray1::from_vec(py, found.point);
+    Ok((values, 2.0 * found.cost, status(found.status), found.evaluations, active))
+}
