@@ -444,7 +444,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "output_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output}: residuals are not white| (Ljung-Box {statistic:.3g} over {lags} lags, 99 % limit {limit:.3g}): the "
+        "{output}: residuals are not white| (statistic {statistic:.3g} over {lags} lags, 99 % limit {limit:.3g}): the "
         "model leaves something out",
     ),
     "residuals_follow_input": FindingKind(

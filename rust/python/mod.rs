@@ -48,8 +48,8 @@ mod _core {
     #[pymodule_export]
     use crate::python::joint_fit::{
         autocovariances, chi_squared, covariance_of, filter_autocovariances, fit_covariance, is_white, joint_fit,
-        joint_multistart, long_run_covariance, refine_candidates, whitening_filter, JointMultistart, JointProblem,
-        JointTimeScaling,
+        joint_multistart, long_run_covariance, portmanteau, refine_candidates, whitening_filter, JointMultistart,
+        JointProblem, JointTimeScaling,
     };
 
     #[pymodule_export]

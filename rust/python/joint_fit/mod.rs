@@ -9,5 +9,5 @@ pub use fit::{joint_fit, joint_multistart, refine_candidates, JointMultistart};
 pub use problem::{JointProblem, JointTimeScaling};
 pub use residuals::{
     autocovariances, chi_squared, covariance_of, filter_autocovariances, fit_covariance, is_white, long_run_covariance,
-    whitening_filter,
+    portmanteau, whitening_filter,
 };
