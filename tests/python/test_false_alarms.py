@@ -176,6 +176,7 @@ def alarms_of_panel(seeds: Iterable[int]) -> tuple[dict[str, list[ordinary.Recor
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_false_alarms_on_a_panel_of_ordinary_records():
     said, loops_said, count = alarms_of_panel(PANEL_SEEDS)
     kinds = (*ordinary.INPUTS, *ordinary.NOISES)
