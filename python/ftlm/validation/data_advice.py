@@ -299,6 +299,9 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
             continue
         before = float(y[at] - y[at - WRAP_SLOPE])
         after = float(y[at + 1 + WRAP_SLOPE] - y[at + 1])
+        if any(_jumps_near(run[n], at) for n in run.inputs):
+            # A measured current follows its command, which jumps.
+            continue
         # Both slopes oppose the jump: the quantity continued while its counter restarted.
         stays = max(abs(before), abs(after)) < 0.5 * abs(steps[at])
         if stays and before * steps[at] < 0 and after * steps[at] < 0:
@@ -309,6 +312,12 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
     turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
     numbers = {"size": _with_unit(run, name, size), "turn": turn, "times": _times(len(rows)), "first": rows[0]}
     yield make_finding("wrap", run=run.name, output=name, **numbers)
+
+
+def _jumps_near(u: Floats, at: int) -> bool:
+    """Whether an input moves by more than the share of its range that a wrap has, within a row of this one."""
+    near = np.abs(np.diff(u[at - 1 : at + 3]))
+    return bool(np.any(near > WRAP_SHARE * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
