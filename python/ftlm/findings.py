@@ -444,7 +444,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "output_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output}: residuals are not white| (Ljung-Box {statistic:.3g} over {lags} lags, 99 % limit {limit:.3g}): the "
+        "{output}: residuals are not white| (statistic {statistic:.3g} over {lags} lags, 99 % limit {limit:.3g}): the "
         "model leaves something out",
     ),
     "residuals_follow_input": FindingKind(
@@ -834,6 +834,23 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "lost",
         LEVEL_WITH_CARE,
         "the chosen structure predicts worse than the mean of what was left out on {parts}",
+    ),
+    "fractional_orders_gain": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "fractional orders earn their place ({parameter}): on {parts} that were not fitted they gain {gain:.2g} points "
+        "of fit over {other}, and no part loses",
+    ),
+    "fractional_orders_gain_nothing": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "fractional orders gain nothing that counts ({parameter}): {gain:.2g} points of fit over {other}, on {parts} "
+        "that were not fitted",
+    ),
+    "fractional_orders_not_told": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "whether fractional orders earn their place ({parameter}) cannot be told: {reason}",
     ),
     "not_told_by_part": FindingKind(
         "untold", LEVEL_FACT, "{parameter}: not told by some part, so any other agrees with it"

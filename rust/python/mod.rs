@@ -49,8 +49,8 @@ mod _core {
     #[pymodule_export]
     use crate::python::joint_fit::{
         autocovariances, chi_squared, cost_surface, covariance_of, filter_autocovariances, fit_covariance, is_white,
-        joint_fit, joint_multistart, long_run_covariance, profile_intervals, refine_candidates, whitening_filter,
-        JointMultistart, JointProblem, JointTimeScaling,
+        joint_fit, joint_multistart, long_run_covariance, portmanteau, profile_intervals, refine_candidates,
+        whitening_filter, JointMultistart, JointProblem, JointTimeScaling,
     };
 
     #[pymodule_export]

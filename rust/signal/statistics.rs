@@ -106,10 +106,8 @@ pub fn median(mut values: Vec<f64>) -> f64 {
 pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
     let (mut sums, mut pairs) = (vec![0.0; most + 1], vec![0.0; most + 1]);
     for values in series {
-        let there: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
-        let centre = if there.is_empty() { 0.0 } else { mean(&there) };
-        let x: Vec<f64> = values.iter().map(|v| if v.is_nan() { 0.0 } else { v - centre }).collect();
-        let gaps = there.len() < values.len();
+        let x = subtract_mean(values);
+        let gaps = values.iter().any(|v| v.is_nan());
         let known: Vec<f64> = if gaps { values.iter().map(|v| f64::from(!v.is_nan())).collect() } else { Vec::new() };
         for lag in 0..(most + 1).min(x.len()) {
             sums[lag] += inner(&x[lag..], &x[..x.len() - lag]);
@@ -120,23 +118,61 @@ pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
     (sums, pairs)
 }
 
-/// Whether autocorrelations up to some lags are consistent with white noise: Ljung–Box test at 1 %.
+/// A series about its own mean, 0 at missing samples.
+fn subtract_mean(values: &[f64]) -> Vec<f64> {
+    let there: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
+    let center = if there.is_empty() { 0.0 } else { mean(&there) };
+    values.iter().map(|v| if v.is_nan() { 0.0 } else { v - center }).collect()
+}
+
+/// Sum over lags of (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)², chi-squared with as many degrees of freedom for white noise.
 ///
-/// With missing samples each correlation has the variance of its own pairs.
+/// The variance of noise may change within the series: that of each lag is estimated from the products themselves
+/// (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). Each series is centered on its own mean, and the results
+/// are pooled. NaN counts as a missing sample.
+///
+/// ```
+/// // Noise that changes its sign at random is white, however its size changes.
+/// let mut state = 1_u32;
+/// let mut sign = || {
+///     state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+///     if state >> 31 == 0 { 1.0 } else { -1.0 }
+/// };
+/// let e: Vec<f64> = (0..2000).map(|t| sign() * if t % 100 < 10 { 1.0 } else { 0.01 }).collect();
+/// assert!(ftlm::signal::statistics::portmanteau(&[&e], 25) < 44.3);
+/// let slow: Vec<f64> = e.windows(2).map(|pair| pair[0] + pair[1]).collect();
+/// assert!(ftlm::signal::statistics::portmanteau(&[&slow], 25) > 44.3);
+/// ```
+#[must_use]
+pub fn portmanteau(series: &[&[f64]], lags: usize) -> f64 {
+    let all: Vec<Vec<f64>> = series.iter().map(|values| subtract_mean(values)).collect();
+    let largest = all.iter().flatten().fold(0.0_f64, |most, v| most.max(v.abs()));
+    if largest == 0.0 {
+        return 0.0;
+    }
+    // Relative to the largest value, whose fourth power is in the range of numbers.
+    let all: Vec<Vec<f64>> = all.iter().map(|x| x.iter().map(|v| v / largest).collect()).collect();
+    let squares: Vec<Vec<f64>> = all.iter().map(|x| x.iter().map(|v| v * v).collect()).collect();
+    let summed = |parts: &[Vec<f64>], lag: usize| -> f64 {
+        parts.iter().filter(|x| x.len() > lag).map(|x| inner(&x[lag..], &x[..x.len() - lag])).sum()
+    };
+    let of = |lag: usize| {
+        let (product, power) = (summed(&all, lag), summed(&squares, lag));
+        if power > 0.0 {
+            product * product / power
+        } else {
+            0.0
+        }
+    };
+    (1..=lags).map(of).sum()
+}
+
+/// Whether a series is consistent with white noise: [`portmanteau`] test at 1 %; true if it is too short for the lags.
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn is_white(series: &[f64], lags: usize) -> bool {
-    if series.len() <= lags + 1 {
-        return true;
-    }
-    let (covariances, pairs) = autocovariances(&[series], lags);
-    if pairs[0] <= (lags + 1) as f64 {
-        return true;
-    }
-    let power = covariances[0] * pairs[0];
-    let of = |lag: usize| covariances[lag] * pairs[lag] / if power > 0.0 { power } else { 1.0 };
-    let summed: f64 = (1..=lags).map(|lag| of(lag) * of(lag) / pairs[lag].max(1.0)).sum();
-    (pairs[0] + 2.0) * pairs[0] * summed <= chi_squared(lags as f64, NORMAL_99)
+    let there = series.iter().filter(|v| !v.is_nan()).count();
+    there <= lags + 1 || portmanteau(&[series], lags) <= chi_squared(lags as f64, NORMAL_99)
 }
 
 /// Quantile of chi-squared at the level of a normal `quantile`, by Wilson and Hilferty.

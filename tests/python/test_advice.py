@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from ftlm import rig
 from ftlm.validation.data_advice import spectral_lines
 from measured import DATA, needs_data
 
@@ -85,6 +86,12 @@ def test_injected_faults_are_found_and_clean_runs_raise_no_alarm():
     assert alarms == []
     recall = {fault: found[fault] / count for fault, count in injected.items()}
     assert min(recall.values()) >= 0.95, recall
+
+
+def test_a_measured_current_that_follows_its_command_is_no_encoder_that_wraps():
+    for seed in range(2):
+        run = rig.record(input="prbs", period=0.05, duration=6, seed=seed)
+        assert "wrap" not in run.advice().codes
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -181,6 +181,31 @@ def test_a_loop_is_found_beside_its_reference():
         assert fed("open, coloured", seed).state == "command"
 
 
+def integral_loop(seed, gain, deviation, colour, every):
+    """A lag of 0.5 s under an integral controller that reads it with noise: the input and the noise."""
+    rng = np.random.default_rng([seed, 5])
+    reference = np.repeat(rng.choice([-1.0, 1.0], loops.ROWS // every + 1), every)[: loops.ROWS]
+    noise = deviation * loops.coloured(rng, loops.ROWS, colour)
+    pole, y, collected = np.exp(-loops.STEP / 0.5), 0.0, 0.0
+    u = np.zeros(loops.ROWS)
+    for k in range(loops.ROWS):
+        collected += gain * loops.STEP * (reference[k] - y - noise[k])
+        u[k] = collected
+        y = pole * y + (1 - pole) * collected
+    return u, noise
+
+
+@pytest.mark.parametrize(
+    ("gain", "deviation", "colour", "every"),
+    [(1.0, 0.1, 0.0, 100), (3.0, 0.1, 0.9, 100), (1.0, 0.02, 0.9, 100), (1.0, 0.1, 0.9, 2000), (0.2, 0.1, 0.9, 100)],
+)
+def test_an_integral_controller_is_no_command(gain, deviation, colour, every):
+    # Its own past holds all that it answered before: the noise of the same row alone is new.
+    for seed in range(3):
+        u, noise = integral_loop(seed, gain, deviation, colour, every)
+        assert feedback_test([noise], [u]).state in ("found", "cannot be told")
+
+
 def test_several_short_runs_are_pooled():
     pulse = np.diff(np.concatenate([[0.0], loops.step_response(400)]))
     runs = [loops.loop("closed, coloured", seed, rows=400) for seed in range(4)]

@@ -61,3 +61,36 @@ def test_an_input_that_no_equation_reads_is_named_with_the_option(seed):
     design = ftlm.design_input(found, duration=20.0)
     assert [f.code for f in design.findings] == ["prediction_in_doubt"]
     assert "v" in design.findings[0].text
+
+
+def weighed(found):
+    """Levels, codes and levels of verdict, which no name or unit may change."""
+    return found.verdict().level, sorted((f.level, f.code) for f in found.findings)
+
+
+@pytest.mark.parametrize("fault", ["none", "order", "outliers", "noise"])
+def test_verdicts_do_not_depend_on_names_scales_or_the_order_of_runs(fault):
+    def runs_of(inside="u", outside="y", names=("first", "second"), scale=(1.0, 1.0)):
+        runs = []
+        for k, name in enumerate(names):
+            g = np.random.default_rng([k, 9])
+            u = np.concatenate([np.zeros(10), steps(g, 600)])
+            y = (
+                lag(u)
+                if fault != "order"
+                else lsim(lti([9.0], [1.0, 1.0, 9.0]), u, STEP * np.arange(u.size), interp=False)[1]
+            )
+            y = y + (2.0 if fault == "noise" else 0.02) * np.std(y) * g.standard_normal(u.size)
+            if fault == "outliers":
+                y[g.choice(np.arange(20, 600), 6)] += 5 * np.std(y)
+            columns = {"inputs": {inside: scale[0] * u}, "outputs": {outside: scale[1] * y}}
+            runs.append(ftlm.Run.from_arrays(step=STEP, name=name, **columns))
+        return runs
+
+    usual = weighed(ftlm.identify(runs_of(), ftlm.equation("D y = a y + b u")))
+    # Names that messages contain.
+    named = runs_of("not_white", "residuals", ("outliers", "a closed loop"))
+    assert weighed(ftlm.identify(named, ftlm.equation("D residuals = a residuals + b not_white"))) == usual
+    scaled = runs_of(scale=(2.0**-10, 2.0**12))
+    assert weighed(ftlm.identify(scaled, ftlm.equation("D y = a y + b u"))) == usual
+    assert weighed(ftlm.identify(runs_of()[::-1], ftlm.equation("D y = a y + b u"))) == usual

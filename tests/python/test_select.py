@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import friction
 import ftlm
+import loops
 from ftlm.cli.main import app
 from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, name_candidates
 from ftlm.structure_selection.cross_validation import (
@@ -242,6 +243,38 @@ def test_what_was_chosen_from_rest_is_judged_on_a_run_in_motion(runs):
     theirs = ftlm.identify(whole.window(0, 8.0), found.winner.structure).validate(late).fit_percent["y"]
     assert ours > 95.0
     assert abs(ours - theirs) < 0.1
+
+
+def relaxing(alpha, noise, seed, rows=400):
+    """D^alpha y = -0.8 y + 1.6 u with white noise."""
+    rng = np.random.default_rng([seed, 3])
+    u = np.repeat(rng.choice([-1.0, 1.0], rows // 15 + 1), 15)[:rows]
+    y = loops.convolved(np.diff(u, prepend=0.0), 2 * (1 - loops.relaxation(0.1 * np.arange(rows), alpha, 0.8)))
+    y += noise * np.std(y) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": y}, name=f"run {seed}")
+
+
+@pytest.mark.parametrize(
+    ("alpha", "noise", "rival", "code"),
+    [
+        (0.7, 0.01, True, "fractional_orders_gain"),
+        (0.98, 0.05, True, "fractional_orders_gain_nothing"),
+        (0.7, 0.01, False, "fractional_orders_not_told"),
+    ],
+)
+def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival, code):
+    candidates = {"free": ftlm.equation("D^alpha y = a y + b u")}
+    if rival:
+        candidates["lag"] = ftlm.equation("D y = a y + b u")
+    found = ftlm.select([relaxing(alpha, noise, 0), relaxing(alpha, noise, 1)], candidates)
+    assert found.winner.name == "free"
+    (said,) = [f for f in found.findings if f.code.startswith("fractional_orders")]
+    assert said.code == code
+    assert f"alpha = {found.best.orders['alpha']:.3g}" in said.text
+    if rival:
+        free, lag = (next(t for t in found.trials if t.name == name) for name in ("free", "lag"))
+        gains = [free.parts[p] - lag.parts[p] for p in lag.parts]
+        assert said.numbers["gain"] == pytest.approx(np.median(gains))
 
 
 def test_auto_has_an_equation_of_each_order(runs):

@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.reproduction.cross_validation import (
-    MIN_FIT_GAIN,
-    improves_prediction,
-    link_structure,
-    orders_on_unseen_runs,
-    stages_in,
-)
+from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction
+from ftlm.reproduction.cross_validation import link_structure, orders_on_unseen_runs, stages_in
 from ftlm.reproduction.report import places_table, sentence, unseen_page, unseen_text
 from test_cli import ftlm_command
 

@@ -12,7 +12,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.analysis.poles import modes
 from ftlm.data.run import Run
-from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing
+from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, interpolate_gaps
 from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
@@ -35,15 +35,16 @@ MAX_PARAMETER_CORRELATION = 0.995
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
 #: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
 MAX_RELATIVE_STANDARD_ERROR = 0.1
-#: An output is early if it leaves its level by so many standard deviations of its noise before its input can act.
-EARLY_SIGMAS = 4.0
+#: An output is early if it leaves its level by so many standard deviations of its noise before its input can act, by a
+#: part of a row that its slope tells. Earlier by more, it would leave its level in the row before.
+EARLY_SIGMAS, EARLY_ROWS = 4.0, (0.1, 1.5)
 #: Outliers are reported from this number and this fraction of all residuals, or if they hold this fraction of the
 #: squares, which doubles the variance of every parameter.
 MIN_OUTLIERS = 3
 MIN_OUTLIER_FRACTION = 2e-3
 MIN_OUTLIER_POWER_FRACTION = 0.5
-#: Smallest share of rows with motion whose residuals measure the usual size.
-MIN_MOVING_SHARE = 0.1
+#: Residuals of so many rows of about the same speed measure the usual one at that speed.
+ROWS_OF_ONE_SPEED = 25
 #: Quantization step in noise standard deviations above which residuals are dominated by rounding.
 QUANTIZATION_NOISE_RATIO = 2.0
 #: Largest deviation of a value from a multiple of the quantization step, as a fraction of the step.
@@ -208,7 +209,7 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
         noise = joint.noise[output]
         if noise <= NEGLIGIBLE_RESIDUAL_SHARE * size:
             continue
-        findings += _outlier_findings(runs, joint, output)
+        findings += _outlier_findings(runs, problem.structure, joint, output)
         findings += _quantization_findings(runs, problem.structure, output, noise)
     kept = [
         run.name for run in runs if run.sample_times is not None and not has_nonuniform_samples(run, problem.structure)
@@ -260,32 +261,39 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
         y, level = run[item.output], evidence.levels[item.output]
         noise = noise_at_start(y)
         early, slope = float(y[row]) - level, float(y[row + 1] - y[row])
-        if abs(early) > EARLY_SIGMAS * noise and early * slope > 0:
-            numbers = {"row": row, "size": abs(early) / noise, "rows": early / slope}
+        rows = early / slope if slope else math.inf
+        if abs(early) > EARLY_SIGMAS * noise and EARLY_ROWS[0] <= rows <= EARLY_ROWS[1]:
+            numbers = {"row": row, "size": abs(early) / noise, "rows": rows}
             inputs = join_names([t.signal for t in driven])
             about = {"run": run.name, "output": item.output, "input": inputs}
             findings.append(make_finding("moves_before_input", **about, **numbers))
     return findings
 
 
-def _outlier_findings(runs: Sequence[Run], joint: JointFit, output: str) -> list[Finding]:
+def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit, output: str) -> list[Finding]:
     """Return a finding on outliers, unless a robust loss was used."""
     if joint.robust is not None:
         return []
-    every = drop_missing(np.concatenate([part[output] for part in joint.residuals]))
-    # Where a machine stands still its residuals are rounding, and no measure of the others.
-    moved = [_moving_residuals(run, output, part[output]) for run, part in zip(runs, joint.residuals, strict=True)]
-    usual = robust_deviation(drop_missing(np.concatenate(moved)))
-    far, first = 0, ""
-    for run, part in zip(runs, joint.residuals, strict=True):
-        rows = np.flatnonzero(np.abs(part[output]) > OUTLIER_DEVIATIONS * usual)
+    # In the unit of the output.
+    series = [joint.noise[output] * part[output] for part in joint.residuals]
+    every = drop_missing(np.concatenate(series))
+    measured = [compared_values(run, structure, output) for run in runs]
+    speeds = [_simulated_speeds(y, part) for y, part in zip(measured, series, strict=True)]
+    usual = _usual_deviations(np.concatenate(series), np.concatenate(speeds))
+    power, far, first = 0.0, 0, ""
+    limits = np.split(OUTLIER_DEVIATIONS * usual, np.cumsum([part.size for part in series])[:-1])
+    for run, part, limit in zip(runs, series, limits, strict=True):
+        rows = np.flatnonzero(np.abs(part) > limit)
+        power += float(np.sum(part[rows] ** 2))
         if rows.size and not far:
             # Compared rows begin behind the first one.
             first = f"first at row {int(rows[0]) + 1} of {run.name}"
         far += rows.size
     count = every.size
-    share = float(np.sum(every[np.abs(every) > OUTLIER_DEVIATIONS * usual] ** 2) / max(dot(every, every), 1e-300))
-    if usual == 0.0 or (share < MIN_OUTLIER_POWER_FRACTION and far < max(MIN_OUTLIERS, MIN_OUTLIER_FRACTION * count)):
+    share = power / max(dot(every, every), 1e-300)
+    if not np.any(usual > 0.0) or (
+        share < MIN_OUTLIER_POWER_FRACTION and far < max(MIN_OUTLIERS, MIN_OUTLIER_FRACTION * count)
+    ):
         return []
     verb, holds, noun = ("lies", "holds", "an outlier") if far == 1 else ("lie", "hold", "outliers")
     return [
@@ -304,11 +312,26 @@ def _outlier_findings(runs: Sequence[Run], joint: JointFit, output: str) -> list
     ]
 
 
-def _moving_residuals(run: Run, output: str, residuals: Floats) -> Floats:
-    """Return the residuals of rows in which the output changed, or all residuals if there are too few such rows."""
-    changed = np.flatnonzero(np.diff(run[output]) != 0)
-    changed = changed[changed < residuals.size]
-    return residuals[changed] if changed.size >= MIN_MOVING_SHARE * residuals.size else residuals
+def _simulated_speeds(measured: Floats, residuals: Floats) -> Floats:
+    """Change of a simulated output around each inner sample, which outliers of the measured one do not move."""
+    simulated = interpolate_gaps(measured[1 : 1 + residuals.size] - residuals)
+    steps = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
+    return np.maximum(steps[:-1], steps[1:])
+
+
+def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
+    """Deviation of the residuals of each row, robustly: of all rows, or if it is larger, of those of its speed.
+
+    Noise that grows with speed (an error of timing, a rate, a gain) is no outlier. Nor is all that moves, where a
+    machine stands still for a part of the run.
+    """
+    usual = np.full(residuals.size, robust_deviation(drop_missing(residuals)))
+    known = np.flatnonzero(~np.isnan(residuals))
+    for rows in np.array_split(
+        known[np.argsort(speeds[known], kind="stable")], max(known.size // ROWS_OF_ONE_SPEED, 1)
+    ):
+        usual[rows] = np.maximum(usual[rows], robust_deviation(residuals[rows]))
+    return usual
 
 
 def _quantization_findings(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> list[Finding]:

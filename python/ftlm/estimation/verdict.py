@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from statistics import median
 from typing import Any
 
 from markupsafe import Markup
@@ -29,6 +30,8 @@ TRUST_LEVEL = "trust"
 MAX_COEFFICIENT_ERROR_RATIO, MAX_ORDER_ERROR = 0.5, 0.25
 #: Limits of the validation loss: ratio to the estimation loss, and percentage below which the ratio does not matter.
 VALIDATION_LOSS_LIMITS = ((3.0, 10.0), (5.0, 5.0))
+#: Smallest significant difference in fit on a validation run [percentage points].
+MIN_FIT_GAIN = 0.5
 #: NR below which a model explains something of an output that noise buries.
 MAX_BURIED_RESIDUAL = 0.99
 UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
@@ -258,6 +261,41 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
             spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
             yield make_finding("swing_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=spread)
             return
+
+
+def is_degenerate(result: Identification) -> bool:
+    """Whether a fit must not be used by itself, so that no comparison with it says anything."""
+    return result.verdict().level == LEVEL_DO_NOT_USE
+
+
+def have_common_value(intervals: Any) -> bool:
+    """Whether all intervals have a value in common."""
+    each = list(intervals)
+    return not each or max(low for low, _ in each) <= min(high for _, high in each)
+
+
+def improves_prediction(
+    gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
+) -> bool | None:
+    """Whether fractional orders improve the prediction, from their gains on validation runs and their intervals.
+
+    True if every estimation run excludes an integer order, the runs are consistent, no validation run loses, and the
+    median gain is significant. False if no gain is significant, or if no run excludes an integer order and the median
+    gain is not significant. Otherwise None.
+    """
+    runs = list(next(iter(intervals.values()), {}))
+    told = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
+    counts = median(gains) >= MIN_FIT_GAIN
+    if (
+        all(told)
+        and counts
+        and min(gains) > -MIN_FIT_GAIN
+        and all(have_common_value(e.values()) for e in intervals.values())
+    ):
+        return True
+    if max(gains) < MIN_FIT_GAIN or (not any(told) and not counts):
+        return False
+    return None
 
 
 def is_buried(residuals: OutputResiduals) -> bool:

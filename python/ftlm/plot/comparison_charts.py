@@ -276,7 +276,7 @@ def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
         judged = f"largest bar at lags from 0 on {number(test.statistic)}, limit {number(test.limit)}"
         return f"{bars} The residual {word} earlier {signal}: {judged} (99 %, both through the whitening filter)."
     word = "could be" if test.passed else "is not"
-    judged = f"Ljung-Box sum {number(test.statistic)}, limit {number(test.limit)}"
+    judged = f"statistic {number(test.statistic)}, limit {number(test.limit)}"
     return f"{bars} The residual {word} white noise: {judged} (99 %)."
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from statistics import median
 from typing import Any
 
 from ftlm.arm.flexible_link import flexible_link
@@ -13,7 +12,7 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.result import Identification
-from ftlm.findings import LEVEL_DO_NOT_USE
+from ftlm.estimation.verdict import MIN_FIT_GAIN, have_common_value, improves_prediction, is_degenerate
 from ftlm.progress import Progress
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run
 from ftlm.structure.structure import Structure
@@ -36,8 +35,6 @@ WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 MOST_ROWS = 1250
 #: Label of the structures of ``Deflection.before``.
 WITHOUT_RATE_LABEL = "without the rate of the other deflection"
-#: Smallest significant difference in fit on a validation run [percentage points].
-MIN_FIT_GAIN = 0.5
 
 
 @dataclass(frozen=True)
@@ -183,41 +180,6 @@ class Deflection:
         if degenerate:
             words += f" On {', '.join(degenerate)} one of the two fits must not be used, so nothing follows from it."
         return Verdict(kind, earns, words)
-
-
-def is_degenerate(result: Identification) -> bool:
-    """Whether a fit must not be used by itself, so that no comparison with it says anything."""
-    return result.verdict().level == LEVEL_DO_NOT_USE
-
-
-def have_common_value(intervals: Any) -> bool:
-    """Whether all intervals have a value in common."""
-    each = list(intervals)
-    return not each or max(low for low, _ in each) <= min(high for _, high in each)
-
-
-def improves_prediction(
-    gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
-) -> bool | None:
-    """Whether fractional orders improve the prediction, from their gains on validation runs and their intervals.
-
-    True if every estimation run excludes an integer order, the runs are consistent, no validation run loses, and the
-    median gain is significant. False if no gain is significant, or if no run excludes an integer order and the median
-    gain is not significant. Otherwise None.
-    """
-    runs = list(next(iter(intervals.values()), {}))
-    told = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
-    counts = median(gains) >= MIN_FIT_GAIN
-    if (
-        all(told)
-        and counts
-        and min(gains) > -MIN_FIT_GAIN
-        and all(have_common_value(e.values()) for e in intervals.values())
-    ):
-        return True
-    if max(gains) < MIN_FIT_GAIN or (not any(told) and not counts):
-        return False
-    return None
 
 
 def _range(low: float, high: float) -> str:

@@ -16,10 +16,10 @@ from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_e
 from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import improves_prediction, is_degenerate
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.cross_validation import improves_prediction, is_degenerate
 from ftlm.reproduction.published_values import INNOVATION_LENGTHS
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
 from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, RIVAL_ALPHA, TRACE_EVERY, Stage

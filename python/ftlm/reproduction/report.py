@@ -13,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import MIN_FIT_GAIN
 from ftlm.model.model import Model
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import comparison_charts, pulse_times
@@ -25,7 +26,6 @@ from ftlm.reproduction.claims import ReproductionData, claims, deviation_in_word
 from ftlm.reproduction.cross_validation import (
     FREE_ORDERS_BY_KIND,
     INTEGER_KIND,
-    MIN_FIT_GAIN,
     WITHOUT_RATE_LABEL,
     Deflection,
     UnseenOrders,

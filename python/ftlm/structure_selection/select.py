@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from statistics import median
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify
-from ftlm.findings import make_finding
+from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degenerate
+from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
@@ -34,6 +37,10 @@ from ftlm.utils.validation import check_threads
 
 #: Integer values of the highest order of the candidates.
 AUTOMATIC_ORDERS = (1, 2, 3, 4)
+#: Mean fit [%] of validation data below which a candidate is not the machine.
+MIN_VALIDATION_FIT = 50.0
+#: Difference of an order from an integer that is none.
+INTEGER_TOLERANCE = 1e-9
 
 
 def automatic_structures(runs: Sequence[Run], output: str | None = None) -> list[Structure]:
@@ -238,16 +245,17 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
     ]
     best, winner = ranked[0], _winner([ranked[k] for k in near])
     found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
-    findings = []
+    findings: list[Finding] = []
     if winner.joint is not None and found.fit is not None and found.fit.noise:
         lower = [o for o, v in found.fit.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
         if lower:
             findings.append(make_finding("other_optimum", output=", ".join(lower)))
-    if winner.validation_fit < 50.0:
+    if winner.validation_fit < MIN_VALIDATION_FIT:
         findings.append(make_finding("none_is_the_machine", fit=format_fit(winner.validation_fit)))
     worse = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
     if worse:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
+    findings += _fractional_order_findings(winner, ranked, found)
     return Selection(
         tuple(ranked),
         ranked.index(winner),
@@ -257,6 +265,42 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
         work.done_count,
         tuple(findings),
     )
+
+
+def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Identification) -> list[Finding]:
+    """Return a finding on whether the fractional orders of the chosen candidate earn their place.
+
+    The rule is that of ``ftlm orders``, on parts that were not fitted, against the best candidate whose orders are all
+    integers, with delays and offsets as far as candidates have them.
+    """
+    orders = {n: v for n, v in winner.values.items() if n in winner.structure.order_names and n in found.orders}
+    if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
+        return []
+    named = ", ".join(f"{n} = {found.orders[n]:.3g}" for n in orders)
+    rival = next((t for t in ranked if t.failed is None and _has_integer_orders(t.structure)), None)
+    if rival is None or set(rival.parts) != set(winner.parts):
+        reason = "no candidate with integer orders was fitted"
+        return [make_finding("fractional_orders_not_told", parameter=named, reason=reason)]
+    gains = [fit - rival.parts[name] for name, fit in winner.parts.items()]
+    parts = f"{len(gains)} part{'s' if len(gains) > 1 else ''}"
+    about = {"parameter": named, "other": rival.name, "parts": parts, "gain": median(gains)}
+    if is_degenerate(found) or rival.unstable or not rival.validation_fit >= MIN_VALIDATION_FIT:
+        reason = f"the fit of {rival.name}, or of the chosen candidate, must not be used"
+        return [make_finding("fractional_orders_not_told", reason=reason, **about)]
+    intervals = {n: {"all": found.intervals[n]} for n in orders if n in found.intervals}
+    whole = {n: float(round(orders[n])) for n in intervals}
+    gained = improves_prediction(gains, intervals, whole) if intervals else None
+    if gained is None:
+        lost = min(gains) <= -MIN_FIT_GAIN
+        reason = f"over {rival.name} some parts gain, and others {'lose' if lost else 'do not'}"
+        return [make_finding("fractional_orders_not_told", reason=reason, **about)]
+    return [make_finding("fractional_orders_gain" if gained else "fractional_orders_gain_nothing", **about)]
+
+
+def _has_integer_orders(structure: Structure) -> bool:
+    """Whether all orders of a structure are fixed integers."""
+    orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
+    return not any(o.names or abs(o.constant - round(o.constant)) > INTEGER_TOLERANCE for o in orders)
 
 
 def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:

@@ -106,12 +106,14 @@ def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Float
     return covariances * pairs / (power if power > 0 else 1.0), pairs
 
 
-def ljung_box(correlations: Floats, pairs: Floats) -> float:
-    """Ljung-Box statistic of autocorrelations at lags from 0 with their numbers of pairs.
+def portmanteau(series: Sequence[Floats], most: int) -> float:
+    """Statistic of whiteness over lags 1 to ``most``, chi-squared with as many degrees of freedom for white noise.
 
-    With missing samples each correlation has the variance of its own pairs.
+    The variance of the noise may change within a series: each lag has the variance of its own products (Lobato,
+    Nankervis and Savin, doi:10.1111/1468-2354.00106). Box and Pierce's sum takes a machine that stands still for a part
+    of the run for color.
     """
-    return float((pairs[0] + 2.0) * pairs[0] * np.sum(correlations[1:] ** 2 / np.maximum(pairs[1:], 1.0)))
+    return _core.portmanteau(series, most)
 
 
 def chi_squared(degrees: int, level: float) -> float:
@@ -137,7 +139,7 @@ def variance_inflation(series: Floats) -> float:
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:
-    """Whether the Ljung-Box test up to ``lags`` accepts white noise at the 1 % level."""
+    """Whether :func:`portmanteau` accepts white noise at the 1 % level."""
     return _core.is_white(series, lags)
 
 

@@ -37,6 +37,8 @@ MAX_INPUT_CORRELATION = 0.999
 MIN_USEFUL_SAMPLES = 100
 #: An output that is constant for longer than this share of the run while an input moves is a dead channel.
 DEAD_SHARE = 0.005
+#: Share of the rows of a rest, at its end, in which an input may already have moved: a dead time.
+DEAD_TIME_SHARE = 0.1
 MIN_DEAD_SAMPLES = 50
 #: Consecutive samples at an extreme that count as clipped, and the share of the run from which it is reported.
 MIN_CLIPPED_SAMPLES = 3
@@ -188,9 +190,10 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     # is legitimate.
     if _entered_steeply(y, first, rows):
         return
-    # The row in which an input moves is one of rest, too: the output answers later.
-    held = [run[n][first : first + rows - 1] for n in run.inputs]
-    ends = [run[n][first + rows - 1 : first + rows + 1] for n in run.inputs]
+    # The rows in which an input moves are of rest, too: the output answers later, after a dead time much later.
+    late = max(1, int(DEAD_TIME_SHARE * rows))
+    held = [run[n][first : first + rows - late] for n in run.inputs]
+    ends = [run[n][first + rows - late : first + rows + 1] for n in run.inputs]
     moved = any(np.any(after != before[0]) for before, after in zip(held, ends, strict=True))
     without_input = not any(values[0] for values in held)
     if all(np.ptp(values) == 0 for values in held) and (without_input or (first == 0 and moved)):
@@ -296,6 +299,9 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
             continue
         before = float(y[at] - y[at - WRAP_SLOPE])
         after = float(y[at + 1 + WRAP_SLOPE] - y[at + 1])
+        if any(_jumps_near(run[n], at) for n in run.inputs):
+            # A measured current follows its command, which jumps.
+            continue
         # Both slopes oppose the jump: the quantity continued while its counter restarted.
         stays = max(abs(before), abs(after)) < 0.5 * abs(steps[at])
         if stays and before * steps[at] < 0 and after * steps[at] < 0:
@@ -306,6 +312,12 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
     turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
     numbers = {"size": _with_unit(run, name, size), "turn": turn, "times": _times(len(rows)), "first": rows[0]}
     yield make_finding("wrap", run=run.name, output=name, **numbers)
+
+
+def _jumps_near(u: Floats, at: int) -> bool:
+    """Whether an input moves by more than the share of its range that a wrap has, within a row of this one."""
+    near = np.abs(np.diff(u[at - 1 : at + 3]))
+    return bool(np.any(near > WRAP_SHARE * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:

@@ -321,6 +321,8 @@ class _Innovations:
         driven = [np.concatenate([_lags(u, 0, output_lags, self.start) for u in inputs])]
         self.residuals = self._stack_rows(outputs)
         answer = _project_out(np.column_stack([*own, *driven, *beside, *levels]), self.residuals)
+        earlier = [columns[:, 1:] for columns in driven]
+        self.present = _project_out(np.column_stack([*own, *earlier, *beside, *levels]), self.residuals)
         self.noise = robust_deviation(answer)
         self.output_innovation = np.clip(answer / max(self.noise, 1e-300), -OUTPUT_CLIP, OUTPUT_CLIP)
         memory = SLOW_FORGETTING * (1 - SLOW_FORGETTING) ** np.arange(SLOW_MEMORY_ROWS)
@@ -375,12 +377,16 @@ class _Innovations:
     def test(self) -> FeedbackTest:
         """Run the test and the gates that an innovation must pass."""
         count = self.inputs.size
-        if self.scale < PREDICTED_SHARE:
-            return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
-        if self.noise < QUIET_SHARE:
-            return FeedbackTest("none", "the output has no noise that could come back", rows=count)
-        clipped = np.clip(self.innovation / self.scale, -INPUT_CLIP, INPUT_CLIP)
+        clipped = np.clip(self.innovation / max(self.scale, 1e-300), -INPUT_CLIP, INPUT_CLIP)
         clipped = clipped - clipped.mean()
+        if robust_deviation(self.present) < QUIET_SHARE:
+            return FeedbackTest("none", "the output has no noise that could come back", rows=count)
+        now = self._present_ratio(clipped)
+        at_once = f"it moves with the output of the same row (ratio {now:.2g}): a controller, or a feedthrough"
+        if self.scale < PREDICTED_SHARE or self.noise < QUIET_SHARE:
+            if now > 1:
+                return FeedbackTest("cannot be told", at_once, rows=count)
+            return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
         ratio, columns, rows = self._ratio(0, clipped)
         target = clipped[rows]
         fitted = columns @ minimum_norm_solution(columns, target, 1e-12)
@@ -400,10 +406,10 @@ class _Innovations:
             doubt = "its innovations follow its past here and there, as a sweep's do"
         if doubt and ratio <= PLACEBO_RATIO_IN_DOUBT:
             return result("cannot be told", doubt)
-        if ratio <= 1:
-            return result("none")
-        if count * share * self.scale**2 < MIN_FEEDBACK_POWER:
-            return result("none", "too little to matter")
+        if ratio <= 1 or count * share * self.scale**2 < MIN_FEEDBACK_POWER:
+            if now > 1:
+                return result("cannot be told", at_once)
+            return result("none", "" if ratio <= 1 else "too little to matter")
         if self._ratio_with_noisy_input(rows) <= 1:
             return result("cannot be told", "a loop, or noise in the measured input")
         # A loop acts all the time. Two signals that were made beforehand agree on one stretch by chance.
@@ -417,6 +423,16 @@ class _Innovations:
         if ratio < (PLACEBO_RATIO_IN_DOUBT * max(placebo, 1.0) if doubt else PLACEBO_RATIO * placebo):
             return result("cannot be told", doubt or f"outputs far back explain as much (ratio {placebo:.2g})")
         return result("found")
+
+    def _present_ratio(self, clipped: Floats) -> float:
+        """Statistic over its limit of the output's innovation of the same row, which an integral controller answers.
+
+        Such an input shows in its own past all that it answered before, so that past outputs add nothing to it.
+        """
+        size = max(robust_deviation(self.present), 1e-300)
+        present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)
+        column = _project_out(self.past, present[:, None], self.weights)
+        return _score_ratio(clipped, column / max(float(np.linalg.norm(column)), 1e-300))
 
     def _ratio_with_noisy_input(self, rows: NDArray[np.intp]) -> float:
         """Least ratio if the measured input had noise: corrected least squares, over shares of the largest noise.

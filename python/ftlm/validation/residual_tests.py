@@ -23,6 +23,7 @@ from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, symbol_html
+from ftlm.utils.linalg import dot
 from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
     NORMAL_99,
@@ -31,7 +32,7 @@ from ftlm.utils.statistics import (
     autoregression,
     chi_squared_99,
     is_constant,
-    ljung_box,
+    portmanteau,
     whiten_series,
 )
 from ftlm.utils.validation import Floats, whole_number
@@ -57,7 +58,7 @@ class CorrelationTest:
     band
         Half-width of the 99 % band of one correlation.
     statistic, limit
-        Test statistic and its 99 % limit for a true model. Whiteness: the Ljung-Box sum over all positive lags.
+        Test statistic and its 99 % limit for a true model. Whiteness: the sum over all positive lags.
         Independence: the largest correlation at lags >= 0, against a simultaneous band for all of them.
     passed
         Whether the test is conclusive and the statistic within its limit; False if the residuals are not finite.
@@ -301,14 +302,16 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
 
     Notes
     -----
-    Whiteness: the 99 % band of one autocorrelation of white noise is 2.576/√N; the verdict is the sum of Ljung and Box
-    (doi:10.1093/biomet/65.2.297) over all lags against the 99 % quantile of χ². Independence: residuals and input pass
+    Whiteness: the 99 % band of one autocorrelation of white noise is 2.576/√N; the verdict is the sum over all
+    lags of (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)² against the 99 % quantile of χ² (Lobato, Nankervis and Savin,
+    doi:10.1111/1468-2354.00106), so that noise may change its size within a run. Independence: residuals and input pass
     the filter that makes the residuals white, an autoregression of least Bayesian information criterion; raw
     correlations of two slow signals are so wide by chance that a missing dead time hides in them (Box and Jenkins,
     chapter 11). The filter is causal, so an input that follows the residuals stays later than they are. The variance of
     one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), taken no smaller than for
-    white residuals; the verdict is the largest correlation at lags >= 0 against the band that holds for all of them
-    together with 99 % (Šidák). Where the model has no feedthrough and lag 0 alone is outside, the input answers within
+    white residuals, nor than the mean of Σ eₜ² uₜ₋ₖ² over all lags, which noise that grows with the input widens; the
+    verdict is the largest correlation at lags >= 0 against the band that holds for all of them together with 99 %
+    (Šidák). Where the model has no feedthrough and lag 0 alone is outside, the input answers within
     a sample or feeds through, and the verdict is that of the other lags. Loops: see :class:`ftlm.FeedbackTest`.
     A test with a limit above 1, or with a constant input, is inconclusive. Both tests use the
     simulation: white equation errors prove nothing.
@@ -409,10 +412,9 @@ def _failed_test(lags: NDArray[np.int64]) -> CorrelationTest:
 
 
 def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
-    """Ljung-Box test of whiteness."""
+    """Test of whiteness that allows for noise of any size at any time."""
     limit = chi_squared_99(lags)
-    own, pairs = autocorrelations(series, lags)
-    statistic = ljung_box(own, pairs)
+    own, statistic = autocorrelations(series, lags)[0], portmanteau(series, lags)
     band = NORMAL_99 / math.sqrt(count)
     return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
 
@@ -424,12 +426,23 @@ def _independence(
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
         return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, conclusive=False)
-    cross, variance, _ = _core.correlation(white, whiten_series(signal, colour), lags)
-    spread, largest = math.sqrt(variance), float(np.max(np.abs(cross[lags + first :])))
+    through = whiten_series(signal, colour)
+    cross, variance, _ = _core.correlation(white, through, lags)
+    # Noise that is larger where the input moves widens correlations as its color does.
+    spread = math.sqrt(max(variance, _product_variance(white, through, lags)))
+    largest = float(np.max(np.abs(cross[lags + first :])))
     limit = NormalDist().inv_cdf(1 - (1 - (1 - SIGNIFICANCE_LEVEL) ** (1 / (lags + 1 - first))) / 2) * spread
     decided = limit < 1.0
     passed = decided and largest <= limit
     return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
+
+
+def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> float:
+    """Mean variance of the correlations at lags from 0, from the squares of their own products."""
+    powers = [(e * e, v * v) for e, v in zip(white, (v - v.mean() for v in signal), strict=True)]
+    total = sum(float(e.sum()) for e, _ in powers) * sum(float(v.sum()) for _, v in powers)
+    each = [sum(dot(e[k:], v[: e.size - k]) for e, v in powers if e.size > k) for k in range(lags + 1)]
+    return float(np.mean(each)) / total if total > 0 else 0.0
 
 
 def failed_tests(tests: Residuals) -> list[Finding]:
@@ -487,7 +500,7 @@ def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
         judged += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
         rows += [[symbol_html(name), what, t.statistic, t.limit, t.verdict] for what, t in judged]
     note = (
-        "Whiteness: Ljung-Box sum over all lags. Independence: largest correlation at lags from 0 on, residual and "
+        "Whiteness: sum over all lags. Independence: largest correlation at lags from 0 on, residual and "
         "input through the filter that whitens the residual. One true model in a hundred fails each. Undecided: the "
         "test could not have failed."
     )

@@ -11,5 +11,5 @@ pub use problem::{JointProblem, JointTimeScaling};
 pub use profile::{cost_surface, profile_intervals};
 pub use residuals::{
     autocovariances, chi_squared, covariance_of, filter_autocovariances, fit_covariance, is_white, long_run_covariance,
-    whitening_filter,
+    portmanteau, whitening_filter,
 };

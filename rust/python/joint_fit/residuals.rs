@@ -114,6 +114,17 @@ pub fn autocovariances<'py>(
     Ok((PyArray1::from_vec(py, sums), PyArray1::from_vec(py, pairs)))
 }
 
+/// Statistic of whiteness over all lags up to `lags`, chi-squared for white noise of any variance.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn portmanteau(py: Python<'_>, series: List<PyReadonlyArray1<'_, f64>>, lags: usize) -> PyResult<f64> {
+    let series = copy_vectors("series", &series)?;
+    let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(lags.max(1));
+    run_interruptible(py, points, None, move |_| {
+        Ok(statistics::portmanteau(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), lags))
+    })
+}
+
 /// Whether autocorrelations of a series are consistent with white noise.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
