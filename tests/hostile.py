@@ -28,8 +28,15 @@ LARGE = 1 << 34
 ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
 #: Where a fit is told how often it may evaluate its cost, which it does; an attack asks it to so often at most.
 EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10, "JointProblem.minimize": 4}, 2000
-#: Where a count multiplies other sizes: pulses a sample, rows of up to 128 states.
-COUNTS, MOST_COUNT = {"Recording.experiment": 0, "state_space_respond": 5}, 1 << 12
+#: Where a count multiplies other sizes, and the most of it: pulses a sample, pulses of a simulation, rows of up to 128
+#: states.
+COUNTS = {
+    "Recording.experiment": (0, 1 << 12),
+    "OutputSimulation.samples": (0, 1 << 12),
+    "OutputSimulation.refine": (2, 1 << 12),
+    "OutputSimulation.fit_friction_terms": (1, 16),
+    "state_space_respond": (5, 1 << 12),
+}
 
 
 class OursError(Exception):
@@ -316,7 +323,7 @@ class Sound:
         }
         return (told,)
 
-    def recording_new(self, inputs=()):
+    def recording_new(self, inputs=(), *, uniform=False):
         """A run of the structure of `joint_problem_new`."""
         rows = 33
         channel = {"nonuniform": None, "delay": None, "limits": [], "filtered": False, "enters_others": True}
@@ -337,7 +344,7 @@ class Sound:
             "friction": False,
             "free": [(signal, kind) for _, signal, kind, _ in inputs],
         }
-        if not inputs and self.random.random() < 0.3:
+        if not inputs and not uniform and self.random.random() < 0.3:
             given["times"] = np.append(0.0, 0.05 * np.arange(1, rows) + self.number(-0.02, 0.02))
             for signal in given["signals"]:
                 signal["nonuniform"] = self.normal(rows)
@@ -576,11 +583,6 @@ class Sound:
         model = self.model()
         return self.record(), model, list(self.INPUTS), [self.powers() for _ in model]
 
-    def respond_and_units(self):
-        model = self.model()
-        units = [(self.random.randrange(len(model)), e) for e in self.one([], [0.0], [0.0, 1.5])]
-        return self.record(), model, list(self.INPUTS), units
-
     def respond_with_initial(self):
         model, record = self.model(), self.record(sensor=False)
         applies = self.sensor(record[1].shape[1], record[0]), [True, False][: len(model)]
@@ -590,6 +592,32 @@ class Sound:
         model = [((0, 2.0, [(0, 0.0), (0, 1.0), (2, 0.0)]), [-3.0, self.number(-1, 0), 1.0])]
         rows = self.m()
         return model, list(self.INPUTS), [(2, self.normal((rows,)), True, 0.5, 0.0)], [[(0.0, 1.0)]], self.step(), rows
+
+    def output_simulation_new(self):
+        """A free run, or a body with friction, on a run of the structure of `joint_problem_new`."""
+        run = _core.Recording(*self.recording_new(uniform=True))
+        model = [((0, 1.5, [(0, 0.0), (1, 0.0)]), [-3.0, self.number(-1, 1)])]
+        return run, model, self.one([], [(0, (0.3, 0.1, 0.5))]), None
+
+    def output_simulation_samples(self):
+        terms = self.one((False, [[(0.0, 0.2)]], False), (True, [[(0.0, 0.0), (1.0, 0.0)]], self.one(True, False)))
+        return _core.OutputSimulation(*self.output_simulation_new()[:2], [], None), (self.one(2, 3), terms)
+
+    def output_simulation_refine(self):
+        target, (_, terms) = self.output_simulation_samples()
+        return target, (terms, 1e-3, 1 << 11, self.one(8, 1 << 14))
+
+    def output_simulation_fit_friction_terms(self):
+        run, model, _, times = self.output_simulation_new()
+        return _core.OutputSimulation(run, model, [(0, (0.3, 0.1, 0.5))], times), ((True, []), self.one(1, 2))
+
+    def fit_initial_terms(self):
+        rows = self.m()
+        units, columns = [(0, 0.0), (1, 1.0)], [self.normal((2, rows)) for _ in range(2)]
+        return self.normal((2, rows)), self.normal((2, rows)), units, columns, self.one(True, False)
+
+    def richardson_limit(self):
+        return [(self.normal((2, 20)), [self.number(-1, 1)]) for _ in range(self.one(1, 4, 5))], [self.one(0, 1)]
 
     def equation_error(self):
         return self.record(), self.equation(), list(self.INPUTS), self.terms()
@@ -1026,8 +1054,7 @@ def attacked(name, given, named, r):
         spots = [path for path in places(arguments) if len(path) > 1]
         if spots:
             arguments = exchanged(arguments, r.choice(spots), lambda value: hostile(value, r, large))
-    for places_of, most in ((EVALUATIONS, MOST_EVALUATIONS), (COUNTS, MOST_COUNT)):
-        at = places_of.get(name)
+    for at, most in (COUNTS.get(name, (None, 0)), (EVALUATIONS.get(name), MOST_EVALUATIONS)):
         if at is not None and isinstance(arguments[0][at], int):
             arguments[0][at] = min(arguments[0][at], most)
     return arguments
