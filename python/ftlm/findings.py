@@ -250,6 +250,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{output} is buried in noise (NR {nr:.3g}), and nothing of the input is left in the residuals",
         "move the input more, record longer, or average repeated runs",
     ),
+    "end_row_far_off": FindingKind(
+        "useless",
+        LEVEL_WITH_CARE,
+        "{output}: its first or its last row lies so far off that the free run explains little of the output (NR "
+        "{nr:.3g}), and {inner:.3g} % of all other rows: an outlier",
+        "the first or the last row of {output} lies far off (NR {nr:.3g}; {inner:.3g} % of the others is explained)",
+        "cut that row away, or mark it as missing",
+    ),
     "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the free run explains little of {where}{shown}"),
     "fit_falls": FindingKind(
         "lost",

@@ -94,3 +94,19 @@ def test_verdicts_do_not_depend_on_names_scales_or_the_order_of_runs(fault):
     scaled = runs_of(scale=(2.0**-10, 2.0**12))
     assert weighed(ftlm.identify(scaled, ftlm.equation("D y = a y + b u"))) == usual
     assert weighed(ftlm.identify(runs_of()[::-1], ftlm.equation("D y = a y + b u"))) == usual
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_an_outlier_at_an_end_of_the_run_is_named_and_not_taken_for_a_poor_model(row):
+    g = np.random.default_rng(4)
+    u = np.concatenate([np.zeros(20), steps(g, 400)])
+    y = lag(u) + 0.01 * g.standard_normal(u.size)
+    y[row] = 30.0
+    found = ftlm.identify(
+        ftlm.Run.from_arrays(step=STEP, inputs={"u": u}, outputs={"y": y}), ftlm.equation("D y = a y + b u")
+    )
+    assert found.coefficients["a"] == pytest.approx(-2.0, rel=0.02)
+    assert "end_row_far_off" in codes(found)
+    assert not {"explains_little", "buried_in_noise"} & set(codes(found))
+    assert found.verdict().level == LEVEL_WITH_CARE
+    assert found.verdict().reason.startswith("the first or the last row of y lies far off")

@@ -53,7 +53,13 @@ from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import run_in_worker
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import check_threads
-from ftlm.validation.comparison import Comparison, compare_samples, finite, simulate_runs
+from ftlm.validation.comparison import (
+    MAX_NORMALIZED_RESIDUAL,
+    Comparison,
+    compare_samples,
+    finite,
+    simulate_runs,
+)
 from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
@@ -341,7 +347,13 @@ def assess_fit(fit: Fit) -> Identification:
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
-    """Return residuals that are not white as colored noise, and a poor fit as noise, where they follow no input."""
+    """Return residuals that are not white as colored noise, and a poor fit as noise, where they follow no input.
+
+    Residual tests leave the first and the last row out: a fit that is poor by these alone has an outlier there.
+    """
+    if item.code == "explains_little" and tests.outputs[item.output].nr <= MAX_NORMALIZED_RESIDUAL:
+        inner = 100.0 * (1.0 - tests.outputs[item.output].nr)
+        return make_finding("end_row_far_off", output=item.output, inner=inner, **item.numbers)
     if item.code == "explains_little" and is_buried(tests.outputs[item.output]):
         return make_finding("buried_in_noise", output=item.output, **item.numbers)
     colored = item.code == "residuals_not_white" and tests.outputs[item.output].is_noise

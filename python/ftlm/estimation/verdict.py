@@ -34,6 +34,8 @@ VALIDATION_LOSS_LIMITS = ((3.0, 10.0), (5.0, 5.0))
 MIN_FIT_GAIN = 0.5
 #: NR below which a model explains something of an output that noise buries.
 MAX_BURIED_RESIDUAL = 0.99
+#: Findings that explain a poor fit by the data.
+POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
 UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
 #: Findings on an unstable plant: simulations of whole runs do not judge its model.
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
@@ -137,7 +139,7 @@ def _combined_verdict(
     own: Sequence[Finding], before: Mapping[str, float], runs: Sequence[Comparison], tried: bool
 ) -> Verdict | None:
     """Return the verdict from all findings, by itself and on other runs; None without findings."""
-    buried = [f.output for f in own if f.code == "buried_in_noise"]
+    buried = [f.output for f in own if f.code in POOR_FIT_CODES]
     found = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
     found += [f for comparison in runs for f in _validation_losses(before, comparison)]
     own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
@@ -233,7 +235,7 @@ def _free_runs(result: Identification) -> Iterator[Finding]:
     if lost:
         yield make_finding("out_of_range", output=", ".join(lost))
     yield from _unstable_poles(result.model)
-    buried = [f for f in result.findings if f.code == "buried_in_noise"]
+    buried = [f for f in result.findings if f.code in POOR_FIT_CODES]
     yield from _poor_fits("", result.comparison, [f.output for f in buried])
     yield from buried
 
