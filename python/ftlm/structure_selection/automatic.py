@@ -143,23 +143,42 @@ class AutomaticSelection:
         probe = AutomaticForm(2, 1)
         probes = self._fit([probe, replace(probe, offset="level")])
         offset = "level" if _gain(probes, lambda f: f.offset == "level") > SIGNIFICANT_BIC else "none"
-        forms = [AutomaticForm(n, m, offset=offset) for n in range(1, MAX_ORDER + 1) for m in range(n)]
-        fits = [*probes, *self._fit([f for f in forms if f not in {p.form for p in probes}])]
-        fits.sort(key=lambda f: f.bic)
+        forms = [AutomaticForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
+        fits = self._fit_zeros(forms, probes)
         if self._is_delayed(fits, offset):
-            fits += self._fit([replace(f, delayed=True) for f in forms if f.order < MAX_ORDER])
-            fits.sort(key=lambda f: f.bic)
+            fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
         done = {f.form for f in fits}
         more = [v for f in fits[:EXTENDED_CANDIDATES] if f.form for v in _variants(f.form) if v not in done]
         fits += self._fit(more)
         return sorted(fits, key=lambda f: f.bic)
 
+    def _fit_zeros(self, forms: Sequence[AutomaticForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
+        """Add the fits of forms with all zeros, and of those with fewer that can have the least criterion; best first.
+
+        A form with fewer zeros leaves no less, so its criterion is lower by at most the penalty of its zeros.
+        """
+        known = {f.form for f in fits}
+        full = [*fits, *self._fit([f for f in forms if f not in known])]
+        least = min((f.bic for f in full), default=math.inf)
+        fewer = [
+            replace(form, zeros=m)
+            for form, fitted in ((f.form, f) for f in full)
+            if form is not None and form in forms
+            for m in range(form.order - 1)
+            if fitted.bic - (form.order - 1 - m) * self._penalty(fitted) < least
+        ]
+        return sorted([*full, *self._fit(fewer)], key=lambda f: f.bic)
+
+    def _penalty(self, fitted: FittedForm) -> float:
+        """Penalty of one zero of every input in the criterion."""
+        return len(self.runs[0].inputs) * math.log(fitted.joint.samples)
+
     def _is_delayed(self, fits: Sequence[FittedForm], offset: str) -> bool:
         """Whether a delay lowers the criterion of a low order without or with a zero."""
         probes = self._fit([AutomaticForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])
         for probe in probes:
-            plain = next(f for f in fits if probe.form and f.form == replace(probe.form, delayed=False))
-            if probe.bic < plain.bic - SIGNIFICANT_BIC:
+            plain = [f.bic for f in fits if probe.form is not None and f.form == replace(probe.form, delayed=False)]
+            if probe.bic < min(plain, default=math.inf) - SIGNIFICANT_BIC:
                 return True
         return False
 
