@@ -255,36 +255,21 @@ impl Realization {
             let fraction = delay - delay.floor();
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let whole = delay.floor().min(1e18) as usize;
-            let all = dense::multiply(&interval.first, drive, n, n, 1);
-            let channel = match input.between {
-                Intersample::Linear => {
-                    let later = dense::multiply(&interval.second, drive, n, n, 1);
-                    let now = all.iter().zip(&later).map(|(a, b)| a - b).collect();
-                    let samples = match delay {
-                        0.0 => Cow::Borrowed(input.samples.as_slice()),
-                        _ => Cow::Owned(delay_samples(&input.samples, delay, input.before)?),
-                    };
-                    Channel { samples, lag: 0, before: input.before, now, later, direct: direct.clone() }
+            let Some(InputGains { now, later }) =
+                InputGains::new(&interval, &self.system, drive, input.between, fraction)
+            else {
+                return Ok(None);
+            };
+            let (samples, lag) = match input.between {
+                Intersample::Linear if delay > 0.0 => {
+                    (Cow::Owned(delay_samples(&input.samples, delay, input.before)?), 0)
                 }
-                Intersample::Hold if fraction == 0.0 => Channel {
-                    samples: Cow::Borrowed(&input.samples),
-                    lag: whole,
-                    before: input.before,
-                    now: all,
-                    later: vec![0.0; n],
-                    direct: direct.clone(),
-                },
+                Intersample::Linear => (Cow::Borrowed(input.samples.as_slice()), 0),
                 Intersample::Hold => {
-                    // The next value arrives within the interval and acts over the rest of it.
-                    let rest = 1.0 - fraction;
-                    let Some(part) = Transition::new(&self.system, n, rest) else { return Ok(None) };
-                    let later: Vec<f64> =
-                        dense::multiply(&part.first, drive, n, n, 1).into_iter().map(|v| v * rest).collect();
-                    let now = all.iter().zip(&later).map(|(a, b)| a - b).collect();
-                    let (samples, direct) = (Cow::Borrowed(input.samples.as_slice()), direct.clone());
-                    Channel { samples, lag: whole.saturating_add(1), before: input.before, now, later, direct }
+                    (Cow::Borrowed(input.samples.as_slice()), whole.saturating_add(usize::from(fraction > 0.0)))
                 }
             };
+            let channel = Channel { samples, lag, before: input.before, now, later, direct: direct.clone() };
             channels.push(channel);
         }
         let finite = channels.iter().flat_map(|c| c.now.iter().chain(&c.later).chain(&c.direct));
@@ -298,8 +283,8 @@ impl Realization {
 }
 
 /// e^M − I, φ₁(M) and φ₂(M) of a row-major n × n matrix.
-struct Transition {
-    growth: Vec<f64>,
+pub(crate) struct Transition {
+    pub(crate) growth: Vec<f64>,
     first: Vec<f64>,
     second: Vec<f64>,
 }
@@ -307,7 +292,7 @@ struct Transition {
 impl Transition {
     /// Functions of `share` times the matrix, by scaling and squaring; None if they overflow.
     #[allow(clippy::cast_possible_truncation)]
-    fn new(matrix: &[f64], n: usize, share: f64) -> Option<Self> {
+    pub(crate) fn new(matrix: &[f64], n: usize, share: f64) -> Option<Self> {
         let norm = (0..n).map(|i| (0..n).map(|j| matrix[i * n + j].abs()).sum::<f64>()).fold(0.0_f64, f64::max) * share;
         if !norm.is_finite() {
             return None;
@@ -346,6 +331,40 @@ pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
     let mut found = Transition::new(matrix, n, 1.0)?.growth;
     found.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
     Some(found)
+}
+
+/// Gains of an input on the states after one interval: of its value at the interval and of the next one.
+pub(crate) struct InputGains {
+    pub(crate) now: Vec<f64>,
+    pub(crate) later: Vec<f64>,
+}
+
+impl InputGains {
+    /// Gains of an input with this drive; None if they overflow.
+    ///
+    /// `fraction` is the part of the interval after which the next value of a held input arrives, 0 without a delay.
+    pub(crate) fn new(
+        interval: &Transition,
+        system: &[f64],
+        drive: &[f64],
+        between: Intersample,
+        fraction: f64,
+    ) -> Option<Self> {
+        let n = drive.len();
+        let all = dense::multiply(&interval.first, drive, n, n, 1);
+        let later: Vec<f64> = match between {
+            Intersample::Linear => dense::multiply(&interval.second, drive, n, n, 1),
+            Intersample::Hold if fraction == 0.0 => return Some(Self { now: all, later: vec![0.0; n] }),
+            Intersample::Hold => {
+                // The next value arrives within the interval and acts over the rest of it.
+                let rest = 1.0 - fraction;
+                let part = Transition::new(system, n, rest)?;
+                dense::multiply(&part.first, drive, n, n, 1).into_iter().map(|v| v * rest).collect()
+            }
+        };
+        let now = all.iter().zip(&later).map(|(a, b)| a - b).collect();
+        Some(Self { now, later })
+    }
 }
 
 /// Input of a recursion.

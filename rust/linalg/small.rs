@@ -50,24 +50,39 @@ const MAX_EIGENVALUE_STEPS: usize = 1000;
 /// assert!((ftlm::linalg::small::spectral_radius(&[-6.0, 1.0, 1.0]).unwrap_or(0.0) - 3.0).abs() < 1e-14);
 /// ```
 #[must_use]
-#[allow(clippy::cast_precision_loss)]
 pub fn spectral_radius(coefficients: &[f64]) -> Option<f64> {
+    let found = polynomial_roots(coefficients)?;
+    Some(found.iter().map(|(re, im)| re.hypot(*im)).fold(0.0, f64::max)).filter(|_| !found.is_empty())
+}
+
+/// Real and imaginary part of the zeros of a polynomial with these coefficients, the constant first.
+///
+/// None for coefficients of which the leading one is 0 or too small beside the others.
+///
+/// ```
+/// // (s + 1)² + 4
+/// let found = ftlm::linalg::small::polynomial_roots(&[5.0, 2.0, 1.0]).unwrap_or_default();
+/// assert!(found.iter().all(|(re, im)| (re + 1.0).abs() < 1e-14 && (im.abs() - 2.0).abs() < 1e-14));
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn polynomial_roots(coefficients: &[f64]) -> Option<Vec<(f64, f64)>> {
     let (leading, others) = coefficients.split_last()?;
     let ratios: Vec<f64> = others.iter().rev().map(|c| -c / leading).collect();
-    if ratios.is_empty() || ratios.iter().any(|v| !v.is_finite()) {
+    if ratios.iter().any(|v| !v.is_finite()) {
         return None;
     }
     // In this unit no coefficient is above 1.
     let unit = ratios.iter().zip(1..).map(|(v, k)| v.abs().powf(1.0 / k as f64)).fold(0.0, f64::max);
     if unit == 0.0 {
-        return Some(0.0);
+        return Some(vec![(0.0, 0.0); ratios.len()]);
     }
     let scaled = |(k, v): (usize, &f64)| (0..=k).fold(*v, |v, _| v / unit);
     let top: Vec<f64> = ratios.iter().enumerate().map(scaled).collect();
     let n = top.len();
     let companion = DMatrix::from_fn(n, n, |i, j| if i == 0 { top[j] } else { f64::from(u8::from(i == j + 1)) });
     let found = Schur::try_new(companion, f64::EPSILON, MAX_EIGENVALUE_STEPS)?.complex_eigenvalues();
-    Some(unit * found.iter().map(|z| z.re.hypot(z.im)).fold(0.0, f64::max))
+    Some(found.iter().map(|z| (unit * z.re, unit * z.im)).collect())
 }
 
 /// LU factorization of an equilibrated square matrix, whose rows and columns may differ in scale by any factor.

@@ -15,6 +15,7 @@ import friction
 import ftlm
 import loops
 from ftlm.cli.main import app
+from ftlm.structure_selection.automatic import AutomaticForm
 from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, name_candidates
 from ftlm.structure_selection.cross_validation import (
     Folds,
@@ -25,7 +26,7 @@ from ftlm.structure_selection.cross_validation import (
     validation_score_bound,
 )
 from ftlm.structure_selection.result import format_fit
-from ftlm.structure_selection.select import _predicts_equally, _rank_trials, _reason, automatic_structures
+from ftlm.structure_selection.select import _predicts_equally, _rank_trials, _reason, automatic_output
 from ftlm.structure_selection.stepwise import (
     CandidateEvaluator,
     FittedVariant,
@@ -277,18 +278,17 @@ def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival
         assert said.numbers["gain"] == pytest.approx(np.median(gains))
 
 
-def test_auto_has_an_equation_of_each_order(runs):
-    made = automatic_structures(runs)
-    assert [len(s.equations[0].terms) for s in made] == [2, 3, 4, 5]
-    first = [str(NestedStructures(s).build(next(iter(NestedStructures(s).simplest())).variant)) for s in made]
-    assert first[0] == "D^1 y = a0 y + b1 u"
-    assert first[3] == "D^4 y = a3 D^3 y + a2 D^2 y + a1 D^1 y + a0 y + b1 u"
+def test_auto_is_of_one_output_with_inputs(runs):
+    assert automatic_output(runs) == "y"
+    made = AutomaticForm(2, 1, delayed=True, integrator=True).structure(runs, "y")
+    assert str(made.without_input_nonlinearities()) == "D^2 y = a1 D^1 y + b1 D^1 u + b0 u"
+    assert list(made.free_delays) == ["u"]
     with pytest.raises(ftlm.ModelError, match="the outputs y, z; structure='auto' is of one"):
-        automatic_structures(
+        automatic_output(
             [ftlm.Run.from_arrays(step=1, inputs={"u": [0, 1, 2]}, outputs={"y": [0, 1, 2], "z": [0, 1, 2]})]
         )
     with pytest.raises(ftlm.ModelError, match="the runs have no input"):
-        automatic_structures([ftlm.Run.from_arrays(step=1, inputs={}, outputs={"y": [0, 1, 2]})])
+        automatic_output([ftlm.Run.from_arrays(step=1, inputs={}, outputs={"y": [0, 1, 2]})])
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Automatic candidate structures: one output, any inputs, integer orders first."""
+"""Selection of a structure by the prediction of validation data."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degenerate
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
-from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
+from ftlm.structure_selection.automatic import AutomaticForm, AutomaticSelection, is_fractional
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
 from ftlm.structure_selection.cross_validation import Folds, Trial, scatter_factor, schwarz_criterion
@@ -35,54 +35,32 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_threads
 
-#: Integer values of the highest order of the candidates.
-AUTOMATIC_ORDERS = (1, 2, 3, 4)
 #: Mean fit [%] of validation data below which a candidate is not the machine.
 MIN_VALIDATION_FIT = 50.0
 #: Difference of an order from an integer that is none.
 INTEGER_TOLERANCE = 1e-9
 
 
-def automatic_structures(runs: Sequence[Run], output: str | None = None) -> list[Structure]:
-    """Return equations of one output with every input as an upper bound for the selection, one for each integer order.
-
-    Each has all derivatives of the output below its order and each input. The highest order and those of one own term
-    and of one input may become free. A measured input (``"foh"``) may be differentiated, a zero-order-hold command may
-    not.
+def automatic_output(runs: Sequence[Run]) -> str:
+    """Return the only output of runs with inputs, for an automatic structure.
 
     Raises
     ------
     ModelError
-        Several outputs and none chosen, or no input.
+        Several outputs, or no input.
     """
     first = runs[0]
     outputs = list(first.outputs)
-    if output is None:
-        if len(outputs) != 1:
-            raise ModelError(
-                f"the runs have the outputs {', '.join(outputs)}; {parameter('structure', 'auto')} is of one: use "
-                "run.select([…]), or name it in a structure in words"
-            )
-        output = outputs[0]
+    if len(outputs) != 1:
+        raise ModelError(
+            f"the runs have the outputs {', '.join(outputs)}; {parameter('structure', 'auto')} is of one: use "
+            "run.select([…]), or name it in a structure in words"
+        )
     if not first.inputs:
         raise ModelError(
             f"the runs have no input, and {parameter('structure', 'auto')} needs one; name inputs when loading"
         )
-    made = []
-    for order in AUTOMATIC_ORDERS:
-        own = [f"a{k} D^mu{k} {output}" for k in range(order - 1, 0, -1)] + [f"a0 {output}"]
-        driving = [f"b{j} D^gamma{j} {name}" for j, name in enumerate(first.inputs, 1)]
-        orders = {f"gamma{j}": _input_order_range(first, name, order) for j, name in enumerate(first.inputs, 1)}
-        orders["alpha"] = (max(order - 0.9, 0.1), order + 0.9, 0.1)
-        orders |= {f"mu{k}": (max(k - 0.9, 0.05), k + 0.9, 0.05) for k in range(1, order)}
-        text = f"D^alpha {output} = {' + '.join([*own, *driving])}"
-        made.append(equation(text, orders=orders, offset="auto"))
-    return made
-
-
-def _input_order_range(run: Run, name: str, order: int) -> tuple[float, float, float]:
-    """Range (low, high, increment) of the order of an input."""
-    return (0.0, float(order) if run.intersample[name] == "foh" else max(order - 1.0, 0.05), 0.05)
+    return outputs[0]
 
 
 #: Difference of Schwarz criteria that is not significant; doi:10.1080/01621459.1995.10476572.
@@ -93,6 +71,9 @@ BIC_STRONG_EVIDENCE = 10.0
 MIN_SCATTER_FOLDS, STUDENT_QUANTILES_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
 #: Score above which a candidate fails on a part, if it also exceeds the best score there by the second value.
 FAILURE_SCORE, FAILURE_SCORE_GAP = math.log(0.5), math.log(2.0)
+#: Ratio of a difference of scores to its standard error over the folds beyond which a prediction is better: the
+#: two-sided 95 % quantile of Student's t for four blocks.
+BETTER_SCATTER_RATIO = 3.2
 #: Maximum number of listed candidates.
 MAX_CANDIDATES = 10_000
 
@@ -128,7 +109,9 @@ def select(
         One run or several with the same names and units.
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
-        ``"auto"``: one output, every input, integer orders 1 to 4 and fractional ones that improve the score.
+        ``"auto"``: one output, every input, integer orders 1 to 4 with zeros, delays, direct feedthrough, an
+        integrator and an output level, then fractional orders. These are chosen where they predict better, or alike
+        with a Schwarz criterion lower by 10.
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
         quarter of every run by a fit on the rest, the default for one run. Or separate validation runs.
@@ -183,14 +166,15 @@ def select(
     every = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
     if isinstance(candidates, str) and candidates != "auto":
         raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
-    searched = automatic_structures(folds.runs) if isinstance(candidates, str) else []
-    searched += [candidates] if isinstance(candidates, Structure) else []
+    output = automatic_output(folds.runs) if isinstance(candidates, str) else None
+    searched = [candidates] if isinstance(candidates, Structure) else []
     idle = [describe_structure(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
     if idle:
         raise ModelError(
             f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
         )
-    for structure in (*searched, *every.values()):
+    automatic = [] if output is None else [AutomaticForm(2, 1).structure(folds.runs, output)]
+    for structure in (*searched, *every.values(), *automatic):
         # Refused here, once, and not as a failure of every candidate.
         prepare(
             folds.runs,
@@ -200,26 +184,31 @@ def select(
             gaps=True,
         )
     if store is None:
-        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every)
+        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, output)
     judges = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
-    asked = Request.of(folds.runs, [searched, every], judges, folds.description)
+    asked = Request.of(folds.runs, [searched, every, *automatic], judges, folds.description)
     with Store(store, asked) as kept:
-        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every)
+        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every, output)
 
 
 def _run_selection(
-    work: CandidateEvaluator, searched: Sequence[Structure], every: Mapping[str, Structure]
+    work: CandidateEvaluator, searched: Sequence[Structure], every: Mapping[str, Structure], output: str | None
 ) -> Selection:
-    """Evaluate nested and listed structures, and choose."""
+    """Evaluate nested and listed structures, or automatic ones of an output, and choose."""
+    if output is not None:
+        AutomaticSelection(work.folds.runs, output, work).run()
     for structure in searched:
         select_stepwise(NestedStructures(structure), work)
     if every:
         evaluate_list(every, work)
-    return _choose(work, work.folds)
+    return _choose(work, work.folds, prefers_integer_orders=output is not None)
 
 
-def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
-    """Rank the trials, choose one, and identify its structure."""
+def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: bool) -> Selection:
+    """Rank the trials, choose one, and identify its structure.
+
+    If integer orders are preferred, fractional ones are chosen only as :func:`_eligible_indices` says.
+    """
     there = [t for t in work.trials if t.joint is not None]
     if not there:
         why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
@@ -243,7 +232,8 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
     ranked = [
         t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked
     ]
-    best, winner = ranked[0], _winner([ranked[k] for k in near])
+    eligible, words = _eligible_indices(ranked, near) if prefers_integer_orders else (near, "")
+    best, winner = ranked[0], _winner([ranked[k] for k in eligible])
     found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
     findings: list[Finding] = []
     if winner.joint is not None and found.fit is not None and found.fit.noise:
@@ -261,7 +251,7 @@ def _choose(work: CandidateEvaluator, folds: Folds) -> Selection:
         ranked.index(winner),
         found,
         folds.description,
-        _reason(winner, best, ranked),
+        _reason(winner, best, ranked) + words,
         work.done_count,
         tuple(findings),
     )
@@ -353,6 +343,37 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
     return (far <= quantile * scatter and likely) or far <= max(
         SCORE_TOLERANCE, min(quantile * scatter, MAX_SCORE_TOLERANCE)
     )
+
+
+def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
+    """Indices of trials that may be chosen beside integer orders, and a sentence on the fractional ones.
+
+    Fractional orders predict better only if they leave 1 % less than the best integer orders, beyond the scatter over
+    the folds. They are eligible as well if they predict alike and their criterion is lower by very strong evidence.
+    """
+    whole = [k for k in _peer_indices(ranked) if not is_fractional(ranked[k].structure)]
+    other = [k for k in near if is_fractional(ranked[k].structure)]
+    if not whole or not other:
+        return list(near), ""
+    least = ranked[min(whole, key=lambda k: ranked[k].score)]
+    peers = [k for k in whole if _predicts_equally(ranked[k], least)]
+    limit = min(_bic(ranked[k]) for k in peers) - BIC_STRONG_EVIDENCE
+    better = [k for k in other if _predicts_better(ranked[k], least)]
+    if better:
+        return better, " Fractional orders predict better than integer orders with a delay and zeros do."
+    alike = [k for k in other if _predicts_equally(ranked[k], least) and _bic(ranked[k]) < limit]
+    if alike:
+        return alike, " Integer orders with a delay and zeros predict alike, with more numbers."
+    return peers, ""
+
+
+def _predicts_better(trial: Trial, other: Trial) -> bool:
+    """Whether a trial leaves 1 % less than another one, beyond the scatter over the folds."""
+    apart = np.array(trial.scores) - np.array(other.scores)
+    if apart.size < MIN_SCATTER_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
+        return False
+    scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
+    return float(np.mean(apart)) < -BETTER_SCATTER_RATIO * scatter
 
 
 def _winner(near: Sequence[Trial]) -> Trial:

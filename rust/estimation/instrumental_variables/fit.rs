@@ -4,7 +4,7 @@
 //! signal is measured with noise, a noise-free substitute is needed (`project`).
 
 use super::coupled;
-use super::prefilter::{damped_inverse, low_pass, power_frequency, unit};
+use super::prefilter::{damped_inverse, power_frequency, state_variable_filter};
 use super::single::{divisor, step, EquationSpectra, Scratch, Source};
 use super::solution::{dot, equations, has_converged, initial_terms, Dropped, Settings, Solution};
 use crate::equation::{Initial, Structure};
@@ -14,9 +14,10 @@ use crate::regressors::Record;
 use crate::series::Kernel;
 use crate::series_system::System;
 
-/// Cutoff frequencies of the low-pass prefilters of the initial guesses, relative to the bandwidth of the output.
-/// None: unfiltered record.
-const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 4] = [None, Some(1.0), Some(2.0), Some(4.0)];
+/// Poles λ of the state-variable filters of the initial guesses, relative to the bandwidth of the output.
+///
+/// Without a filter the regressors are pure integrals, in which drift outweighs the motion of long records.
+const FILTER_POLE_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
 
 /// Increase of the output error above which a step is halved, at most [`MAX_STEP_HALVINGS`] times in a row.
 const MAX_ERROR_RATIO: f64 = 1.2;
@@ -53,7 +54,7 @@ pub struct Fit {
 ///
 /// The noise-free signals of a record ([`Record::with_clean`]) replace outputs that no equation simulates. They are the
 /// first instruments of the simulated outputs. A record without them uses its measured signals. The initial guesses are
-/// two-stage least squares behind several low-pass prefilters. The result is the refined solution with the least output
+/// two-stage least squares behind several state-variable filters. The result is the refined solution with the least output
 /// error, or the iterate with the least output error if none converges. An unstable iterate is damped (its series is
 /// evaluated at ρz, ρ < 1), which keeps the instruments bounded and free of noise.
 ///
@@ -103,9 +104,9 @@ pub fn fit(
     // Best refinement of all equations together. Whether the separate estimates are stable depends on the initial
     // guess.
     let mut together: Option<coupled::CoupledEstimate> = None;
-    for multiple in PREFILTER_CUTOFF_RATIOS {
+    for ratio in FILTER_POLE_RATIOS {
         // An initial guess that fails does not affect the others.
-        match problem.start(multiple).and_then(|solutions| {
+        match problem.start(ratio).and_then(|solutions| {
             let ended = problem.iterate(solutions.clone(), settings)?;
             Ok((solutions, ended))
         }) {
@@ -203,17 +204,16 @@ impl<'a> Problem<'a> {
 
     /// Two-stage least squares: one step with the noise-free signals as instruments.
     ///
-    /// The signals are prefiltered by a low-pass at `multiple` times the bandwidth of the output, if given.
-    fn start(&self, multiple: Option<f64>) -> Result<Vec<Solution>> {
+    /// The signals pass the state-variable filter s^α/(s + λ)^⌈α⌉ with λ at `ratio` times the bandwidth of the output.
+    fn start(&self, ratio: f64) -> Result<Vec<Solution>> {
         let mut scratch = Scratch::default();
         let mut solutions = Vec::with_capacity(self.structures.len());
         for (i, (structure, fixed)) in self.structures.iter().zip(self.fixed).enumerate() {
             let pairs = self.spectra[i].iter().zip(&self.substitutes[i]);
             let sources: Vec<Source<'_>> = pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
-            let low_passed = |r: &Record, multiple: f64| {
-                low_pass(multiple * power_frequency(r.signal(structure.output), r.step()), r)
+            let filter = |r: &Record| {
+                state_variable_filter(ratio * power_frequency(r.signal(structure.output), r.step()), structure.order, r)
             };
-            let filter = |r: &Record| multiple.map_or_else(|| Ok(unit(r.m())), |multiple| low_passed(r, multiple));
             let filters = self.records.iter().map(|r| Ok(Kernel::new(&filter(r)?))).collect::<Result<Vec<Kernel>>>()?;
             let own: Vec<Vec<f64>> = self.clean.iter().map(|r| r.signal(structure.output).to_vec()).collect();
             solutions.push(step(&sources, &filters, &own, fixed, &self.dropped[i], false, &mut scratch)?.0);

@@ -97,6 +97,21 @@ pub fn low_pass(omega: f64, record: &Record) -> Result<Vec<f64>> {
     Filter { numerator, denominator }.series(record.m(), record.step())
 }
 
+/// Series of the state-variable filter s^α/(s + λ)^⌈α⌉.
+///
+/// # Errors
+/// As [`Filter::series`].
+pub(super) fn state_variable_filter(pole: f64, order: f64, record: &Record) -> Result<Vec<f64>> {
+    let n = order.ceil().max(1.0) as i32;
+    let mut binomial = 1.0;
+    let mut denominator = Vec::new();
+    for k in 0..=n {
+        denominator.push((binomial * pole.powi(n - k), f64::from(k)));
+        binomial *= f64::from(n - k) / f64::from(k + 1);
+    }
+    Filter { numerator: vec![(1.0, order)], denominator }.series(record.m(), record.step())
+}
+
 /// The series 1.
 pub(super) fn unit(m: usize) -> Vec<f64> {
     let mut one = vec![0.0; m];

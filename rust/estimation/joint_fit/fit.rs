@@ -251,7 +251,7 @@ pub fn fit(
     pace.advance_to(MULTISTART_PROGRESS_SHARE)?;
     let mut grid = sought.grid(sought.sizes.iter().map(|size| 1.0 / size.noise).collect(), 1)?;
     // If a response is faster than the sampling interval, a grid of that step has a spurious optimum.
-    while grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+    while grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && !grid.is_exact(&first.result.iterate) {
         let finer = grid.finer()?;
         if !grid.is_refinement_significant(&first.result.iterate, &finer)? {
             break;
@@ -292,7 +292,7 @@ fn finish_fit(
     if growth.is_some_and(|growth| !growth.keeps_unstable) {
         (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
     }
-    let optimum = if settings.refine {
+    let optimum = if settings.refine && !grid.is_exact(&best.result.iterate) {
         let others: Vec<Iterate> = select_survivors(&reached).into_iter().map(|runner| runner.result.iterate).collect();
         refine_step(best.result, grid, settings.loss, &others)?
     } else {

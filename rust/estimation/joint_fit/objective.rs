@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::problem::{Iterate, OptimizationResult, Problem};
 use crate::error::{check_length, Error, Result};
+use crate::estimation::output_error::integer_orders::IntegerOrders;
 use crate::estimation::output_error::{Experiment, Settings};
 use crate::parallel::Stop;
 use crate::recording::{Recordings, Sampling};
@@ -15,6 +16,9 @@ pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
 const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
 /// Finest grid, in block pulses per sampling interval.
 pub const MAX_PULSES_PER_SAMPLE: usize = 16;
+
+/// Deviation of a delay in sampling intervals from a whole number below which it is whole.
+const WHOLE_DELAY_TOLERANCE: f64 = 1e-9;
 
 /// Weights 1/σ of the outputs, and robust weights of the samples.
 #[derive(Debug, Clone, PartialEq)]
@@ -151,6 +155,19 @@ impl<'a> Objective<'a> {
     pub fn minimize_in(&self, turned: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
         let settings = Settings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
         turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
+    }
+
+    /// True if the simulation does not depend on the step: integer orders, and no held input that switches within one.
+    #[must_use]
+    pub fn is_exact(&self, place: &Iterate) -> bool {
+        let whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
+        let runs = self.source.runs().iter().zip(self.source.spans());
+        self.sampling.decimation == 1
+            && self.problem.frictions.is_empty()
+            && runs
+                .flat_map(|(run, (step, _))| run.channels().iter().map(move |c| (c.delay, step)))
+                .all(|(delay, step)| delay.is_none_or(|delay| whole(delay, step)))
+            && IntegerOrders::of(&self.problem.model, &self.experiments, &place.point).is_some()
     }
 
     /// True if halving the step changes the simulated samples significantly relative to the residuals.

@@ -2,10 +2,12 @@
 
 use std::cell::RefCell;
 
+use super::evaluation::Evaluation;
 use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
+use super::integer_orders::{ExactSimulation, IntegerOrders};
 use super::parameterization::{Coordinate, FreeInput, FreeModel, Point, TimeUnit};
-use super::residuals::Evaluation;
+use super::residuals::Linearization;
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::optimization::damped_step::Problem;
 use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
@@ -33,6 +35,43 @@ pub struct Fit {
     pub status: Status,
 }
 
+/// Evaluation on block pulses, or of exact samples.
+enum Simulation<'a> {
+    Pulses(Evaluation<Linearization>),
+    Exact(Evaluation<ExactSimulation<'a>>),
+}
+
+impl Simulation<'_> {
+    fn point(&self) -> &Point {
+        match self {
+            Self::Pulses(evaluation) => &evaluation.point,
+            Self::Exact(evaluation) => &evaluation.point,
+        }
+    }
+
+    fn size(&self) -> f64 {
+        match self {
+            Self::Pulses(evaluation) => evaluation.size,
+            Self::Exact(evaluation) => evaluation.size,
+        }
+    }
+
+    fn residuals(&self) -> &[f64] {
+        match self {
+            Self::Pulses(evaluation) => &evaluation.residuals,
+            Self::Exact(evaluation) => &evaluation.residuals,
+        }
+    }
+
+    /// Coefficients and exponents of the initial terms.
+    fn initial_terms(&self) -> (&[Vec<Vec<f64>>], &[Vec<f64>]) {
+        match self {
+            Self::Pulses(evaluation) => (&evaluation.initial, &evaluation.exponents),
+            Self::Exact(evaluation) => (&evaluation.initial, &evaluation.exponents),
+        }
+    }
+}
+
 /// Nonlinear least-squares problem of the output error of a model.
 struct OutputErrorProblem<'a> {
     model: &'a FreeModel,
@@ -47,36 +86,50 @@ struct OutputErrorProblem<'a> {
     allows_extrapolation: bool,
     /// Coefficients that are eliminated at every point.
     linear: Vec<usize>,
+    /// Exact simulation, if all orders are integers.
+    exact: Option<IntegerOrders>,
     /// Caches of the evaluations, by experiment.
     caches: RefCell<Vec<EvaluationCache>>,
     /// Cancellation flag.
     stop: &'a Stop,
 }
 
-impl Problem for OutputErrorProblem<'_> {
+impl<'a> Problem for OutputErrorProblem<'a> {
     type Point = Point;
-    type Evaluation = Evaluation;
+    type Evaluation = Simulation<'a>;
 
-    fn evaluate(&self, point: &Point) -> Result<Evaluation> {
+    fn evaluate(&self, point: &Point) -> Result<Simulation<'a>> {
         self.stop.check()?;
-        self.model.evaluate(self.experiments, &mut self.caches.borrow_mut(), point, &self.linear)
+        if let Some(exact) = &self.exact {
+            return exact.evaluate(self.model, self.experiments, point, &self.linear).map(Simulation::Exact);
+        }
+        let (linear, caches) = (&self.linear, &mut self.caches.borrow_mut());
+        self.model.evaluate(self.experiments, caches, point, linear).map(Simulation::Pulses)
     }
 
-    fn point_of_evaluation(&self, evaluation: &Evaluation, _point: Point) -> Point {
-        evaluation.point.clone()
+    fn point_of_evaluation(&self, evaluation: &Simulation<'a>, _point: Point) -> Point {
+        evaluation.point().clone()
     }
 
     fn is_eliminated(&self, parameter: usize) -> bool {
         parameter.checked_sub(self.model.order_bounds.len()).is_some_and(|c| self.linear.contains(&c))
     }
 
-    fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
-        &evaluation.residuals
+    fn residuals<'e>(&self, evaluation: &'e Simulation<'a>) -> &'e [f64] {
+        evaluation.residuals()
     }
 
-    fn jacobian(&self, _point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+    fn jacobian(&self, _point: &Point, evaluation: &Simulation<'a>) -> Result<Vec<Vec<f64>>> {
         self.stop.check()?;
-        self.model.jacobian(self.experiments, &mut self.caches.borrow_mut(), &self.linear, evaluation)
+        match evaluation {
+            Simulation::Exact(evaluation) => match &self.exact {
+                Some(exact) => exact.jacobian(self.model, self.experiments, &self.linear, evaluation),
+                None => Err(Error::Internal { what: "exact samples of orders that are no integers".into() }),
+            },
+            Simulation::Pulses(evaluation) => {
+                self.model.jacobian(self.experiments, &mut self.caches.borrow_mut(), &self.linear, evaluation)
+            }
+        }
     }
 
     fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
@@ -122,13 +175,17 @@ impl Problem for OutputErrorProblem<'_> {
         parameter >= point.orders.len() + point.coefficients.len()
     }
 
-    fn signal_norm(&self, evaluation: &Evaluation) -> f64 {
-        evaluation.size
+    fn signal_norm(&self, evaluation: &Simulation<'a>) -> f64 {
+        evaluation.size()
     }
 
     /// True if the grids resolve the dynamics of each equation. Unresolved modes would fit noise.
     fn is_admissible(&self, point: &Point) -> bool {
-        self.model.is_resolved(self.experiments, point) && !(self.requires_stability && self.model.is_unstable(point))
+        let is_resolved = match &self.exact {
+            Some(exact) => exact.is_resolved(self.model, self.experiments, point),
+            None => self.model.is_resolved(self.experiments, point),
+        };
+        is_resolved && !(self.requires_stability && self.model.is_unstable(point))
     }
 
     fn allows_extrapolation(&self) -> bool {
@@ -254,7 +311,8 @@ pub fn fit_until(
         false => None,
     };
     let experiments = passed.as_deref().unwrap_or(experiments);
-    let shelves = RefCell::new(EvaluationCache::of(experiments)?);
+    let exact = IntegerOrders::of(&model, experiments, &point);
+    let shelves = RefCell::new(if exact.is_some() { Vec::new() } else { EvaluationCache::of(experiments)? });
     let clock = TimeUnit::from_experiments(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
     let problem = OutputErrorProblem {
@@ -265,6 +323,7 @@ pub fn fit_until(
         requires_stability: steady,
         allows_extrapolation: plain,
         linear,
+        exact,
         caches: shelves,
         stop,
     };
@@ -272,10 +331,10 @@ pub fn fit_until(
     Ok(Fit {
         point: found.point,
         cost: found.cost,
-        residuals: found.evaluation.residuals,
+        residuals: found.evaluation.residuals().to_vec(),
         jacobian: found.jacobian,
-        initial: found.evaluation.initial,
-        exponents: found.evaluation.exponents,
+        initial: found.evaluation.initial_terms().0.to_vec(),
+        exponents: found.evaluation.initial_terms().1.to_vec(),
         evaluations: found.evaluations,
         status: found.status,
     })

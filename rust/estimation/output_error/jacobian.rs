@@ -3,10 +3,11 @@
 use std::borrow::Cow;
 use std::rc::Rc;
 
+use super::evaluation::Evaluation;
 use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, Point};
-use super::residuals::{Evaluation, Linearization};
+use super::residuals::Linearization;
 use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
 use crate::linalg::orthogonal::project_out;
@@ -21,7 +22,7 @@ impl FreeModel {
         experiments: &[Experiment],
         shelves: &mut [EvaluationCache],
         linear: &[usize],
-        at: &Evaluation,
+        at: &Evaluation<Linearization>,
     ) -> Result<Vec<Vec<f64>>> {
         let point = &at.point;
         let count = point.orders.len() + point.coefficients.len() + point.inputs.len();

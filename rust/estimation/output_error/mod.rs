@@ -8,10 +8,12 @@
 //! pulses on either side of kh, on a grid that can be finer than the samples, plus the direct feedthrough of the
 //! inputs. Missing samples have zero weight. Nonuniform samples are compared at their own times.
 
+pub(crate) mod evaluation;
 mod evaluation_cache;
 pub mod experiment;
 mod feedthrough;
 pub mod fit;
+pub(crate) mod integer_orders;
 mod jacobian;
 mod kink_correction;
 pub mod parameterization;

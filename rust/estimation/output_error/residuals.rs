@@ -7,6 +7,7 @@
 use std::borrow::Cow;
 use std::rc::Rc;
 
+use super::evaluation::{solve_linear_steps, Evaluation, LinearSide, RANK_TOLERANCE};
 use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
 use super::feedthrough::{add_feedthrough_derivative, Feedthrough, JumpCorrection};
@@ -17,29 +18,12 @@ use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimation::least_squares;
 use crate::fractional::kernels::MAX_EXCESS;
-use crate::linalg::dense;
-use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
-use crate::linalg::small::back_substitute;
+use crate::linalg::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, Recursion, SumOfProducts};
 
 /// Smallest difference of α and the order of an autoregressive term; at 0 the equation would be an identity.
 const MIN_INTEGRATION_ORDER: f64 = 1e-3;
-
-/// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
-const RANK_TOLERANCE: f64 = 1e-12;
-
-/// Residuals at a point, and intermediates for their derivatives.
-pub(crate) struct Evaluation {
-    /// The point, with optimal values of the linear coefficients.
-    pub(crate) point: Point,
-    pub(crate) residuals: Vec<f64>,
-    /// Norm of the weighted measured samples.
-    pub(crate) size: f64,
-    pub(crate) initial: Vec<Vec<Vec<f64>>>,
-    pub(crate) exponents: Vec<Vec<f64>>,
-    pub(crate) parts: Vec<Linearization>,
-}
 
 /// Response of an experiment to an initial term: equation, weighted samples, pulse means.
 ///
@@ -66,22 +50,20 @@ impl FreeModel {
         shelves: &mut [EvaluationCache],
         point: &Point,
         linear: &[usize],
-    ) -> Result<Evaluation> {
+    ) -> Result<Evaluation<Linearization>> {
         let structures = self.structures(&point.orders);
-        let mut out = Evaluation {
-            point: point.clone(),
-            residuals: Vec::new(),
-            size: 0.0,
-            initial: Vec::new(),
-            exponents: Vec::new(),
-            parts: Vec::with_capacity(experiments.len()),
-        };
+        let mut out = Evaluation::empty(point.clone());
         let mut answers = Vec::with_capacity(experiments.len());
         for (experiment, shelf) in experiments.iter().zip(shelves) {
             answers.push(self.simulate_at_rest(experiment, shelf, &structures, point, linear, &mut out)?);
         }
         if !linear.is_empty() {
-            let sides: Vec<(&[f64], &Linearization)> = answers.iter().map(|a| (&a.residuals[..], &a.part)).collect();
+            let sides: Vec<LinearSide<'_>> = (answers.iter())
+                .map(|RestSimulation { part, residuals, .. }| {
+                    let effects = part.linear_effects.iter().map(|d| &d.samples[..]).collect();
+                    (&residuals[..], &part.basis[..], effects)
+                })
+                .collect();
             let moves = solve_linear_steps(&sides)?;
             linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
             for (answer, experiment) in answers.iter_mut().zip(experiments) {
@@ -108,7 +90,7 @@ impl FreeModel {
         structures: &[Structure],
         point: &Point,
         linear: &[usize],
-        out: &mut Evaluation,
+        out: &mut Evaluation<Linearization>,
     ) -> Result<RestSimulation> {
         let record = &experiment.record;
         let acted = (self.inputs.iter().zip(&point.inputs))
@@ -315,7 +297,7 @@ impl FreeModel {
     }
 
     /// Add the initial terms by projection of the residuals on their responses.
-    fn add_initial_terms(answer: RestSimulation, equations: usize, out: &mut Evaluation) -> Result<()> {
+    fn add_initial_terms(answer: RestSimulation, equations: usize, out: &mut Evaluation<Linearization>) -> Result<()> {
         let RestSimulation { mut part, mut residuals, free } = answer;
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
         if !free.is_empty() {
@@ -355,10 +337,6 @@ fn truncate_means(means: &PulseMeans, m: usize) -> Cow<'_, [Vec<f64>]> {
         false => means.iter().map(|row| row[..m.min(row.len())].to_vec()).collect::<Vec<_>>().into(),
     }
 }
-
-/// Damping of the unit columns: a coefficient that is identifiable only at this level, that of rounding, is not
-/// changed.
-const COLLINEARITY_DAMPING: f64 = 1e-7;
 
 impl FreeModel {
     /// Indices of the coefficients that occur alone and only in terms of external inputs.
@@ -425,45 +403,6 @@ impl FreeModel {
             },
         )?;
         Ok(driven)
-    }
-}
-
-/// Solve for the steps of the linear coefficients that minimize the residuals of all experiments.
-///
-/// The initial terms of each experiment are projected out.
-pub(crate) fn solve_linear_steps(sides: &[(&[f64], &Linearization)]) -> Result<Vec<f64>> {
-    let count = sides.first().map_or(0, |(_, part)| part.linear_effects.len());
-    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
-    for (residuals, run) in sides {
-        for (column, part) in
-            columns.iter_mut().zip(run.linear_effects.iter().map(|d| &d.samples[..]).chain([*residuals]))
-        {
-            let first = column.len();
-            column.extend_from_slice(part);
-            project_out(&run.basis, &mut column[first..]);
-        }
-    }
-    let mut scales = Vec::with_capacity(count);
-    for (place, column) in columns.iter_mut().enumerate() {
-        let size = norm(column);
-        if place < count {
-            let scale = if size > 0.0 && size.is_finite() { 1.0 / size } else { 0.0 };
-            column.iter_mut().for_each(|v| *v *= scale);
-            scales.push(scale);
-        }
-        let rows = column.len();
-        column.resize(rows + count, 0.0);
-        if place < count {
-            column[rows + place] = COLLINEARITY_DAMPING;
-        }
-    }
-    let r = dense::triangular_factor(&columns);
-    let stride = count + 1;
-    let rhs: Vec<f64> = (0..count).map(|i| r[i * stride + count]).collect();
-    let moves: Vec<f64> = back_substitute(&r, stride, &rhs).iter().zip(&scales).map(|(s, scale)| s * scale).collect();
-    match moves.iter().position(|v| !v.is_finite()) {
-        Some(index) => Err(Error::Diverged { what: "linear coefficient".into(), index }),
-        None => Ok(moves),
     }
 }
 

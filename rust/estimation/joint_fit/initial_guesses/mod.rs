@@ -1,5 +1,6 @@
 //! Initial guesses of joint fits: order grids on prefiltered records, delays, saturation limits, resonances.
 
+mod integer_orders;
 mod order_grid;
 mod prefilter;
 mod resonances;
@@ -13,6 +14,7 @@ use self::prefilter::LowPassCache;
 use self::resonances::scan_candidates;
 use super::format::format_general;
 use super::multistart::InitialGuessSource;
+use super::objective::Objective;
 use super::parameter_set::ParameterSet;
 use super::problem::Candidate;
 use crate::error::{check_length, Error, Result};
@@ -174,6 +176,12 @@ impl<'a> OrderGrids<'a> {
 impl InitialGuessSource for OrderGrids<'_> {
     fn initial_guesses(&self, free: &ParameterSet) -> Result<Vec<Candidate>> {
         self.candidates(free)
+    }
+
+    fn integer_order_optima(&self, free: &ParameterSet, grid: &Objective<'_>) -> Result<Option<Vec<Candidate>>> {
+        let fastest = self.frequencies(free)?.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
+        let delays = input_points(free, self.source, fastest)?.into_iter().map(|(point, _)| point).collect::<Vec<_>>();
+        integer_orders::integer_order_optima(free, grid, &delays)
     }
 }
 

@@ -72,6 +72,12 @@ const POWER_SHARE: f64 = 0.9;
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn power_frequency(samples: &[f64], step: f64) -> f64 {
+    power_share_frequency(samples, step, POWER_SHARE)
+}
+
+/// Frequency \[rad/s\] below which this share of the power of samples lies.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn power_share_frequency(samples: &[f64], step: f64, share: f64) -> f64 {
     let count = samples.len();
     if count == 0 {
         return f64::NAN;
@@ -91,7 +97,7 @@ pub fn power_frequency(samples: &[f64], step: f64) -> f64 {
     // A constant signal has no power; its bandwidth is the lowest frequency of the run.
     let reached = |power: &f64| {
         below += power;
-        below / whole >= POWER_SHARE || (below / whole).is_nan()
+        below / whole >= share || (below / whole).is_nan()
     };
     let at = power.iter().position(reached).unwrap_or(power.len());
     2.0 * PI * at.max(1) as f64 / (count as f64 * step)

@@ -18,7 +18,7 @@ use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::progress::ProgressListener;
 use crate::estimation::joint_fit::structure::{Equation, Structure};
 use crate::parallel::Stop;
-use crate::recording::Recordings;
+use crate::recording::{Recordings, Sampling};
 
 /// Ratio of the best cost to the noise floor above which candidates behind the best are promoted, too. Candidates up to
 /// [`MAX_PROMOTION_COST_RATIO`] are promoted if they improve in a few evaluations.
@@ -32,6 +32,14 @@ pub trait InitialGuessSource {
     /// # Errors
     /// If its equations cannot be searched; [`Error::Interrupted`].
     fn initial_guesses(&self, free: &ParameterSet) -> Result<Vec<Candidate>>;
+
+    /// Optima of a problem of integer orders on all samples; None for other problems.
+    ///
+    /// # Errors
+    /// As [`InitialGuessSource::initial_guesses`].
+    fn integer_order_optima(&self, _free: &ParameterSet, _grid: &Objective<'_>) -> Result<Option<Vec<Candidate>>> {
+        Ok(None)
+    }
 }
 
 /// Common data of the multistarts of a problem and of its submodels.
@@ -73,10 +81,26 @@ impl<'a> MultistartContext<'a> {
 /// # Errors
 /// As the source, the initial guesses and the callback; [`Error::Interrupted`].
 pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    if let Some(found) = integer_order_multistart(free, course)? {
+        return Ok(found);
+    }
     if free.structure.history {
         return multistart_with_history(free, course);
     }
     Ok(multistart_without_history(free, course)?.0)
+}
+
+/// Optima of a problem of integer orders on all samples, best first; None for other problems.
+fn integer_order_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Option<Vec<Candidate>>> {
+    if !free.orders.is_empty() || free.has_friction() {
+        return Ok(None);
+    }
+    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
+    let grid = Objective::new((&free.problem, course.source, course.stop), weights, Sampling::default(), false)?;
+    let Some(starts) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
+    let found = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
+    Ok((!found.is_empty()).then_some(found))
 }
 
 /// Convert the error of an invalid model to None.
@@ -218,6 +242,9 @@ impl<'a> MultistartState<'a> {
 
     /// Optimize a submodel from its own initial guesses; `going` of them continue.
     fn optimize_nested_model(&self, free: &ParameterSet, going: usize) -> Result<Vec<Candidate>> {
+        if let Some(found) = integer_order_multistart(free, self.course.for_submodel())? {
+            return self.laps.run(free, &self.coarse, &found, SECOND_BUDGET_EVALUATIONS);
+        }
         // With integer orders two of its terms may coincide.
         let Some(starts) = none_if_invalid_model(self.course.starts.initial_guesses(free))? else {
             return Ok(Vec::new());

@@ -1,0 +1,272 @@
+"""Automatic structure of one output: integer orders with zeros, delays and an output level, then fractional forms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from ftlm.data.run import Run
+from ftlm.estimation.output_error import JointFit
+from ftlm.structure.parser import equation
+from ftlm.structure.structure import Structure
+from ftlm.structure_selection.candidates import describe_structure
+from ftlm.structure_selection.cross_validation import Trial, parameter_count, schwarz_criterion
+from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
+
+#: Highest integer order.
+MAX_ORDER = 4
+#: Largest delay in samples, and as a share of the shortest run.
+MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
+#: Number of best candidates of which variants are fitted (an integrator, feedthrough, a level), and that are validated.
+EXTENDED_CANDIDATES, VALIDATED_CANDIDATES, VALIDATED_FRACTIONAL = 3, 6, 2
+#: Difference of Schwarz criteria beyond which a candidate of integer orders is not validated, and one of fractional
+#: orders.
+MAX_BIC_GAP, MAX_FRACTIONAL_BIC_GAP = 60.0, 10.0
+#: Decrease of the criterion for which delays or levels are tried in every candidate.
+SIGNIFICANT_BIC = 6.0
+#: Integer order of a form with a damping term, of which the order of that term may be free.
+MIN_ORDER_OF_TWO_TERMS = 2
+#: Orders at which fractional forms start.
+INITIAL_FRACTIONAL_ORDERS = (0.5, 0.8, 1.2, 1.7)
+
+
+@dataclass(frozen=True)
+class AutomaticForm:
+    """Equation of one output with integer orders: order, zeros, delays, integrator and offset.
+
+    Parameters
+    ----------
+    order
+        Order of the output.
+    zeros
+        Highest derivative of each input.
+    delayed
+        Whether every input has a free delay.
+    integrator
+        Whether the output itself has no term.
+    offset
+        Offset of each run.
+    """
+
+    order: int
+    zeros: int
+    delayed: bool = False
+    integrator: bool = False
+    offset: str = "none"
+
+    def structure(self, runs: Sequence[Run], output: str) -> Structure:
+        """Return the structure of the form for one output of runs."""
+        names = list(runs[0].inputs)
+        powers = range(self.order - 1, int(self.integrator) - 1, -1)
+        own = [f"a{k} {_derivative(k, output)}" for k in powers]
+        driving = [
+            f"b{_number(names, name)}{k} {_derivative(k, name)}" for name in names for k in range(self.zeros, -1, -1)
+        ]
+        text = f"{_derivative(self.order, output)} = {' + '.join([*own, *driving])}"
+        return equation(text, delay=delay_intervals(runs) if self.delayed else None, offset=self.offset)
+
+
+def _derivative(order: int, name: str) -> str:
+    return {0: name, 1: f"D {name}"}.get(order, f"D^{order} {name}")
+
+
+def _number(names: Sequence[str], name: str) -> str:
+    """Number of an input in the names of its coefficients; empty for a single input."""
+    return f"{names.index(name) + 1}_" if len(names) > 1 else ""
+
+
+def delay_intervals(runs: Sequence[Run]) -> dict[str, tuple[float, float]]:
+    """Return intervals [s] of the delays of all inputs."""
+    longest = min(min(MAX_DELAY_SAMPLES, run.length * MAX_DELAY_SHARE) * run.step for run in runs)
+    return dict.fromkeys(runs[0].inputs, (0.0, longest))
+
+
+@dataclass(frozen=True)
+class FittedForm:
+    """Form or structure with its fit and criterion."""
+
+    structure: Structure
+    joint: JointFit
+    bic: float
+    form: AutomaticForm | None = None
+
+
+@dataclass
+class AutomaticSelection:
+    """Automatic selection for one output of some runs.
+
+    Parameters
+    ----------
+    runs
+        Estimation runs.
+    output
+        The output.
+    work
+        Evaluator of the candidates.
+    """
+
+    runs: Sequence[Run]
+    output: str
+    work: CandidateEvaluator
+
+    def run(self) -> list[Trial]:
+        """Fit the candidates and validate the best; return all trials in order."""
+        fits = self._fit_integer_orders()
+        if fits:
+            best = self._validate(fits, VALIDATED_CANDIDATES, MAX_BIC_GAP, fits[0].bic)
+            forms = self._fit_fractional_forms(fits, best)
+            self._validate(forms, VALIDATED_FRACTIONAL, MAX_FRACTIONAL_BIC_GAP, fits[0].bic)
+        return self.work.trials
+
+    def _fit(self, forms: Sequence[AutomaticForm]) -> list[FittedForm]:
+        """Fit forms, best first; a form that cannot be fitted becomes a failed trial."""
+        return self._fit_structures([(f.structure(self.runs, self.output), f, []) for f in dict.fromkeys(forms)])
+
+    def _fit_structures(
+        self, items: Sequence[tuple[Structure, AutomaticForm | None, list[dict[str, float]]]]
+    ) -> list[FittedForm]:
+        joints = self.work.map_candidates(lambda i: self.work.fit_candidate(i[0], i[2], refine=False), items)
+        found = []
+        for (structure, form, _), joint in zip(items, joints, strict=True):
+            if isinstance(joint, JointFit):
+                found.append(FittedForm(structure, joint, self._criterion(structure, joint), form))
+            else:
+                self.work.trials.append(self.work.validate(describe_structure(structure), structure, joint))
+        return sorted(found, key=lambda f: f.bic)
+
+    def _criterion(self, structure: Structure, joint: JointFit) -> float:
+        return schwarz_criterion(joint, parameter_count(structure, joint, self.work.folds), 1.0)
+
+    def _fit_integer_orders(self) -> list[FittedForm]:
+        """Fit integer orders, and variants of the best; best first."""
+        probe = AutomaticForm(2, 1)
+        probes = self._fit([probe, replace(probe, offset="level")])
+        offset = "level" if _gain(probes, lambda f: f.offset == "level") > SIGNIFICANT_BIC else "none"
+        forms = [AutomaticForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
+        fits = self._fit_zeros(forms, probes)
+        if self._is_delayed(fits, offset):
+            fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
+        done = {f.form for f in fits}
+        more = [v for f in fits[:EXTENDED_CANDIDATES] if f.form for v in _variants(f.form) if v not in done]
+        fits += self._fit(more)
+        return sorted(fits, key=lambda f: f.bic)
+
+    def _fit_zeros(self, forms: Sequence[AutomaticForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
+        """Add the fits of forms with all zeros, and of those with fewer that can have the least criterion; best first.
+
+        A form with fewer zeros leaves no less, so its criterion is lower by at most the penalty of its zeros.
+        """
+        known = {f.form for f in fits}
+        full = [*fits, *self._fit([f for f in forms if f not in known])]
+        least = min((f.bic for f in full), default=math.inf)
+        fewer = [
+            replace(form, zeros=m)
+            for form, fitted in ((f.form, f) for f in full)
+            if form is not None and form in forms
+            for m in range(form.order - 1)
+            if fitted.bic - (form.order - 1 - m) * self._penalty(fitted) < least
+        ]
+        return sorted([*full, *self._fit(fewer)], key=lambda f: f.bic)
+
+    def _penalty(self, fitted: FittedForm) -> float:
+        """Penalty of one zero of every input in the criterion."""
+        return len(self.runs[0].inputs) * math.log(fitted.joint.samples)
+
+    def _is_delayed(self, fits: Sequence[FittedForm], offset: str) -> bool:
+        """Whether a delay lowers the criterion of a low order without or with a zero."""
+        probes = self._fit([AutomaticForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])
+        for probe in probes:
+            plain = [f.bic for f in fits if probe.form is not None and f.form == replace(probe.form, delayed=False)]
+            if probe.bic < min(plain, default=math.inf) - SIGNIFICANT_BIC:
+                return True
+        return False
+
+    def _validate(self, fits: Sequence[FittedForm], count: int, gap: float, least: float) -> FittedForm | None:
+        """Validate the best fits; return the one with the best prediction."""
+        ahead = [f for f in fits if f.bic < least + gap][:count]
+        found = self.work.map_candidates(
+            lambda f: self.work.validate(describe_structure(f.structure), f.structure, f.joint), ahead
+        )
+        self.work.trials += found
+        ranked = sorted(zip(found, ahead, strict=True), key=lambda pair: (pair[0].unstable, pair[0].score))
+        return ranked[0][1] if ranked else None
+
+    def _fit_fractional_forms(self, fits: Sequence[FittedForm], best: FittedForm | None) -> list[FittedForm]:
+        """Fit fractional forms from the optima of integer orders, best first.
+
+        They have the offset of the best one of integer orders. If that has a delay, the best of them gets one as well.
+        """
+        form = best.form if best is not None and best.form is not None else AutomaticForm(1, 0)
+        y, frequency = self.output, _frequency(fits, form.offset)
+        names = list(self.runs[0].inputs)
+        inputs = [(_number(names, name), name) for name in names]
+        driving = " + ".join(f"b{number}0 {name}" for number, name in inputs)
+        direct = " + ".join(f"b{number}1 D^alpha {name}" for number, name in inputs)
+        texts = {
+            f"D^alpha {y} = a0 {y} + {driving}": INITIAL_FRACTIONAL_ORDERS,
+            f"D^alpha {y} = a1 D^mu {y} + a0 {y} + {driving}": INITIAL_FRACTIONAL_ORDERS[1:],
+            f"D^alpha {y} = {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
+            f"D^alpha {y} = {direct} + {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
+        }
+        if form.order == MIN_ORDER_OF_TWO_TERMS:
+            texts[f"D^2 {y} = a1 D^mu {y} + a0 {y} + {driving}"] = (2.0,)
+
+        def start(text: str, alpha: float, delays: Mapping[str, float]) -> dict[str, float]:
+            structure = equation(text, offset=form.offset)
+            known = {"a0": -(frequency**alpha), "a1": -0.3 * frequency ** (alpha - 0.5), "alpha": alpha, "mu": 0.5}
+            # The coefficients of the inputs are eliminated at every iterate.
+            gains = dict.fromkeys(structure.coefficient_names, frequency**alpha)
+            names = (*structure.order_names, *structure.coefficient_names)
+            return {n: v for n, v in {**gains, **known}.items() if n in names} | dict(delays)
+
+        found = self._fit_structures(
+            [(equation(t, offset=form.offset), None, [start(t, a, {}) for a in orders]) for t, orders in texts.items()]
+        )
+        if form.delayed and found and best is not None:
+            text = next(t for t in texts if equation(t, offset=form.offset) == found[0].structure)
+            delays = {n: v for n, v in values_of(best.joint).items() if n.startswith("delay_")}
+            begin = [{**values_of(found[0].joint), **delays}, *(start(text, a, delays) for a in texts[text])]
+            delayed = equation(text, delay=delay_intervals(self.runs), offset=form.offset)
+            found += self._fit_structures([(delayed, None, begin)])
+        return sorted(found, key=lambda f: f.bic)
+
+
+def _variants(form: AutomaticForm) -> list[AutomaticForm]:
+    """Forms that differ in one property: an integrator, direct feedthrough, a level."""
+    return [
+        replace(form, integrator=True),
+        replace(form, zeros=form.order),
+        replace(form, offset="level" if form.offset == "none" else "none"),
+    ]
+
+
+def _gain(fits: Sequence[FittedForm], has: Callable[[AutomaticForm], bool]) -> float:
+    """Decrease of the least criterion by a property; 0 if no form has it."""
+    with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
+    without = [f.bic for f in fits if f.form is not None and not has(f.form)]
+    return min(without, default=math.inf) - min(with_it) if with_it else 0.0
+
+
+def _frequency(fits: Sequence[FittedForm], offset: str) -> float:
+    """Frequency [rad/s] of a lag of first order, or of a resonance if that explains more."""
+    for order in (2, 1):
+        for item in fits:
+            if item.form is not None and (item.form.order, item.form.offset, item.form.integrator) == (
+                order,
+                offset,
+                False,
+            ):
+                size = abs(item.joint.coefficients.get("a0", 0.0))
+                damping = abs(item.joint.coefficients.get("a1", 0.0))
+                if order == 1 and size > 0.0:
+                    return size
+                if size > 0.0 and damping < 2.0 * math.sqrt(size):
+                    return math.sqrt(size)
+    return 1.0
+
+
+def is_fractional(structure: Structure) -> bool:
+    """Whether an order of a structure is free or fractional."""
+    orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
+    return any(o.names or not float(o.constant).is_integer() for o in orders)

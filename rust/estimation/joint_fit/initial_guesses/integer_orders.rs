@@ -1,0 +1,709 @@
+//! Optima of equations of integer orders: instrumental variables and lower orders as initial guesses, then variable
+//! projection over the poles.
+//!
+//! State-variable filters 1/(s + λ)^n give first coefficients for several λ (Garnier & Young). Refined instrumental
+//! variables improve them: with the exact simulation x as instrument and y − x as residual a step solves
+//! Σ Ψ_a (y − x − Σ Φ_b d_b) = 0, Ψ = s^i/A x, Φ = s^i/A y. Other guesses add a pole or a pair of poles to the optimum
+//! of a lower order. The best continue in the logarithms of p and q of the sections s² + p s + q, where every point is
+//! stable and no pole is faster than the samples show.
+
+use std::borrow::Cow;
+use std::f64::consts::PI;
+
+use super::prefilter::power_share_frequency;
+use crate::equation::AffineOrder;
+use crate::error::{Error, Result};
+use crate::estimation::joint_fit::format::format_general;
+use crate::estimation::joint_fit::objective::Objective;
+use crate::estimation::joint_fit::parameter_set::ParameterSet;
+use crate::estimation::joint_fit::problem::{Candidate, Iterate};
+use crate::estimation::optimization::damped_step;
+use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings};
+use crate::estimation::output_error::evaluation::{self, solve_linear_steps, LinearSide, RANK_TOLERANCE};
+use crate::estimation::output_error::integer_orders::{
+    source_input, Companion, ExactSimulation, IntegerOrders, SourceInput,
+};
+use crate::estimation::output_error::{Experiment, FreeModel, InputLaw, Monomial, Point};
+use crate::linalg::orthogonal::{extend_orthonormal, project_out};
+use crate::linalg::small::{polynomial_roots, EquilibratedLu};
+use crate::parallel::Stop;
+use crate::signal::block_pulse::Intersample;
+use crate::signal::nonuniform::interpolate_gaps;
+use crate::signal::statistics::{inner, median};
+
+/// Poles λ of the state-variable filters relative to the frequency that halves the power of the output.
+const FILTER_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
+/// Poles added to an optimum of lower order, relative to the same frequency, and damping of an added pair.
+const ADDED_POLE_RATIOS: [f64; 7] = [0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0];
+const ADDED_PAIR_DAMPING: f64 = 0.05;
+/// Steps of the instrumental variables, and halvings of one that does not decrease the cost.
+const INSTRUMENT_STEPS: usize = 8;
+const MAX_HALVINGS: usize = 5;
+/// Initial guesses that continue, and evaluations of each. Costs that differ less are one optimum.
+const CONTINUED_GUESSES: usize = 3;
+const SECTION_EVALUATIONS: usize = 40;
+const SAME_COST_TOLERANCE: f64 = 1e-3;
+const COST_TOLERANCE: f64 = 1e-8;
+/// Largest magnitude of p/2 and √q of a section times the step: a real pole that is faster and a pair above the
+/// Nyquist frequency are not determined by the samples.
+const MAX_DECAY_STEP: f64 = 1.0;
+const MAX_FREQUENCY_STEP: f64 = PI;
+/// Slowest pole relative to the duration of the longest run.
+const MIN_POLE_DURATION: f64 = 1e-4;
+/// Smallest damping of an initial guess.
+const MIN_DAMPING: f64 = 1e-4;
+/// Delays that continue.
+const CONTINUED_DELAYS: usize = 3;
+
+/// Exact simulation at a point.
+type Evaluation<'a> = evaluation::Evaluation<ExactSimulation<'a>>;
+/// Complex pole.
+type Pole = (f64, f64);
+
+/// One equation whose autoregressive coefficients are those of a polynomial.
+struct Equation<'a> {
+    model: FreeModel,
+    experiments: &'a [Experiment],
+    /// Coefficient of each order of the output, from the lowest; the orders below are integrators.
+    own: Vec<usize>,
+    integrators: usize,
+    stop: &'a Stop,
+    /// Frequency that halves the power of the output, step and duration of the runs.
+    frequency: f64,
+    step: f64,
+    duration: f64,
+}
+
+/// Guess with its cost.
+struct Guess {
+    cost: f64,
+    point: Point,
+    origin: String,
+}
+
+/// Optima of a problem of integer orders, best first, each equation for itself; None for other problems.
+///
+/// # Errors
+/// [`Error::Interrupted`]; errors of the runs.
+pub fn integer_order_optima(
+    free: &ParameterSet,
+    grid: &Objective<'_>,
+    delays: &[Vec<f64>],
+) -> Result<Option<Vec<Candidate>>> {
+    let model = &free.problem.model;
+    let plain = free.products.is_empty()
+        && !free.has_friction()
+        && free.orders.is_empty()
+        && (model.equations.len() == 1 || (!model.coupled && model.inputs.is_empty()))
+        && model.inputs.iter().all(|input| input.law == InputLaw::Delay);
+    let start = Point {
+        orders: Vec::new(),
+        coefficients: vec![0.0; free.coefficients.len()],
+        inputs: delays.first().cloned().unwrap_or_default(),
+    };
+    if !plain || IntegerOrders::of(model, grid.experiments(), &start).is_none() {
+        return Ok(None);
+    }
+    let mut found: Vec<Candidate> = Vec::new();
+    for i in 0..model.equations.len() {
+        let experiments: Vec<Experiment> = grid.experiments().iter().map(|e| single_output(e, i)).collect();
+        let Some(equation) = Equation::new(model, i, &experiments, grid.stop()) else { return Ok(None) };
+        let guesses = equation.optima(&start, delays)?;
+        if guesses.is_empty() {
+            return Ok(None);
+        }
+        // Optima of the equations are independent: the k-th candidate has the k-th optimum of each.
+        for (k, guess) in guesses.into_iter().enumerate() {
+            if i == 0 {
+                let place = Iterate { point: guess.point, states: Vec::new() };
+                found.push(Candidate::at(place, guess.origin));
+            } else if k < found.len() {
+                let place = &mut found[k].result.iterate.point;
+                for j in equation.coefficients() {
+                    place.coefficients[j] = guess.point.coefficients[j];
+                }
+            }
+        }
+    }
+    Ok(Some(found))
+}
+
+/// Experiment of one output.
+fn single_output(experiment: &Experiment, i: usize) -> Experiment {
+    let mut one = experiment.clone();
+    one.samples = vec![experiment.samples[i].clone()];
+    one.weights = vec![experiment.weights[i]];
+    one.sample_weights = experiment.sample_weights.get(i).cloned().into_iter().collect();
+    one
+}
+
+impl<'a> Equation<'a> {
+    /// Equation i of a model; None if its autoregressive coefficients are not free ones of their own.
+    #[allow(clippy::cast_precision_loss)]
+    fn new(model: &FreeModel, i: usize, experiments: &'a [Experiment], stop: &'a Stop) -> Option<Self> {
+        let equation = &model.equations[i];
+        let model = FreeModel { equations: vec![equation.clone()], coupled: false, ..model.clone() };
+        let order = integer(&equation.order)?;
+        let mut own = vec![None; order];
+        let alone = |monomial: &Monomial| match monomial.powers[..] {
+            [(j, 1)] if monomial.factor != 0.0 => Some(j),
+            _ => None,
+        };
+        let linear = model.linear_coefficients();
+        for (signal, nu, monomial) in &equation.terms {
+            if *signal == equation.output {
+                let (j, nu) = (alone(monomial)?, integer(nu)?);
+                if nu >= order || own[nu].replace((j, monomial.factor)).is_some() || linear.contains(&j) {
+                    return None;
+                }
+            } else if monomial.powers.iter().any(|(j, _)| !linear.contains(j)) {
+                return None;
+            }
+        }
+        let integrators = own.iter().position(Option::is_some).unwrap_or(order);
+        let own: Vec<(usize, f64)> = own[integrators..].iter().copied().collect::<Option<_>>()?;
+        // Factors other than ±1 do not occur beside free coefficients of their own.
+        if own.iter().any(|(_, factor)| *factor != 1.0) {
+            return None;
+        }
+        let frequency = median(
+            experiments
+                .iter()
+                .map(|e| power_share_frequency(&output_samples(e), e.record.step(), 0.5))
+                .filter(|f| f.is_finite())
+                .collect(),
+        );
+        let step = experiments.iter().map(|e| e.record.step()).fold(f64::INFINITY, f64::min);
+        let duration = experiments.iter().map(|e| e.record.step() * e.record.m() as f64).fold(0.0, f64::max);
+        let own = own.into_iter().map(|(j, _)| j).collect();
+        (frequency > 0.0).then_some(Self { model, experiments, own, integrators, stop, frequency, step, duration })
+    }
+
+    fn order(&self) -> usize {
+        self.integrators + self.own.len()
+    }
+
+    /// Coefficients of the equation.
+    fn coefficients(&self) -> Vec<usize> {
+        self.own.iter().copied().chain(self.model.linear_coefficients()).collect()
+    }
+
+    /// The same equation at a lower order, with the input terms that it can have.
+    #[allow(clippy::cast_precision_loss)]
+    fn at_order(&self, order: usize) -> Self {
+        let mut model = self.model.clone();
+        let equation = &mut model.equations[0];
+        let (output, full) = (equation.output, self.order());
+        equation.terms.retain(|(signal, nu, _)| {
+            let nu = integer(nu).unwrap_or(usize::MAX);
+            nu < order || (nu == full && *signal != output && order == full)
+        });
+        if order < full {
+            equation.order = AffineOrder { constant: order as f64, ..equation.order.clone() };
+        }
+        Self { model, own: self.own[..order - self.integrators].to_vec(), ..*self }
+    }
+
+    /// Optima of the equation, best first.
+    fn optima(&self, start: &Point, delays: &[Vec<f64>]) -> Result<Vec<Guess>> {
+        let delays = self.likely_delays(start, delays)?;
+        let mut lower: Vec<Vec<Vec<Pole>>> = vec![Vec::new(); delays.len()];
+        let mut found = Vec::new();
+        for order in (self.integrators.max(1))..=self.order() {
+            let last = order == self.order();
+            let equation = self.at_order(order);
+            let mut here = Vec::new();
+            for (delay, poles) in delays.iter().zip(&mut lower) {
+                let begin = Point { inputs: delay.clone(), ..start.clone() };
+                let mut guesses = equation.instrumental_variables(&begin)?;
+                guesses.extend(equation.grown(&begin, poles)?);
+                let ends = equation.refine(guesses)?;
+                let best = ends.first().map(|end| equation.poles(&end.point)).unwrap_or_default();
+                poles.push(best);
+                here.extend(ends);
+            }
+            if last {
+                found = here;
+            }
+        }
+        found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        Ok(found)
+    }
+
+    /// Delays at which a filter of second order fits best: local minima of its cost.
+    fn likely_delays(&self, start: &Point, delays: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
+        if delays.len() <= CONTINUED_DELAYS {
+            return Ok(if delays.is_empty() { vec![Vec::new()] } else { delays.to_vec() });
+        }
+        let equation = self.at_order(self.order().min(self.integrators + 2));
+        let mut costs = Vec::with_capacity(delays.len());
+        for delay in delays {
+            let point = Point { inputs: delay.clone(), ..start.clone() };
+            let mut least = f64::INFINITY;
+            for ratio in [1.0, 4.0] {
+                if let Some(found) = equation.filtered_least_squares(&point, ratio * self.frequency)? {
+                    least = least.min(equation.evaluate(&found)?.map_or(f64::INFINITY, |e| cost(&e)));
+                }
+            }
+            costs.push(least);
+        }
+        let mut order: Vec<usize> = (0..delays.len()).collect();
+        order.sort_by(|&i, &j| costs[i].total_cmp(&costs[j]));
+        Ok(order.into_iter().take(CONTINUED_DELAYS).map(|i| delays[i].clone()).collect())
+    }
+
+    /// Guesses by state-variable filters and refined instrumental variables.
+    fn instrumental_variables(&self, start: &Point) -> Result<Vec<Guess>> {
+        let mut guesses = Vec::new();
+        for ratio in FILTER_RATIOS {
+            let corner = ratio * self.frequency;
+            if corner * self.step > PI {
+                continue;
+            }
+            let Some(point) = self.filtered_least_squares(start, corner)? else { continue };
+            let origin = format!("instrumental variables, filter {} rad/s", format_general(corner, 3));
+            if let Some(unbent) = self.evaluate(&point)?.filter(|_| !self.is_stable(&point)) {
+                let origin = format!("{origin}, unstable");
+                guesses.push(Guess { cost: cost(&unbent), point: unbent.point, origin });
+            }
+            if let Some(refined) = self.refine_instruments(&self.stabilize(&point))? {
+                guesses.push(Guess { cost: cost(&refined), point: refined.point, origin });
+            }
+        }
+        Ok(guesses)
+    }
+
+    /// Guesses with one real pole or one pair more than the optima of lower orders.
+    fn grown(&self, start: &Point, lower: &[Vec<Pole>]) -> Result<Vec<Guess>> {
+        let mut guesses = Vec::new();
+        for more in 1..=2_usize {
+            let Some(poles) = lower.len().checked_sub(more).map(|k| &lower[k]) else { continue };
+            if poles.len() + more != self.own.len() {
+                continue;
+            }
+            for ratio in ADDED_POLE_RATIOS {
+                let size = ratio * self.frequency;
+                let mut with = poles.clone();
+                match more {
+                    1 => with.push((-size, 0.0)),
+                    _ => {
+                        let (decay, swing) = (ADDED_PAIR_DAMPING * size, (1.0 - ADDED_PAIR_DAMPING.powi(2)).sqrt());
+                        with.extend([(-decay, swing * size), (-decay, -swing * size)]);
+                    }
+                }
+                let point = self.at_poles(start, &with);
+                if let Some(found) = self.evaluate(&point)? {
+                    guesses.push(Guess { cost: cost(&found), point: found.point, origin: "lower order".into() });
+                }
+            }
+        }
+        Ok(guesses)
+    }
+
+    /// Refine the best distinct guesses by variable projection over their sections.
+    fn refine(&self, mut guesses: Vec<Guess>) -> Result<Vec<Guess>> {
+        guesses.retain(|guess| guess.cost.is_finite());
+        guesses.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        let (mut ends, mut costs) = (Vec::<Guess>::new(), Vec::<f64>::new());
+        for guess in guesses {
+            if ends.len() >= CONTINUED_GUESSES {
+                break;
+            }
+            if costs.iter().any(|cost| (guess.cost / cost - 1.0).abs() < SAME_COST_TOLERANCE) {
+                continue;
+            }
+            costs.push(guess.cost);
+            if !self.is_stable(&guess.point) {
+                ends.push(guess);
+                continue;
+            }
+            let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &guess.point) else { continue };
+            let problem =
+                SectionsProblem { equation: self, exact, linear: self.model.linear_coefficients(), base: &guess.point };
+            let settings = Settings { evaluations: SECTION_EVALUATIONS, tolerance: COST_TOLERANCE };
+            let sections = self.sections(&self.poles(&guess.point));
+            let start = [sections, guess.point.inputs.clone()].concat();
+            match minimize(&problem, problem.clamp_to_bounds(start), settings) {
+                Ok(found) => {
+                    ends.push(Guess { cost: found.cost, point: found.evaluation.point, origin: guess.origin });
+                }
+                Err(Error::Interrupted) => return Err(Error::Interrupted),
+                Err(_) => ends.push(guess),
+            }
+        }
+        ends.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        Ok(ends)
+    }
+
+    /// Simulation at a point with its best input coefficients; None if it is not finite.
+    fn evaluate(&self, point: &Point) -> Result<Option<Evaluation<'a>>> {
+        self.stop.check()?;
+        let Some(exact) = IntegerOrders::of(&self.model, self.experiments, point) else { return Ok(None) };
+        let linear = self.model.linear_coefficients();
+        Ok(exact.evaluate(&self.model, self.experiments, point, &linear).ok().filter(|e| cost(e).is_finite()))
+    }
+
+    /// Coefficients of s^0 … s^(n − 1) of the divisor.
+    fn divisor(&self, point: &Point) -> Vec<f64> {
+        let own = self.own.iter().map(|&j| -point.coefficients[j]);
+        std::iter::repeat_n(0.0, self.integrators).chain(own).collect()
+    }
+
+    /// Poles without the integrators.
+    fn poles(&self, point: &Point) -> Vec<Pole> {
+        let mut divisor = self.divisor(point)[self.integrators..].to_vec();
+        divisor.push(1.0);
+        polynomial_roots(&divisor).unwrap_or_default()
+    }
+
+    fn is_stable(&self, point: &Point) -> bool {
+        let poles = self.poles(point);
+        poles.len() == self.own.len() && poles.iter().all(|(re, _)| *re < 0.0)
+    }
+
+    fn at_poles(&self, point: &Point, poles: &[Pole]) -> Point {
+        let mut moved = point.clone();
+        for (&j, c) in self.own.iter().zip(polynomial(poles)) {
+            moved.coefficients[j] = -c;
+        }
+        moved
+    }
+
+    /// Point with unstable poles reflected and poles within the bounds of the sampling.
+    fn stabilize(&self, point: &Point) -> Point {
+        let (fastest, slowest) = (MAX_FREQUENCY_STEP / self.step, MIN_POLE_DURATION / self.duration);
+        let poles = self.poles(point);
+        if poles.len() != self.own.len() {
+            return point.clone();
+        }
+        let within = |(re, im): Pole| {
+            let size = re.hypot(im);
+            let share = if size > fastest { fastest / size } else { 1.0 };
+            let decay = (re.abs() * share).max(MIN_DAMPING * size * share).max(slowest);
+            (-decay, im * share)
+        };
+        self.at_poles(point, &poles.into_iter().map(within).collect::<Vec<_>>())
+    }
+
+    /// Logarithms of p and q of the sections s² + p s + q, then of the real pole that is left.
+    fn sections(&self, poles: &[Pole]) -> Vec<f64> {
+        let slowest = MIN_POLE_DURATION / self.duration;
+        let mut real: Vec<f64> = poles.iter().filter(|(_, im)| *im == 0.0).map(|(re, _)| (-re).max(slowest)).collect();
+        real.sort_by(f64::total_cmp);
+        let mut out = Vec::with_capacity(poles.len());
+        for (re, im) in poles.iter().filter(|(_, im)| *im > 0.0) {
+            out.extend([(-2.0 * re).max(slowest).ln(), (re * re + im * im).ln()]);
+        }
+        while real.len() >= 2 {
+            let (slow, fast) = (real.remove(0), real.pop().unwrap_or(slowest));
+            out.extend([(slow + fast).ln(), (slow * fast).ln()]);
+        }
+        out.extend(real.iter().map(|w| w.ln()));
+        out
+    }
+
+    /// Point from filtered samples by least squares: [s^n/F] y = Σ a_i [s^i/F] y + Σ b_j [s^j/F] u, F = (s + λ)^n.
+    #[allow(clippy::type_complexity)]
+    fn filtered_least_squares(&self, start: &Point, corner: f64) -> Result<Option<Point>> {
+        self.stop.check()?;
+        let n = self.order();
+        let filter: Vec<f64> = polynomial(&vec![(-corner, 0.0); n]).iter().map(|c| -c).collect();
+        let linear = self.model.linear_coefficients();
+        let equation = &self.model.equations[0];
+        let mut companions = Vec::new();
+        let mut sides: Vec<(Vec<f64>, Vec<Vec<f64>>, Vec<Vec<f64>>)> = Vec::new();
+        for experiment in self.experiments {
+            let (count, step) = (experiment.compared_count(), experiment.record.step());
+            let companion = Companion::of_width(&mut companions, &filter, step);
+            let grid = (experiment.pulses_per_sample, count);
+            let respond = |input: Option<&SourceInput<'_>>| companion.respond(input, None, grid);
+            let weighted = |column: Vec<f64>| column.iter().zip(experiment.weights_of(0)).map(|(v, w)| v * w).collect();
+            let Some(output) = respond(Some(&measured_input(experiment))) else { return Ok(None) };
+            let mut target = companion.derivative(&output, n);
+            let mut columns = vec![vec![0.0; count]; self.own.len() + linear.len()];
+            for (place, column) in columns.iter_mut().enumerate().take(self.own.len()) {
+                *column = companion.derivative(&output, self.integrators + place);
+            }
+            for (signal, nu, monomial) in equation.terms.iter().filter(|(signal, ..)| *signal != equation.output) {
+                let input = source_input(&self.model, experiment, *signal, start)?;
+                let (Some(response), Some(nu)) = (respond(Some(&input)), integer(nu)) else { return Ok(None) };
+                let acted = companion.derivative(&response, nu);
+                match monomial.powers.first().and_then(|(j, _)| linear.iter().position(|l| l == j)) {
+                    Some(place) => {
+                        let column = &mut columns[self.own.len() + place];
+                        column.iter_mut().zip(&acted).for_each(|(v, a)| *v += monomial.factor * a);
+                    }
+                    None => target.iter_mut().zip(&acted).for_each(|(v, a)| *v -= monomial.factor * a),
+                }
+            }
+            let mut basis = Vec::new();
+            if !self.model.initial.is_at_rest() || self.model.initial.has_level() {
+                let held = |samples: Vec<f64>| SourceInput {
+                    samples: Cow::Owned(samples),
+                    between: Intersample::Hold,
+                    delay: 0.0,
+                    before: 0.0,
+                };
+                let (Some(impulse), Some(constant)) = (respond(None), respond(Some(&held(vec![1.0])))) else {
+                    return Ok(None);
+                };
+                for j in 0..n {
+                    extend_orthonormal(&mut basis, weighted(companion.derivative(&impulse, j)), RANK_TOLERANCE);
+                }
+                if !self.model.initial.without_offset().eq(&self.model.initial) {
+                    extend_orthonormal(&mut basis, weighted(companion.derivative(&constant, 0)), RANK_TOLERANCE);
+                }
+            }
+            sides.push((weighted(target), basis, columns.into_iter().map(weighted).collect()));
+        }
+        let sides: Vec<LinearSide<'_>> = (sides.iter())
+            .map(|(target, basis, columns)| (&target[..], &basis[..], columns.iter().map(Vec::as_slice).collect()))
+            .collect();
+        let Ok(solution) = solve_linear_steps(&sides) else { return Ok(None) };
+        let mut point = start.clone();
+        for (&j, value) in self.own.iter().chain(&linear).zip(&solution) {
+            point.coefficients[j] = *value;
+        }
+        Ok(Some(point))
+    }
+
+    /// Improve a point by refined instrumental variables; None if it has no finite simulation.
+    fn refine_instruments(&self, start: &Point) -> Result<Option<Evaluation<'a>>> {
+        let Some(mut here) = self.evaluate(start)? else { return Ok(None) };
+        for _ in 0..INSTRUMENT_STEPS {
+            let Some(step) = self.instrument_step(&here)? else { break };
+            let (mut share, mut next) = (1.0, None);
+            for _ in 0..MAX_HALVINGS {
+                let mut point = here.point.clone();
+                for (&j, by) in self.own.iter().zip(&step) {
+                    point.coefficients[j] += share * by;
+                }
+                next = self.evaluate(&self.stabilize(&point))?.filter(|there| cost(there) < cost(&here));
+                if next.is_some() {
+                    break;
+                }
+                share *= 0.5;
+            }
+            let Some(there) = next else { break };
+            let gain = 1.0 - cost(&there) / cost(&here);
+            here = there;
+            if gain < 1e-4 {
+                break;
+            }
+        }
+        Ok(Some(here))
+    }
+
+    /// Step of the autoregressive coefficients with the simulation as instrument; None if it is not determined.
+    fn instrument_step(&self, here: &Evaluation<'a>) -> Result<Option<Vec<f64>>> {
+        let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &here.point) else { return Ok(None) };
+        let linear = self.model.linear_coefficients();
+        let Ok(jacobian) = exact.jacobian(&self.model, self.experiments, &linear, here) else { return Ok(None) };
+        let orders = here.point.orders.len();
+        let places: Vec<usize> = self.own.iter().chain(&linear).map(|j| orders + j).collect();
+        let own: Vec<f64> = self.divisor(&here.point).iter().map(|c| -c).collect();
+        let mut regressors: Vec<Vec<f64>> = vec![Vec::new(); self.own.len()];
+        let mut companions = Vec::new();
+        for (experiment, basis) in self.experiments.iter().zip(here.parts.iter().map(ExactSimulation::basis)) {
+            let companion = Companion::of_width(&mut companions, &own, experiment.record.step());
+            let grid = (experiment.pulses_per_sample, experiment.compared_count());
+            let Some(output) = companion.respond(Some(&measured_input(experiment)), None, grid) else {
+                return Ok(None);
+            };
+            for (place, column) in regressors.iter_mut().enumerate() {
+                let part = companion.derivative(&output, self.integrators + place);
+                let mut part: Vec<f64> = part.iter().zip(experiment.weights_of(0)).map(|(v, w)| v * w).collect();
+                project_out(basis, &mut part);
+                column.extend(part);
+            }
+        }
+        let k = places.len();
+        let (mut cross, mut right) = (vec![0.0; k * k], vec![0.0; k]);
+        for (a, &instrument) in places.iter().enumerate() {
+            // The Jacobian is that of the residuals, measured minus simulated samples.
+            right[a] = -inner(&jacobian[instrument], &here.residuals);
+            for b in 0..k {
+                cross[a * k + b] = match regressors.get(b) {
+                    Some(regressor) => -inner(&jacobian[instrument], regressor),
+                    None => inner(&jacobian[instrument], &jacobian[places[b]]),
+                };
+            }
+        }
+        let Ok(factor) = EquilibratedLu::new(&cross, k) else { return Ok(None) };
+        let step = factor.solve(&right);
+        Ok(step.iter().all(|v| v.is_finite()).then(|| step[..self.own.len()].to_vec()))
+    }
+}
+
+/// Samples of the only output, with gaps interpolated.
+fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
+    let samples = &experiment.samples[0];
+    let Some(weights) = experiment.sample_weights.first().filter(|w| w.contains(&0.0)) else {
+        return Cow::Borrowed(samples);
+    };
+    let known = |(k, v): (usize, &f64)| {
+        let read = k == 0 || weights.get(k - 1).is_none_or(|w| *w > 0.0);
+        if read {
+            *v
+        } else {
+            f64::NAN
+        }
+    };
+    let marked: Vec<f64> = samples.iter().enumerate().map(known).collect();
+    Cow::Owned(interpolate_gaps(&marked).into_owned())
+}
+
+/// The measured output as input of a filter, linear between samples.
+fn measured_input(experiment: &Experiment) -> SourceInput<'_> {
+    SourceInput { samples: output_samples(experiment), between: Intersample::Linear, delay: 0.0, before: 0.0 }
+}
+
+/// Integer from a fixed order.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn integer(order: &AffineOrder) -> Option<usize> {
+    let nearest = order.constant.round();
+    (order.weights.iter().all(|w| *w == 0.0) && nearest >= 0.0 && (order.constant - nearest).abs() < 1e-9)
+        .then_some(nearest as usize)
+}
+
+/// Half the sum of squared residuals.
+fn cost(evaluation: &Evaluation<'_>) -> f64 {
+    0.5 * inner(&evaluation.residuals, &evaluation.residuals)
+}
+
+/// Coefficients of s^0 … s^(n − 1) of the monic real polynomial with these zeros.
+fn polynomial(zeros: &[Pole]) -> Vec<f64> {
+    let mut product = vec![1.0];
+    for &(re, im) in zeros {
+        if im == 0.0 {
+            product = multiply(&product, &[-re, 1.0]);
+        } else if im > 0.0 {
+            product = multiply(&product, &[re * re + im * im, -2.0 * re, 1.0]);
+        }
+    }
+    product.pop();
+    product
+}
+
+fn multiply(a: &[f64], b: &[f64]) -> Vec<f64> {
+    let mut product = vec![0.0; a.len() + b.len() - 1];
+    for (i, x) in a.iter().enumerate() {
+        for (j, y) in b.iter().enumerate() {
+            product[i + j] += x * y;
+        }
+    }
+    product
+}
+
+/// Least squares over the logarithms of the sections and the delays.
+struct SectionsProblem<'e, 'a> {
+    equation: &'e Equation<'a>,
+    exact: IntegerOrders,
+    linear: Vec<usize>,
+    base: &'e Point,
+}
+
+impl SectionsProblem<'_, '_> {
+    /// Sections as polynomials with the derivatives of their coefficients with respect to their logarithms.
+    fn factors(&self, sections: &[f64]) -> Vec<(Vec<f64>, Vec<Vec<f64>>)> {
+        let pair = |c: &[f64]| match c {
+            [p, q] => (vec![q.exp(), p.exp(), 1.0], vec![vec![0.0, p.exp()], vec![q.exp()]]),
+            _ => (vec![c[0].exp(), 1.0], vec![vec![c[0].exp()]]),
+        };
+        sections.chunks(2).map(pair).collect()
+    }
+
+    fn bounds(&self, k: usize) -> (f64, f64) {
+        let equation = self.equation;
+        let count = equation.own.len();
+        let (slowest, decay, frequency) = (
+            (MIN_POLE_DURATION / equation.duration).ln(),
+            (MAX_DECAY_STEP / equation.step).ln(),
+            (MAX_FREQUENCY_STEP / equation.step).ln(),
+        );
+        match k {
+            k if k >= count => equation.model.inputs[k - count].bounds,
+            k if k % 2 == 1 => (2.0 * slowest, 2.0 * frequency),
+            k if k + 1 == count => (slowest, decay),
+            _ => (slowest, decay + 2.0_f64.ln()),
+        }
+    }
+
+    fn clamp_to_bounds(&self, mut point: Vec<f64>) -> Vec<f64> {
+        for (k, v) in point.iter_mut().enumerate() {
+            let (low, high) = self.bounds(k);
+            *v = v.max(low).min(high);
+        }
+        point
+    }
+}
+
+impl<'a> damped_step::Problem for SectionsProblem<'_, 'a> {
+    type Point = Vec<f64>;
+    type Evaluation = Evaluation<'a>;
+
+    fn evaluate(&self, point: &Vec<f64>) -> Result<Evaluation<'a>> {
+        let equation = self.equation;
+        equation.stop.check()?;
+        let count = equation.own.len();
+        let product = self.factors(&point[..count]).iter().fold(vec![1.0], |a, (section, _)| multiply(&a, section));
+        let mut at = self.base.clone();
+        at.inputs = point[count..].to_vec();
+        for (&j, c) in equation.own.iter().zip(&product) {
+            at.coefficients[j] = -c;
+        }
+        self.exact.evaluate(&equation.model, equation.experiments, &at, &self.linear)
+    }
+
+    fn residuals<'e>(&self, evaluation: &'e Evaluation<'a>) -> &'e [f64] {
+        &evaluation.residuals
+    }
+
+    fn jacobian(&self, point: &Vec<f64>, evaluation: &Evaluation<'a>) -> Result<Vec<Vec<f64>>> {
+        let equation = self.equation;
+        let mut of = self.exact.jacobian(&equation.model, equation.experiments, &self.linear, evaluation)?;
+        let (orders, count) = (evaluation.point.orders.len(), equation.own.len());
+        let factors = self.factors(&point[..count]);
+        // Variable projection in Kaufman's form: the columns of the input coefficients are projected out.
+        let basis = {
+            let mut basis = Vec::new();
+            for &j in &self.linear {
+                extend_orthonormal(&mut basis, of[orders + j].clone(), RANK_TOLERANCE);
+            }
+            basis
+        };
+        let mut columns = Vec::with_capacity(point.len());
+        for (k, (_, slopes)) in factors.iter().enumerate() {
+            let others = factors.iter().enumerate().filter(|(other, _)| *other != k);
+            let others = others.fold(vec![1.0], |a, (_, (section, _))| multiply(&a, section));
+            for slope in slopes {
+                let mut column = vec![0.0; evaluation.residuals.len()];
+                for (&j, by) in equation.own.iter().zip(multiply(&others, slope)) {
+                    column.iter_mut().zip(&of[orders + j]).for_each(|(v, d)| *v -= by * d);
+                }
+                columns.push(column);
+            }
+        }
+        columns.extend(of.drain(orders + evaluation.point.coefficients.len()..));
+        columns.iter_mut().for_each(|column| project_out(&basis, column));
+        Ok(columns)
+    }
+
+    fn apply_step(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
+        let count = self.equation.own.len();
+        let limited = |(k, (v, by)): (usize, (&f64, &f64))| if k < count { v + by.clamp(-1.5, 1.5) } else { v + by };
+        let next = self.clamp_to_bounds(point.iter().zip(steps).enumerate().map(limited).collect());
+        let size = |k: usize| if k < count { 1.0 } else { self.bounds(k).1.max(f64::MIN_POSITIVE) };
+        let moved = next.iter().zip(point).enumerate().map(|(k, (a, b))| (a - b).abs() / size(k)).fold(0.0, f64::max);
+        (next, moved)
+    }
+
+    fn distance_to_bounds(&self, point: &Vec<f64>, k: usize) -> (f64, f64) {
+        let (low, high) = self.bounds(k);
+        (point[k] - low, high - point[k])
+    }
+
+    fn has_kinks(&self, _point: &Vec<f64>, k: usize) -> bool {
+        k >= self.equation.own.len()
+    }
+}

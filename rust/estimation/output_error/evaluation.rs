@@ -1,0 +1,74 @@
+//! Residuals at a point, and the elimination of the linear coefficients.
+
+use super::parameterization::Point;
+use crate::error::{Error, Result};
+use crate::linalg::dense;
+use crate::linalg::orthogonal::{norm, project_out};
+use crate::linalg::small::back_substitute;
+
+/// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
+pub(crate) const RANK_TOLERANCE: f64 = 1e-12;
+
+/// Residuals at a point, and intermediates `P` of each experiment for their derivatives.
+pub(crate) struct Evaluation<P> {
+    /// The point, with optimal values of the linear coefficients.
+    pub(crate) point: Point,
+    pub(crate) residuals: Vec<f64>,
+    /// Norm of the weighted measured samples.
+    pub(crate) size: f64,
+    pub(crate) initial: Vec<Vec<Vec<f64>>>,
+    pub(crate) exponents: Vec<Vec<f64>>,
+    pub(crate) parts: Vec<P>,
+}
+
+impl<P> Evaluation<P> {
+    /// Evaluation before any experiment.
+    pub(crate) fn empty(point: Point) -> Self {
+        let (residuals, initial, exponents) = (Vec::new(), Vec::new(), Vec::new());
+        Self { point, residuals, size: 0.0, initial, exponents, parts: Vec::new() }
+    }
+}
+
+/// Damping of the unit columns: a coefficient that is identifiable only at this level, that of rounding, is not
+/// changed.
+const COLLINEARITY_DAMPING: f64 = 1e-7;
+
+/// Residuals of an experiment, the basis of its initial terms, and the effects of the linear coefficients on its samples.
+pub(crate) type LinearSide<'a> = (&'a [f64], &'a [Vec<f64>], Vec<&'a [f64]>);
+
+/// Solve for the steps of the linear coefficients that minimize the residuals of all experiments.
+///
+/// The initial terms of each experiment are projected out.
+pub(crate) fn solve_linear_steps(sides: &[LinearSide<'_>]) -> Result<Vec<f64>> {
+    let count = sides.first().map_or(0, |(_, _, effects)| effects.len());
+    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
+    for (residuals, basis, effects) in sides {
+        for (column, part) in columns.iter_mut().zip(effects.iter().chain([residuals])) {
+            let first = column.len();
+            column.extend_from_slice(part);
+            project_out(basis, &mut column[first..]);
+        }
+    }
+    let mut scales = Vec::with_capacity(count);
+    for (place, column) in columns.iter_mut().enumerate() {
+        let size = norm(column);
+        if place < count {
+            let scale = if size > 0.0 && size.is_finite() { 1.0 / size } else { 0.0 };
+            column.iter_mut().for_each(|v| *v *= scale);
+            scales.push(scale);
+        }
+        let rows = column.len();
+        column.resize(rows + count, 0.0);
+        if place < count {
+            column[rows + place] = COLLINEARITY_DAMPING;
+        }
+    }
+    let r = dense::triangular_factor(&columns);
+    let stride = count + 1;
+    let rhs: Vec<f64> = (0..count).map(|i| r[i * stride + count]).collect();
+    let moves: Vec<f64> = back_substitute(&r, stride, &rhs).iter().zip(&scales).map(|(s, scale)| s * scale).collect();
+    match moves.iter().position(|v| !v.is_finite()) {
+        Some(index) => Err(Error::Diverged { what: "linear coefficient".into(), index }),
+        None => Ok(moves),
+    }
+}

@@ -1,0 +1,761 @@
+//! Exact output samples of equations of integer orders, and their derivatives.
+//!
+//! Let D^n y = Σ a_i D^i y + Σ b_j D^j u, A(s) = s^n − Σ a_i s^i. The samples of s^j/A u are states of one companion
+//! form, advanced from pulse to pulse by its matrix exponential. This is exact for an input that is held or linear over
+//! a pulse, with any delay of a held input. y is linear in b_j, its derivative with respect to a_i is s^i/A y, a state of
+//! two companion forms in series, and its derivative with respect to a delay is −D y. A power of t is the response to an
+//! impulse, a constant or a ramp. Time is scaled by the largest coefficient, so that no element of the companion form is
+//! above 1.
+
+use std::borrow::Cow;
+use std::cell::RefCell;
+use std::rc::Rc;
+
+use super::evaluation::{solve_linear_steps, Evaluation, LinearSide, RANK_TOLERANCE};
+use super::experiment::Experiment;
+use super::parameterization::{FreeModel, InputLaw, Point};
+
+use crate::error::{Error, Result};
+use crate::estimation::least_squares;
+use crate::linalg::orthogonal::{extend_orthonormal, project_out};
+use crate::linalg::small::spectral_radius;
+use crate::signal::block_pulse::Intersample;
+use crate::state_space::{InputGains, Transition};
+
+/// Difference below which an order or exponent is an integer.
+const INTEGER_TOLERANCE: f64 = 1e-9;
+/// Largest order of an equation.
+const MAX_ORDER: usize = 12;
+/// Largest magnitude of a pole times the sampling interval: half the sampling frequency. Faster poles have no effect on
+/// the samples that noise would not have as well.
+const MAX_POLE_PHASE_RAD: f64 = std::f64::consts::PI;
+
+/// Equations of integer orders whose inputs are held or linear in every experiment.
+pub(crate) struct IntegerOrders {
+    equations: Vec<EquationOrders>,
+}
+
+/// Orders of one equation.
+struct EquationOrders {
+    order: usize,
+    /// Index and order of the autoregressive terms.
+    own: Vec<(usize, usize)>,
+    /// Input signals, each with index and order of its terms.
+    inputs: Vec<(usize, Vec<(usize, usize)>)>,
+}
+
+/// Input of a companion form.
+pub(crate) struct SourceInput<'a> {
+    /// A value per pulse if held, per edge if linear.
+    pub(crate) samples: Cow<'a, [f64]>,
+    pub(crate) between: Intersample,
+    /// Delay of a held input in pulses, and the value before the first pulse.
+    pub(crate) delay: f64,
+    pub(crate) before: f64,
+}
+
+/// Input or initial term of a companion form.
+enum SourceKind {
+    /// Index of the input in the equation.
+    Input(usize),
+    /// Powers of t below the order.
+    Impulse,
+    /// Power of t at the order or one above it: the exponent.
+    Power(usize),
+}
+
+/// One source of an equation and its states.
+struct Source<'a> {
+    kind: SourceKind,
+    input: Option<SourceInput<'a>>,
+    /// States at the compared samples, a row per sample.
+    states: Vec<f64>,
+    /// Input just after the compared samples.
+    values: Vec<f64>,
+}
+
+/// Companion form of A(s) in scaled time.
+pub(crate) struct Companion {
+    pub(crate) order: usize,
+    /// Unit of frequency.
+    scale: f64,
+    /// Autoregressive coefficients in scaled time, a_i scale^(i − n).
+    own: Vec<f64>,
+    /// Pulse width in scaled time, and in seconds.
+    step: f64,
+    width: f64,
+    /// Discretizations so far, shared by all experiments of this pulse width.
+    known: RefCell<Vec<Rc<Discretization>>>,
+}
+
+/// Inter-sample behavior of the input, None without one; fraction of a pulse in its delay; output row and direct gain of
+/// the series connection.
+type DiscretizationKey = (Option<Intersample>, u64, Option<(Vec<f64>, f64)>);
+
+/// Exact advance of the states by one pulse.
+struct Discretization {
+    key: DiscretizationKey,
+    /// e^M − I, column-major.
+    growth: Vec<f64>,
+    gains: Option<InputGains>,
+}
+
+/// Pulses per sample, number of compared samples.
+type Grid = (usize, usize);
+
+impl Companion {
+    /// Companion form of s^n − Σ own_i s^i for pulses of width `step`.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
+    pub(crate) fn new(own: &[f64], step: f64) -> Self {
+        let order = own.len();
+        let root = |(i, a): (usize, &f64)| libm::pow(a.abs(), 1.0 / (order - i) as f64);
+        let scale = own.iter().enumerate().map(root).fold(0.0, f64::max);
+        let scale = if scale > 0.0 && scale.is_finite() { scale } else { 1.0 / step };
+        let own = own.iter().enumerate().map(|(i, a)| a * scale.powi(i as i32 - order as i32)).collect();
+        Self { order, scale, own, step: step * scale, width: step, known: RefCell::default() }
+    }
+
+    /// Companion form for this pulse width, from a list of those so far.
+    pub(crate) fn of_width(known: &mut Vec<Rc<Self>>, own: &[f64], step: f64) -> Rc<Self> {
+        if let Some(found) = known.iter().find(|c| c.width.to_bits() == step.to_bits()) {
+            return found.clone();
+        }
+        known.push(Rc::new(Self::new(own, step)));
+        known[known.len() - 1].clone()
+    }
+
+    /// scale^power.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    fn power(&self, power: isize) -> f64 {
+        self.scale.powi(power as i32)
+    }
+
+    /// Output row of Σ coefficient s^j/A over (j, coefficient), and the direct gain.
+    #[allow(clippy::cast_possible_wrap)]
+    fn output(&self, terms: impl Iterator<Item = (usize, f64)>) -> (Vec<f64>, f64) {
+        let (n, mut row, mut direct) = (self.order, vec![0.0; self.order], 0.0);
+        for (j, c) in terms {
+            if j < n {
+                row[j] += c * self.power(j as isize - n as isize);
+            } else if j == n {
+                direct += c;
+                row.iter_mut().zip(&self.own).for_each(|(r, a)| *r += c * a);
+            }
+        }
+        (row, direct)
+    }
+
+    /// Samples of s^j/A of an input or impulse with this response, j up to the order.
+    pub(crate) fn derivative(&self, (states, values): &(Vec<f64>, Vec<f64>), j: usize) -> Vec<f64> {
+        let (read, direct) = self.output(std::iter::once((j, 1.0)));
+        let of = |(row, u): (&[f64], &f64)| row.iter().zip(&read).map(|(x, c)| x * c).sum::<f64>() + direct * u;
+        states.chunks_exact(self.order.max(1)).zip(values).map(of).collect()
+    }
+
+    /// Response to an input or an impulse: states of 1/A, and with an output row those of 1/A behind it.
+    ///
+    /// The states come at the compared samples, with the input just after each. None on overflow.
+    pub(crate) fn respond(
+        &self,
+        input: Option<&SourceInput<'_>>,
+        behind: Option<(&[f64], f64)>,
+        grid: Grid,
+    ) -> Option<(Vec<f64>, Vec<f64>)> {
+        let n = self.order;
+        let total = if behind.is_some() { 2 * n } else { n };
+        let fraction = input.map_or(0.0, |input| input.delay - input.delay.floor());
+        let discretization = self.discretization(input.map(|input| input.between), fraction, behind)?;
+        let mut start = vec![0.0; total];
+        if input.is_none() {
+            start[n - 1] = 1.0;
+        }
+        discretization.advance(start, input, grid)
+    }
+
+    /// Discretization of 1/A, or of 1/A behind an output row of it.
+    fn discretization(
+        &self,
+        between: Option<Intersample>,
+        fraction: f64,
+        behind: Option<(&[f64], f64)>,
+    ) -> Option<Rc<Discretization>> {
+        let key = (between, fraction.to_bits(), behind.map(|(read, direct)| (read.to_vec(), direct)));
+        if let Some(found) = self.known.borrow().iter().find(|d| d.key == key) {
+            return Some(found.clone());
+        }
+        let n = self.order;
+        let total = if behind.is_some() { 2 * n } else { n };
+        let (mut system, mut drive) = (vec![0.0; total * total], vec![0.0; total]);
+        for first in (0..total).step_by(n.max(1)) {
+            for i in 0..n {
+                let row = (first + i) * total + first;
+                if i + 1 < n {
+                    system[row + i + 1] = self.step;
+                } else {
+                    system[row..row + n].iter_mut().zip(&self.own).for_each(|(s, a)| *s = self.step * a);
+                }
+            }
+        }
+        drive[n - 1] = self.step;
+        if let Some((read, direct)) = behind {
+            let last = (total - 1) * total;
+            system[last..last + n].iter_mut().zip(read).for_each(|(s, c)| *s = self.step * c);
+            drive[total - 1] = self.step * direct;
+        }
+        let interval = Transition::new(&system, total, 1.0)?;
+        let gains = match between {
+            None => None,
+            Some(between) => Some(InputGains::new(&interval, &system, &drive, between, fraction)?),
+        };
+        // Columns are contiguous, so that the states of a step are independent sums.
+        let growth = (0..total * total).map(|k| interval.growth[k % total * total + k / total]).collect();
+        let made = Rc::new(Discretization { key, growth, gains });
+        self.known.borrow_mut().push(made.clone());
+        Some(made)
+    }
+}
+
+impl Discretization {
+    /// States at the compared samples, and the input just after each; None on overflow.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn advance(
+        &self,
+        mut state: Vec<f64>,
+        input: Option<&SourceInput<'_>>,
+        (every, count): Grid,
+    ) -> Option<(Vec<f64>, Vec<f64>)> {
+        let n = state.len();
+        let (mut states, mut values) = (Vec::with_capacity(n * count), Vec::with_capacity(count));
+        let lag = input.map_or(0, |input| {
+            let late = input.between == Intersample::Hold && input.delay > input.delay.floor();
+            input.delay.floor().min(1e15) as usize + usize::from(late)
+        });
+        let at = |k: usize| match (input, k.checked_sub(lag)) {
+            (None, _) => 0.0,
+            (Some(input), None) => input.before,
+            (Some(input), Some(k)) => input.samples[k.min(input.samples.len() - 1)],
+        };
+        let mut next = vec![0.0; n];
+        for k in 0..=count * every {
+            let (now, later) = (at(k), at(k + 1));
+            if k > 0 && k % every == 0 {
+                states.extend_from_slice(&state);
+                values.push(now);
+            }
+            next.copy_from_slice(&state);
+            if let Some(gains) = &self.gains {
+                for ((v, a), b) in next.iter_mut().zip(&gains.now).zip(&gains.later) {
+                    *v += a * now + b * later;
+                }
+            }
+            for (column, x) in self.growth.chunks_exact(n).zip(&state) {
+                next.iter_mut().zip(column).for_each(|(v, g)| *v += g * x);
+            }
+            std::mem::swap(&mut state, &mut next);
+        }
+        states.iter().all(|v| v.is_finite()).then_some((states, values))
+    }
+}
+
+/// Exact simulation of an equation on an experiment.
+struct EquationSimulation<'a> {
+    companion: Rc<Companion>,
+    sources: Vec<Source<'a>>,
+}
+
+/// Exact simulation of an experiment.
+pub(crate) struct ExactSimulation<'a> {
+    equations: Vec<EquationSimulation<'a>>,
+    /// Orthonormal basis of the weighted responses to the initial terms.
+    basis: Vec<Vec<f64>>,
+    /// Effect on the weighted samples per unit of each linear coefficient.
+    effects: Vec<Vec<f64>>,
+}
+
+/// Integer from an order or exponent, if it is one from 0.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn integer(order: f64) -> Option<usize> {
+    let nearest = order.round();
+    (nearest >= 0.0 && nearest <= 2.0 * MAX_ORDER as f64 && (order - nearest).abs() <= INTEGER_TOLERANCE)
+        .then_some(nearest as usize)
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn factorial(n: usize) -> f64 {
+    (1..=n).map(|k| k as f64).product()
+}
+
+impl IntegerOrders {
+    /// Integer orders of a model at a point; None if an order is free or fractional, if equations are coupled, or if an
+    /// experiment has a sensor filter, nonuniform samples, or an input that is neither held nor linear.
+    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &Point) -> Option<Self> {
+        let structures = model.structures(&point.orders);
+        let fixed = |weights: &[f64]| {
+            weights.iter().zip(&model.order_bounds).all(|(w, (low, high))| *w == 0.0 || low.to_bits() == high.to_bits())
+        };
+        let mut equations = Vec::with_capacity(structures.len());
+        for (i, (structure, equation)) in structures.iter().zip(&model.equations).enumerate() {
+            if !fixed(&equation.order.weights) || !equation.terms.iter().all(|(_, order, _)| fixed(&order.weights)) {
+                return None;
+            }
+            let order = integer(structure.order).filter(|n| (1..=MAX_ORDER).contains(n))?;
+            let (mut own, mut inputs) = (Vec::new(), Vec::<(usize, Vec<(usize, usize)>)>::new());
+            for (k, term) in structure.terms.iter().enumerate() {
+                let nu = integer(term.order)?;
+                match model.output_index(i, term.signal) {
+                    Some(j) if j == i && nu < order => own.push((k, nu)),
+                    None if nu <= order => match inputs.iter_mut().find(|(signal, _)| *signal == term.signal) {
+                        Some((_, terms)) => terms.push((k, nu)),
+                        None => inputs.push((term.signal, vec![(k, nu)])),
+                    },
+                    _ => return None,
+                }
+            }
+            for experiment in experiments {
+                let exponents = model.exponents(experiment, i, structure);
+                if !exponents.iter().all(|&e| integer(e).is_some_and(|e| e <= order + 1)) {
+                    return None;
+                }
+                let known = |&(signal, _): &(usize, Vec<(usize, usize)>)| {
+                    let Some(values) = experiment.point_values.get(signal) else { return false };
+                    values.is_zero_order_hold || (values.values.is_some() && model.law_of(signal).is_none())
+                };
+                let plain =
+                    experiment.nonuniform.is_none() && experiment.filter.is_none() && !experiment.record.is_filtered();
+                if !plain || !inputs.iter().all(known) {
+                    return None;
+                }
+            }
+            equations.push(EquationOrders { order, own, inputs });
+        }
+        Some(Self { equations })
+    }
+
+    /// True if no pole is faster than the sampling of an experiment resolves.
+    pub(crate) fn is_resolved(&self, model: &FreeModel, experiments: &[Experiment], point: &Point) -> bool {
+        let longest =
+            experiments.iter().map(|e| e.record.step() * e.pulses_per_sample as f64).fold(f64::INFINITY, f64::min);
+        self.equations.iter().enumerate().all(|(i, _)| {
+            let mut divisor: Vec<f64> = self.own_coefficients(model, i, point).iter().map(|a| -a).collect();
+            divisor.push(1.0);
+            spectral_radius(&divisor).is_some_and(|fastest| fastest * longest <= MAX_POLE_PHASE_RAD)
+        })
+    }
+
+    /// Coefficients of D^0 y … D^(n − 1) y of an equation.
+    fn own_coefficients(&self, model: &FreeModel, i: usize, point: &Point) -> Vec<f64> {
+        let mut own = vec![0.0; self.equations[i].order];
+        for &(k, nu) in &self.equations[i].own {
+            own[nu] += model.equations[i].terms[k].2.at(&point.coefficients);
+        }
+        own
+    }
+
+    /// Residuals at a point with the `linear` coefficients and the initial terms eliminated.
+    pub(crate) fn evaluate<'a>(
+        &self,
+        model: &FreeModel,
+        experiments: &'a [Experiment],
+        point: &Point,
+        linear: &[usize],
+    ) -> Result<Evaluation<ExactSimulation<'a>>> {
+        let structures = model.structures(&point.orders);
+        let mut out = Evaluation::empty(point.clone());
+        let mut residuals = Vec::with_capacity(experiments.len());
+        let mut columns = Vec::with_capacity(experiments.len());
+        let mut companions = vec![Vec::new(); self.equations.len()];
+        for experiment in experiments {
+            out.exponents = structures.iter().enumerate().map(|(i, s)| model.exponents(experiment, i, s)).collect();
+            let (simulation, initial) =
+                self.simulate(model, experiment, (point, linear), &out.exponents, &mut companions)?;
+            let mut left = experiment.measured_samples();
+            out.size = out.size.hypot(left.iter().map(|v| v * v).sum::<f64>().sqrt());
+            let response = (0..self.equations.len()).flat_map(|i| simulation.response(self, model, i, point));
+            let weights = (0..self.equations.len()).flat_map(|i| experiment.weights_of(i));
+            left.iter_mut().zip(response.zip(weights)).for_each(|(e, (v, w))| *e -= w * v);
+            if let Some(index) = left.iter().position(|e| !e.is_finite()) {
+                return Err(Error::Diverged { what: "free run".into(), index });
+            }
+            residuals.push(left);
+            columns.push(initial);
+            out.parts.push(simulation);
+        }
+        if !linear.is_empty() {
+            let sides: Vec<LinearSide<'_>> = (residuals.iter().zip(&out.parts))
+                .map(|(left, s)| (&left[..], &s.basis[..], s.effects.iter().map(Vec::as_slice).collect()))
+                .collect();
+            let moves = solve_linear_steps(&sides)?;
+            linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
+            for (left, simulation) in residuals.iter_mut().zip(&out.parts) {
+                for (effect, by) in simulation.effects.iter().zip(&moves) {
+                    left.iter_mut().zip(effect).for_each(|(e, v)| *e -= by * v);
+                }
+            }
+        }
+        for (mut left, columns) in residuals.into_iter().zip(columns) {
+            let mut initial: Vec<Vec<f64>> = vec![Vec::new(); self.equations.len()];
+            if !columns.is_empty() {
+                let (places, columns): (Vec<_>, Vec<_>) = columns.into_iter().unzip();
+                let (values, _) = least_squares::solve(&columns, &left, 0)?;
+                for ((place, column), x) in places.iter().zip(&columns).zip(&values) {
+                    if let Some(i) = place {
+                        initial[*i].push(*x);
+                    }
+                    left.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
+                }
+            }
+            out.residuals.extend(left);
+            out.initial.push(initial);
+        }
+        Ok(out)
+    }
+
+    /// Simulation of an experiment, and the weighted responses to its initial terms, each with its equation.
+    #[allow(clippy::type_complexity)]
+    fn simulate<'a>(
+        &self,
+        model: &FreeModel,
+        experiment: &'a Experiment,
+        (point, linear): (&Point, &[usize]),
+        exponents: &[Vec<f64>],
+        companions: &mut [Vec<Rc<Companion>>],
+    ) -> Result<(ExactSimulation<'a>, Vec<(Option<usize>, Vec<f64>)>)> {
+        let (record, count) = (&experiment.record, experiment.compared_count());
+        let (every, step) = (experiment.pulses_per_sample, record.step());
+        let outputs = self.equations.len();
+        let overflow = || Error::Diverged { what: "free run".into(), index: 0 };
+        let mut equations = Vec::with_capacity(outputs);
+        let (mut basis, mut columns) = (Vec::new(), Vec::new());
+        let place = |i: usize, samples: &mut dyn Iterator<Item = f64>| {
+            let mut column = vec![0.0; outputs * count];
+            let own = column[i * count..(i + 1) * count].iter_mut();
+            own.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v = w * y);
+            column
+        };
+        for (i, orders) in self.equations.iter().enumerate() {
+            let companion = Companion::of_width(&mut companions[i], &self.own_coefficients(model, i, point), step);
+            let mut sources = Vec::new();
+            let mut add = |kind, input: Option<SourceInput<'a>>| -> Result<()> {
+                let (states, values) = companion.respond(input.as_ref(), None, (every, count)).ok_or_else(overflow)?;
+                sources.push(Source { kind, input, states, values });
+                Ok(())
+            };
+            for (q, (signal, _)) in orders.inputs.iter().enumerate() {
+                add(SourceKind::Input(q), Some(source_input(model, experiment, *signal, point)?))?;
+            }
+            let powers: Vec<usize> = exponents[i].iter().filter_map(|&e| integer(e)).collect();
+            if powers.iter().any(|&e| e < orders.order) {
+                add(SourceKind::Impulse, None)?;
+            }
+            for &e in powers.iter().filter(|&&e| e >= orders.order) {
+                // A constant, or a ramp with a value per edge.
+                let (between, length) = match e == orders.order {
+                    true => (Intersample::Hold, 1),
+                    false => (Intersample::Linear, record.m() + 1),
+                };
+                #[allow(clippy::cast_precision_loss)]
+                let samples = (0..length).map(|k| if length == 1 { 1.0 } else { k as f64 * step }).collect();
+                add(SourceKind::Power(e), Some(SourceInput { samples, between, delay: 0.0, before: 0.0 }))?;
+            }
+            let simulation = EquationSimulation { companion, sources };
+            for &e in &powers {
+                let mut values = vec![0.0; powers.len()];
+                if let Some(at) = powers.iter().position(|&p| p == e) {
+                    values[at] = 1.0;
+                }
+                let mut response = vec![0.0; count];
+                for source in &simulation.sources {
+                    if !matches!(source.kind, SourceKind::Input(_)) {
+                        let (read, direct) = simulation.initial_output(&source.kind, &powers, &values);
+                        source.add_output(&read, direct, &mut response);
+                    }
+                }
+                let column = place(i, &mut response.into_iter());
+                extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE);
+                columns.push((Some(i), column));
+            }
+            equations.push(simulation);
+        }
+        if model.initial.has_level() {
+            for i in 0..outputs {
+                let column = place(i, &mut std::iter::repeat(1.0));
+                extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE);
+                columns.push((None, column));
+            }
+        }
+        let mut simulation = ExactSimulation { equations, basis, effects: Vec::new() };
+        for &j in linear {
+            simulation.effects.push(simulation.input_effect(self, model, experiment, point, j));
+        }
+        Ok((simulation, columns))
+    }
+
+    /// Derivatives of the residuals, with the initial terms projected out.
+    pub(crate) fn jacobian(
+        &self,
+        model: &FreeModel,
+        experiments: &[Experiment],
+        linear: &[usize],
+        at: &Evaluation<ExactSimulation<'_>>,
+    ) -> Result<Vec<Vec<f64>>> {
+        let point = &at.point;
+        let (orders, coefficients) = (point.orders.len(), point.coefficients.len());
+        let count = orders + coefficients + point.inputs.len();
+        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
+        for (run, (experiment, simulation)) in experiments.iter().zip(&at.parts).enumerate() {
+            let responses = (0..self.equations.len())
+                .map(|i| simulation.autoregressive_states(self, model, experiment, (i, point), &at.initial[run]))
+                .collect::<Option<Vec<_>>>()
+                .ok_or_else(|| Error::Diverged { what: "sensitivity of the free run".into(), index: 0 })?;
+            for (parameter, out) in jacobian.iter_mut().enumerate() {
+                let mut column = match parameter.checked_sub(orders) {
+                    // No order is free.
+                    None => vec![0.0; self.equations.len() * experiment.compared_count()],
+                    Some(j) if j < coefficients => match linear.iter().position(|&l| l == j) {
+                        Some(place) => simulation.effects[place].clone(),
+                        None => {
+                            let mut column = simulation.input_effect(self, model, experiment, point, j);
+                            simulation.add_autoregressive_effect(
+                                self,
+                                model,
+                                experiment,
+                                (j, point),
+                                &responses,
+                                &mut column,
+                            );
+                            column
+                        }
+                    },
+                    Some(j) => simulation.law_effect(self, model, experiment, point, j - coefficients)?,
+                };
+                project_out(&simulation.basis, &mut column);
+                if column.iter().any(|v| !v.is_finite()) {
+                    return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+                }
+                // Residuals are measured minus simulated samples.
+                out.extend(column.iter().map(|v| -v));
+            }
+        }
+        Ok(jacobian)
+    }
+}
+
+/// Input of a signal as it acts: means per pulse if held, values per edge if linear.
+pub(crate) fn source_input<'a>(
+    model: &FreeModel,
+    experiment: &'a Experiment,
+    signal: usize,
+    point: &Point,
+) -> Result<SourceInput<'a>> {
+    let record = &experiment.record;
+    let (means, instants) = (record.signal(signal), &experiment.point_values[signal]);
+    if let (false, Some(values)) = (instants.is_zero_order_hold, &instants.values) {
+        let every = experiment.pulses_per_sample;
+        #[allow(clippy::cast_precision_loss)]
+        let edge = |k: usize| {
+            let (row, rest) = (k / every, (k % every) as f64 / every as f64);
+            values[row] + if rest > 0.0 { rest * (values[row + 1] - values[row]) } else { 0.0 }
+        };
+        let samples = if every == 1 { Cow::Borrowed(&values[..]) } else { (0..=record.m()).map(edge).collect() };
+        return Ok(SourceInput { samples, between: Intersample::Linear, delay: 0.0, before: 0.0 });
+    }
+    let (mut samples, mut delay, mut before) = (Cow::Borrowed(means), 0.0, 0.0);
+    if let Some(law) = model.law_of(signal) {
+        if model.inputs[law].law == InputLaw::Delay {
+            delay = point.inputs[law] / record.step();
+            before = if model.initial.is_at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
+        } else {
+            samples = model.apply_input_law(record, model.inputs[law], point.inputs[law])?.0.into();
+        }
+    }
+    Ok(SourceInput { samples, between: Intersample::Hold, delay, before })
+}
+
+impl Source<'_> {
+    /// Add the output of a row over the states, and of a direct gain, to samples.
+    fn add_output(&self, read: &[f64], direct: f64, samples: &mut [f64]) {
+        let rows = self.states.chunks_exact(read.len().max(1));
+        for ((y, row), u) in samples.iter_mut().zip(rows).zip(&self.values) {
+            *y += row.iter().zip(read).map(|(x, c)| x * c).sum::<f64>() + direct * u;
+        }
+    }
+}
+
+impl EquationSimulation<'_> {
+    /// Output row and direct gain of the initial terms t^e of one source.
+    #[allow(clippy::cast_possible_wrap)]
+    fn initial_output(&self, kind: &SourceKind, powers: &[usize], values: &[f64]) -> (Vec<f64>, f64) {
+        let n = self.companion.order;
+        let mut read = vec![0.0; n];
+        for (&e, x) in powers.iter().zip(values) {
+            match kind {
+                SourceKind::Impulse if e < n => {
+                    read[n - 1 - e] += x * factorial(e) * self.companion.power(-(e as isize));
+                }
+                SourceKind::Power(own) if *own == e => {
+                    read[0] += x * factorial(e) * self.companion.power(-(n as isize));
+                }
+                _ => {}
+            }
+        }
+        (read, 0.0)
+    }
+}
+
+impl ExactSimulation<'_> {
+    /// Orthonormal basis of the weighted responses to the initial terms.
+    pub(crate) fn basis(&self) -> &[Vec<f64>] {
+        &self.basis
+    }
+
+    /// Output row and direct gain of one input, with the given coefficient per term.
+    fn input_output(
+        &self,
+        orders: &IntegerOrders,
+        (i, q): (usize, usize),
+        coefficient: impl Fn(usize) -> f64,
+        shift: usize,
+    ) -> (Vec<f64>, f64) {
+        let terms = orders.equations[i].inputs[q].1.iter();
+        self.equations[i].companion.output(terms.map(|&(k, nu)| (nu + shift, coefficient(k))))
+    }
+
+    /// Samples of an equation from rest, without weights.
+    fn response(&self, orders: &IntegerOrders, model: &FreeModel, i: usize, point: &Point) -> Vec<f64> {
+        let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
+        let mut samples = vec![0.0; self.equations[i].sources.first().map_or(0, |s| s.values.len())];
+        for source in &self.equations[i].sources {
+            if let SourceKind::Input(q) = source.kind {
+                let (read, direct) = self.input_output(orders, (i, q), of, 0);
+                source.add_output(&read, direct, &mut samples);
+            }
+        }
+        samples
+    }
+
+    /// Effect on the weighted samples per unit of a coefficient, through the input terms.
+    fn input_effect(
+        &self,
+        orders: &IntegerOrders,
+        model: &FreeModel,
+        experiment: &Experiment,
+        point: &Point,
+        j: usize,
+    ) -> Vec<f64> {
+        let count = experiment.compared_count();
+        let mut column = vec![0.0; orders.equations.len() * count];
+        for (i, simulation) in self.equations.iter().enumerate() {
+            let of = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
+            let own = &mut column[i * count..(i + 1) * count];
+            for source in &simulation.sources {
+                if let SourceKind::Input(q) = source.kind
+                    && orders.equations[i].inputs[q].1.iter().any(|&(k, _)| of(k) != 0.0)
+                {
+                    let (read, direct) = self.input_output(orders, (i, q), of, 0);
+                    source.add_output(&read, direct, own);
+                }
+            }
+            own.iter_mut().zip(experiment.weights_of(i)).for_each(|(v, w)| *v *= w);
+        }
+        column
+    }
+
+    /// States of 1/A y of equation i at the compared samples; None on overflow.
+    fn autoregressive_states(
+        &self,
+        orders: &IntegerOrders,
+        model: &FreeModel,
+        experiment: &Experiment,
+        (i, point): (usize, &Point),
+        initial: &[Vec<f64>],
+    ) -> Option<Vec<f64>> {
+        let EquationSimulation { companion, sources } = &self.equations[i];
+        let (n, count) = (companion.order, experiment.compared_count());
+        let structures = model.structures(&point.orders);
+        let exponents = model.exponents(experiment, i, &structures[i]);
+        let powers: Vec<usize> = exponents.iter().filter_map(|&e| integer(e)).collect();
+        let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
+        let mut total = vec![0.0; n * count];
+        for source in sources {
+            let (read, direct) = match source.kind {
+                SourceKind::Input(q) => self.input_output(orders, (i, q), of, 0),
+                _ => self.equations[i].initial_output(&source.kind, &powers, &initial[i]),
+            };
+            if direct == 0.0 && read.iter().all(|v| *v == 0.0) {
+                continue;
+            }
+            let grid = (experiment.pulses_per_sample, count);
+            let (states, _) = companion.respond(source.input.as_ref(), Some((&read, direct)), grid)?;
+            for (sum, row) in total.chunks_exact_mut(n).zip(states.chunks_exact(2 * n)) {
+                sum.iter_mut().zip(&row[n..]).for_each(|(a, b)| *a += b);
+            }
+        }
+        Some(total)
+    }
+
+    /// Add the effect of a coefficient through the autoregressive terms to weighted samples.
+    #[allow(clippy::cast_possible_wrap)]
+    fn add_autoregressive_effect(
+        &self,
+        orders: &IntegerOrders,
+        model: &FreeModel,
+        experiment: &Experiment,
+        (j, point): (usize, &Point),
+        responses: &[Vec<f64>],
+        column: &mut [f64],
+    ) {
+        let count = experiment.compared_count();
+        for (i, equation) in orders.equations.iter().enumerate() {
+            let (companion, n) = (&self.equations[i].companion, equation.order);
+            for &(k, nu) in &equation.own {
+                let slope = model.equations[i].terms[k].2.slope(&point.coefficients, j);
+                if slope != 0.0 {
+                    let gain = slope * companion.power(nu as isize - n as isize);
+                    let states = responses[i].iter().skip(nu).step_by(n);
+                    let own = column[i * count..(i + 1) * count].iter_mut();
+                    own.zip(experiment.weights_of(i).zip(states)).for_each(|(v, (w, x))| *v += w * gain * x);
+                }
+            }
+        }
+    }
+
+    /// Effect on the weighted samples per unit of the free parameter of an input.
+    fn law_effect(
+        &self,
+        orders: &IntegerOrders,
+        model: &FreeModel,
+        experiment: &Experiment,
+        point: &Point,
+        law: usize,
+    ) -> Result<Vec<f64>> {
+        let (count, input) = (experiment.compared_count(), model.inputs[law]);
+        let mut column = vec![0.0; orders.equations.len() * count];
+        for (i, simulation) in self.equations.iter().enumerate() {
+            let own = &mut column[i * count..(i + 1) * count];
+            let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
+            for source in &simulation.sources {
+                let SourceKind::Input(q) = source.kind else { continue };
+                if orders.equations[i].inputs[q].0 != input.signal {
+                    continue;
+                }
+                if input.law == InputLaw::Delay {
+                    // −D y. The derivative of the jumps themselves is infinite and left out.
+                    let (read, direct) = self.input_output(orders, (i, q), |k| -of(k), 1);
+                    source.add_output(&read, direct, own);
+                    continue;
+                }
+                let slope = model.apply_input_law(&experiment.record, input, point.inputs[law])?.1;
+                let slope = SourceInput { samples: slope.into(), between: Intersample::Hold, delay: 0.0, before: 0.0 };
+                let grid = (experiment.pulses_per_sample, count);
+                let (states, values) = simulation
+                    .companion
+                    .respond(Some(&slope), None, grid)
+                    .ok_or_else(|| Error::Diverged { what: "sensitivity of the free run".into(), index: 0 })?;
+                let (read, direct) = self.input_output(orders, (i, q), of, 0);
+                Source { kind: SourceKind::Impulse, input: None, states, values }.add_output(&read, direct, own);
+            }
+            own.iter_mut().zip(experiment.weights_of(i)).for_each(|(v, w)| *v *= w);
+        }
+        Ok(column)
+    }
+}

@@ -1,0 +1,59 @@
+"""The automatic structure finds delays and zeros, and predicts another record as the truth does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+import ftlm
+
+
+def record(
+    numerator: list[float], denominator: list[float], *, seed: int, hold: int, step: float = 0.02, late: int = 0
+) -> tuple[ftlm.Run, float]:
+    """Return a noisy record and the fit of the truth."""
+    g = np.random.default_rng(seed)
+    u = np.repeat(g.uniform(-3, 3, 600 // hold + 1), hold)[:600]
+    b, a, _ = cont2discrete((numerator, denominator), step)[:3]
+    y = lfilter(np.ravel(b), a, np.r_[np.zeros(late), u][:600])
+    noisy = y + 0.02 * y.std() * g.standard_normal(600)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": noisy})
+    return run, 100 * (1 - float(np.linalg.norm(noisy - y) / np.linalg.norm(noisy - noisy.mean())))
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "late", "words"),
+    [
+        ([7.0], [1.0, 4.0], 6, "delay"),
+        ([12.0, 40.0], [1.0, 3.0, 40.0], 0, "D^1 u"),
+        ([60.0], [1.0, 6.0, 0.0], 0, "D^2 y = a1 D^1 y + b0 u"),
+    ],
+)
+def test_auto_finds_a_delay_a_zero_and_an_integrator(
+    numerator: list[float], denominator: list[float], late: int, words: str
+) -> None:
+    run, _ = record(numerator, denominator, seed=1, hold=20, late=late)
+    other, truth = record(numerator, denominator, seed=2, hold=7, late=late)
+    found = ftlm.select(run, "auto", threads=1)
+    assert words in found.winner.name
+    assert found.best.model.compare(other).fit_percent["y"] > truth - 0.5
+
+
+def test_a_candidate_that_fails_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ftlm.structure_selection import stepwise
+
+    whole = stepwise.fit
+
+    def refuse(runs, structure, starts, **options):  # type: ignore[no-untyped-def]
+        if structure.order_names:
+            raise ftlm.ConvergenceError("no finite simulation")
+        return whole(runs, structure, starts, **options)
+
+    monkeypatch.setattr(stepwise, "fit", refuse)
+    run, _ = record([7.0], [1.0, 4.0], seed=1, hold=20)
+    found = ftlm.select(run, "auto", threads=1)
+    failed = [t for t in found.trials if t.failed is not None]
+    assert failed
+    assert all(t.failed == "no finite simulation" for t in failed)
+    assert found.winner.failed is None

@@ -1,0 +1,102 @@
+"""Fits of integer orders use exact samples of held and linear inputs, and hold against scipy's discretization."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter, lsim
+
+import ftlm
+from ftlm.utils.validation import Floats
+
+H = 0.05
+
+
+def held(numerator: list[float], denominator: list[float], u: Floats, step: float = H) -> Floats:
+    b, a, _ = cont2discrete((numerator, denominator), step)[:3]
+    y: Floats = lfilter(np.ravel(b), a, u)
+    return y
+
+
+def telegraph(seed: int, n: int = 400, hold: int = 8) -> Floats:
+    g = np.random.default_rng(seed)
+    u: Floats = np.repeat(g.choice([-1.0, 1.0], n // hold + 1), hold)[:n]
+    return u
+
+
+def test_a_start_at_the_truth_has_no_residual_whatever_the_sampling() -> None:
+    # 3.3 samples a period: the pulse grid at this step is off by percents.
+    u = telegraph(1)
+    truth = {"a1": -8.0, "a0": -1600.0, "b1": 30.0, "b0": 800.0}
+    run = ftlm.Run.from_arrays(step=H, inputs={"u": u}, outputs={"y": held([30.0, 800.0], [1.0, 8.0, 1600.0], u)})
+    equation = ftlm.equation("D^2 y = a1 D y + a0 y + b1 D u + b0 u", initial="rest")
+    found = ftlm.identify(run, equation, method=ftlm.OutputError(intervals="quadratic", start=truth))
+    assert found.coefficients == pytest.approx(truth, rel=1e-8)
+
+
+def test_a_linear_input_and_an_initial_state_are_exact() -> None:
+    g = np.random.default_rng(2)
+    t, u = H * np.arange(300), np.cumsum(g.standard_normal(300)) / 5
+    # y'' = -3 y' - 40 y + 10 u + 2 u', from y(0) = 1, y'(0) = -2, in the observer's form.
+    system = ([[-3.0, 1.0], [-40.0, 0.0]], [[2.0], [10.0]], [[1.0, 0.0]], [[0.0]])
+    y = lsim(system, u, t, [1.0, 1.0])[1]
+    run = ftlm.Run.from_arrays(step=H, inputs={"u": u}, outputs={"y": y}, intersample={"u": "foh"})
+    equation = ftlm.equation("D^2 y = a1 D y + a0 y + b1 D u + b0 u", initial="caputo")
+    found = ftlm.identify(run, equation, method=ftlm.OutputError(intervals="quadratic"))
+    expected = {"a1": -3.0, "a0": -40.0, "b1": 2.0, "b0": 10.0}
+    assert found.coefficients == pytest.approx(expected, rel=1e-7)
+
+
+def test_a_delay_between_samples_is_exact() -> None:
+    u = telegraph(3)
+    fine = held([8.0], [1.0, 4.0], np.r_[np.zeros(3), np.repeat(u, 10)][: 10 * len(u)], H / 10)
+    run = ftlm.Run.from_arrays(step=H, inputs={"u": u}, outputs={"y": fine[::10]})
+    equation = ftlm.equation("D y = a y + b u", delay={"u": (0.0, 0.2)}, initial="rest")
+    found = ftlm.identify(run, equation, method=ftlm.OutputError(intervals="quadratic"))
+    assert found.delays["u"] == pytest.approx(0.3 * H, rel=1e-6)
+    assert found.coefficients == pytest.approx({"a": -4.0, "b": 8.0}, rel=1e-7)
+
+
+def random_plant(seed: int) -> tuple[list[float], list[float], Floats, float]:
+    """Return numerator, denominator, input and step of a random plant of order 1 to 5."""
+    g = np.random.default_rng(seed)
+    n, poles = int(g.integers(1, 6)), []
+    while len(poles) < n:
+        w = np.exp(g.uniform(np.log(0.3), np.log(8)))
+        if n - len(poles) >= 2 and g.random() < 0.6:
+            z = g.uniform(0.02, 0.9)
+            poles += [w * complex(-z, np.sqrt(1 - z * z)), w * complex(-z, -np.sqrt(1 - z * z))]
+        else:
+            poles.append(-w)
+    zeros = g.choice([-1.0, 1.0], int(g.integers(0, n))) * np.exp(g.uniform(np.log(0.3), np.log(8)))
+    numerator = np.atleast_1d(np.poly(zeros))
+    u = np.repeat(g.choice([-1.0, 1.0], 1200), g.integers(1, 30, 1200))[:1200]
+    return list(numerator), list(np.poly(poles).real), u, np.pi / 48
+
+
+def fit_and_truth(seed: int, more: int = 0) -> tuple[float, float]:
+    """Return the cost of a fit with `more` orders than a random plant, and that of the truth."""
+    numerator, denominator, u, step = random_plant(seed)
+    y = held(numerator, denominator, u, step)
+    noisy = y + 0.03 * y.std() * np.random.default_rng(1000 + seed).standard_normal(y.size)
+    n, m = len(denominator) - 1 + more, len(numerator) - 1 + more
+    terms = [f"a{i} D^{i} y" for i in range(n)] + [f"b{i} D^{i} u" for i in range(m + 1)]
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": noisy})
+    equation = ftlm.equation(f"D^{n} y = {' + '.join(terms)}", initial="rest")
+    found = ftlm.identify(run, equation, method=ftlm.OutputError(intervals="quadratic"))
+    left = 1 - found.fit_percent["y"] / 100
+    return left**2, float(np.sum((noisy - y) ** 2) / np.sum((noisy - noisy.mean()) ** 2))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_random_plant_is_fitted_no_worse_than_by_the_truth(seed: int) -> None:
+    cost, truth = fit_and_truth(seed)
+    assert cost <= truth
+    richer, _ = fit_and_truth(seed, more=1)
+    assert richer <= 1.001 * cost
+
+
+@pytest.mark.slow
+def test_two_hundred_random_plants_are_fitted_no_worse_than_by_the_truth() -> None:
+    costs = [fit_and_truth(100 + seed) for seed in range(200)]
+    assert [seed for seed, (cost, truth) in enumerate(costs) if cost > truth] == []
