@@ -267,7 +267,7 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Id
     if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
         return []
     named = ", ".join(f"{n} = {found.orders[n]:.3g}" for n in orders)
-    rival = next((t for t in ranked if t.failed is None and _has_integer_orders(t.structure)), None)
+    rival = next((t for t in ranked if t.failed is None and not is_fractional(t.structure)), None)
     if rival is None or set(rival.parts) != set(winner.parts):
         reason = "no candidate with integer orders was fitted"
         return [make_finding("fractional_orders_not_told", parameter=named, reason=reason)]
@@ -285,12 +285,6 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Id
         reason = f"over {rival.name} some parts gain, and others {'lose' if lost else 'do not'}"
         return [make_finding("fractional_orders_not_told", reason=reason, **about)]
     return [make_finding("fractional_orders_gain" if gained else "fractional_orders_gain_nothing", **about)]
-
-
-def _has_integer_orders(structure: Structure) -> bool:
-    """Whether all orders of a structure are fixed integers."""
-    orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
-    return not any(o.names or abs(o.constant - round(o.constant)) > INTEGER_TOLERANCE for o in orders)
 
 
 def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
@@ -360,7 +354,7 @@ def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[lis
     limit = min(_bic(ranked[k]) for k in peers) - BIC_STRONG_EVIDENCE
     better = [k for k in other if _predicts_better(ranked[k], least)]
     if better:
-        return better, " Fractional orders predict better than integer orders with a delay and zeros do."
+        return better, ""
     alike = [k for k in other if _predicts_equally(ranked[k], least) and _bic(ranked[k]) < limit]
     if alike:
         return alike, " Integer orders with a delay and zeros predict alike, with more numbers."
