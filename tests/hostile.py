@@ -525,6 +525,9 @@ class Sound:
     def is_white(self):
         return self.normal(60), self.one(5, 25)
 
+    def portmanteau(self):
+        return [self.normal(50), self.normal(40)], self.one(5, 20)
+
     def chi_squared(self):
         return float(self.one(1, 5, 20)), self.one(1.6, 2.3)
 

@@ -132,7 +132,7 @@ def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_no
     w = np.geomspace(0.1, 100, 9)
     seen = model("D^2 y = -D y - 4 y + u", sensor_filter=ftlm.SensorFilter.low_pass(["y"]))
     np.testing.assert_allclose(seen.to_tf()(1j * w), seen.frequency_response(w)[0, 0], rtol=1e-12)
-    with pytest.raises(ftlm.ModelError, match=r"order 1\.5 is no whole number .*to_control\(band=…\)"):
+    with pytest.raises(ftlm.ModelError, match=r"order 1\.5 is no whole number .*to_control with band="):
         model("D^1.5 y = -y + u").to_tf()
     with pytest.raises(ftlm.ModelError, match="the input u passes a sensor filter"):
         model("D y = -y + u", sensor_filter=ftlm.SensorFilter.low_pass(["u"])).to_tf()

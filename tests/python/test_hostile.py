@@ -524,7 +524,7 @@ main()
 """
 
 
-@pytest.mark.parametrize("module", ["ftlm.cli", "numpy", "ftlm._core", "typer", "ftlm.cli.data_commands"])
+@pytest.mark.parametrize("module", ["ftlm.cli", "numpy", "ftlm._core", "typer", "ftlm.cli.framework"])
 def test_an_interrupt_while_the_command_line_is_imported_is_one_line(module, root):
     done = subprocess.run([sys.executable, "-c", PRESSED_AT, module], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ftlm: interrupted; nothing was written\n")

@@ -240,7 +240,7 @@ def to_tf(model: Model) -> Any:
     for name, delay in system.delay.items():
         warnings.warn(
             f"the delay of {name}, {delay:g} s, is not in the transfer function; it is in its attribute delay, and "
-            "to_control(band=…) approximates it",
+            f"to_control with {parameter('band')} approximates it",
             UserWarning,
             stacklevel=2,
         )
@@ -253,7 +253,7 @@ def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
     if broken is not None:
         raise ModelError(
             f"order {broken:g} is no whole number from 0, so there is no exact transfer function of python-control; "
-            "to_control(band=…) approximates one"
+            f"to_control with {parameter('band')} approximates one"
         )
     values = np.zeros(1 + max((round(p) for _, p in pairs), default=0))
     for value, power in pairs:

@@ -574,11 +574,15 @@ def _standard_deviations(
     values = parameter_vector(model)
     slopes = np.zeros((values.size, zeros.size), dtype=np.complex128)
 
+    own = characteristic(model, coupled=coupled)[at]
+    _, unit = _terms(zeros, np.array(list(own)), np.array(list(own.values())))
+
     def value(numbers: Floats) -> tuple[Complex, Complex]:
+        """D and dD / d ln s at the zeros, in units of the largest term of the model."""
         polynomial = characteristic(with_parameter_vector(model, numbers), coupled=coupled)[at]
         powers = np.array(list(polynomial))
         terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
-        scale = np.exp(level)
+        scale = np.exp(level - unit)
         return np.sum(terms, axis=0) * scale, np.sum(powers[:, None] * terms, axis=0) * scale
 
     _, slope = value(values)

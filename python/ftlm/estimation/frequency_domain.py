@@ -871,25 +871,30 @@ def _result(
     exact: bool,
     ends: Sequence[ResponseFit] = (),
 ) -> FrequencyIdentification:
-    left, slopes = problem.residuals(best.values)
-    steep = problem.slopes_in_seconds(best.values, slopes)
     values = problem.in_seconds(best.values)
     rising = _frequency_order(records)
-    left, steep = left[rising], steep[rising]
+    left = problem.residuals(best.values)[0][rising]
     series = _series(records, left)
     free = left.size - values.size
     chi = best.cost / free
     too_large = kind == "deviation" and best.cost > chi_squared_99(free)
     findings: list[Finding] = []
-    if kind == "deviation" and not too_large:
-        covariance = covariance_of(steep.T, [np.zeros(e.size) for e in series], float(free))
-    else:
-        covariance = covariance_of(steep.T, series, best.cost)
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+
+    def covariance_at(end: ResponseFit) -> Floats:
+        residuals, slopes = problem.residuals(end.values)
+        steep = problem.slopes_in_seconds(end.values, slopes)[rising]
+        if kind == "deviation" and not too_large:
+            return covariance_of(steep.T, [np.zeros(e.size) for e in series], float(free))
+        return covariance_of(steep.T, _series(records, residuals[rising]), end.cost)
+
+    def errors_of(covariance: Floats) -> dict[str, float]:
+        return dict(zip(problem.names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+
+    covariance = covariance_at(best)
     white = exact or all(is_white(e, min(WHITENESS_LAGS, max(e.size // 4, 1))) for e in series)
     factor = float(_student(free)) if kind != "deviation" or too_large else NormalDist().inv_cdf(0.975)
     names = problem.names
-    standard = dict(zip(names, errors.tolist(), strict=True))
+    standard = errors_of(covariance)
     if too_large:
         findings.append(make_finding("deviations_exceeded", ratio=math.sqrt(chi)))
     if not white:
@@ -897,9 +902,11 @@ def _result(
     if not best.converged:
         findings.append(make_finding("response_not_converged"))
     findings += [make_finding("response_on_bound", bound=bound) for bound in held]
+    falls = [(end, _log_likelihood_difference(end.cost, best.cost, kind, left.size)) for end in ends]
     optima = [
-        (problem.in_seconds(end.values), _log_likelihood_difference(end.cost, best.cost, kind, left.size))
-        for end in ends
+        (problem.in_seconds(end.values), fall, errors_of(covariance_at(end)))
+        for end, fall in falls
+        if fall <= SECOND_OPTIMUM_LOG_LIKELIHOOD
     ]
     findings += second_optimum_findings(problem.names, values, standard, optima)
     findings += _identifiability_findings(problem, values, standard)

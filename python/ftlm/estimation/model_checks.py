@@ -110,19 +110,23 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
 
 
 def second_optimum_findings(
-    names: Sequence[str], values: Floats, errors: Mapping[str, float], optima: Sequence[tuple[Floats, float]]
+    names: Sequence[str],
+    values: Floats,
+    errors: Mapping[str, float],
+    optima: Sequence[tuple[Floats, float, Mapping[str, float]]],
 ) -> list[Finding]:
     """Return a finding on the most likely other optimum at values over three standard errors apart.
 
-    Each optimum comes with the fall of the log likelihood.
+    Each optimum comes with the fall of the log likelihood and its own standard errors: what it does not determine
+    itself is no value.
     """
-    for other, fall in sorted(optima, key=lambda pair: pair[1]):
+    for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
         if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:
             break
         apart = [
             f"{n} = {there:.4g} for {here:.4g}"
             for n, here, there in zip(names, values.tolist(), other.tolist(), strict=True)
-            if math.isfinite(errors[n]) and abs(there - here) > SECOND_OPTIMUM_ERRORS * errors[n]
+            if math.isfinite(errors[n]) and abs(there - here) > SECOND_OPTIMUM_ERRORS * max(errors[n], own[n])
         ]
         if apart:
             moved = ", ".join(text.partition(" = ")[0] for text in apart)
@@ -159,7 +163,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
         for values in far:
             other, there, left = fit(values)
             if float(np.sum((left - residuals) ** 2)) > SAME_MODEL_POWER:
-                optima.append((other, there - cost))
+                optima.append((other, there - cost, joint.standard_errors))
     except FtlmError:
         # No finite simulation on the way.
         return []

@@ -86,6 +86,8 @@ pub fn fit_reweighted<'a>(
     loss: Loss,
 ) -> Result<(OptimizationResult, Objective<'a>)> {
     let rounds = if loss == Loss::Huber { MAX_ROBUST_REWEIGHTINGS } else { MAX_REWEIGHTINGS };
+    // Exact samples leave no residual; what remains of the first noise level then is rounding.
+    let limits: Vec<f64> = grid.weights.outputs.iter().map(|weight| weight / f64::EPSILON).collect();
     let (mut place, mut grid, mut turn) = (start.clone(), grid, 0);
     loop {
         turn += 1;
@@ -103,7 +105,8 @@ pub fn fit_reweighted<'a>(
         if turn == rounds || (still && are_weights_equal(grid.weights.robust_weights.as_ref(), shares.as_ref())) {
             return Ok((attempt, grid));
         }
-        let outputs = grid.weights.outputs.iter().zip(&levels).map(|(w, level)| w / level.max(1e-300)).collect();
+        let inverse = grid.weights.outputs.iter().zip(&levels).map(|(weight, level)| weight / level);
+        let outputs = inverse.zip(&limits).map(|(weight, &limit)| weight.min(limit)).collect();
         grid = grid.with_weights(Weights { outputs, robust_weights: shares })?;
         place = attempt.iterate;
     }
