@@ -25,7 +25,7 @@ def record(
 @pytest.mark.parametrize(
     ("numerator", "denominator", "late", "words"),
     [
-        ([7.0], [1.0, 4.0], 6, "delay"),
+        ([7.0], [1.0, 4.0], 6, "u(t - 0:1 s)"),
         ([12.0, 40.0], [1.0, 3.0, 40.0], 0, "D^1 u"),
         ([60.0], [1.0, 6.0, 0.0], 0, "D^2 y = a1 D^1 y + b0 u"),
     ],

@@ -20,7 +20,7 @@ from ftlm.structure.input_nonlinearity import (
     input_name,
     replace_nonlinearities,
 )
-from ftlm.structure.order import Order, Values, parse_values
+from ftlm.structure.order import Order, Values, format_shortest, parse_values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
@@ -541,7 +541,7 @@ class Structure:
 
 def _format(value: float, digits: str) -> str:
     """Format a number with these digits, or exactly for ``"r"``."""
-    return repr(float(value)) if digits == "r" else format(value, digits)
+    return format_shortest(value) if digits == "r" else format(value, digits)
 
 
 def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, ...] | UnsetType:

@@ -323,9 +323,9 @@ class NestedStructures:
 
 
 def describe_structure(structure: Structure) -> str:
-    """Return a structure as one line, with the free parameters of its inputs."""
-    free = "".join(f", {item.words} free" for item in structure.free_inputs)
-    return str(structure).replace("\n", "; ") + free
+    """Return a structure as one line, with the output level that its equations do not show."""
+    level = ", with an output level" if structure.offset == "level" else ""
+    return str(structure).replace("\n", "; ") + level
 
 
 def signature(structure: Structure) -> str:
