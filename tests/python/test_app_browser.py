@@ -19,7 +19,7 @@ import plants
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=window.hacked=1>"
-SLOW = "D^a1 y = p1 D^m1 y + p2 D^m2 y + p3 D^m3 y + p4 D^m4 y + p5 D^m5 y + p6 y + b1 D^g1 u + b0 u"
+SLOW = "D^a1 y = p1 D^m1 y + p2 D^m2 y + p3 D^m3 y + p4 D^m4 y + p5 D^m5 y + p6 D^m6 y + p7 y + b0 u"
 
 
 @pytest.fixture(scope="module")
