@@ -164,7 +164,8 @@ pub fn portmanteau(series: &[&[f64]], lags: usize) -> f64 {
             0.0
         }
     };
-    (1..=lags).map(of).sum()
+    let longest = all.iter().map(Vec::len).max().unwrap_or(0);
+    (1..=lags.min(longest)).map(of).sum()
 }
 
 /// Whether a series is consistent with white noise: [`portmanteau`] test at 1 %; true if it is too short for the lags.
