@@ -390,7 +390,7 @@ class Candidates:
         p
             Innovation length; 0 for least squares.
         prior_covariance
-            Initial covariance of the coefficients, a number or shape (k,); infinite for none.
+            Initial covariance of the coefficients, a number or shape (k,); infinite for no prior.
         rows
             Coordinates of (42) in which the innovation runs: ``"haar"``, for which M is a power of two, or ``"time"``.
 
@@ -481,11 +481,7 @@ class Candidates:
         if coefficients is None:
             found = self.coefficients(table, p=p, prior_covariance=prior_covariance, rows=rows)
         else:
-            found = as_floats("coefficients", coefficients, gaps=True)
-            if found.shape != (len(table), len(self._terms)):
-                raise DataError(
-                    f"coefficients has shape {found.shape}; give ({len(table)}, {len(self._terms)}), one row a tuple"
-                )
+            found = self._check_shape(as_floats("coefficients", coefficients, gaps=True), len(table))
         scores = np.full(len(table), np.inf)
         known = np.all(np.isfinite(found), axis=1)
         scores[known] = self._points[norm].scores(
@@ -516,9 +512,8 @@ class Candidates:
         -----
         O(k M log M) a tuple and O(M log^2 M) for its own terms.
         """
-        table, numbers = self._orders(orders), _finite("coefficients", coefficients)
-        if numbers.shape != (len(table), len(self._terms)):
-            raise DataError(f"coefficients has shape {numbers.shape}; give ({len(table)}, {len(self._terms)})")
+        table = self._orders(orders)
+        numbers = self._check_shape(_finite("coefficients", coefficients), len(table))
         m, own = self._signals.shape[1], self._terms == self._output
         divisor = np.zeros((len(table), m))
         divisor[:, 0] = 1.0
@@ -540,6 +535,14 @@ class Candidates:
             norm: _core.Points([record], self._output, self._terms.tolist(), inputs, norm == "l2")
             for norm in ("l1", "l2")
         }
+
+    def _check_shape(self, coefficients: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+        """Return the coefficients of so many order tuples; raise for another shape."""
+        if coefficients.shape != (count, len(self._terms)):
+            raise DataError(
+                f"coefficients has shape {coefficients.shape}; give ({count}, {len(self._terms)}), one row a tuple"
+            )
+        return coefficients
 
     def _orders(self, orders: ArrayLike) -> NDArray[np.float64]:
         """Return order tuples as a table."""

@@ -53,13 +53,13 @@ pub struct LimitEstimate {
 }
 
 impl LimitEstimate {
-    fn worst(&self) -> f64 {
-        worst(&self.change)
+    fn largest_change(&self) -> f64 {
+        largest_change(&self.change)
     }
 }
 
 /// Largest change; infinite if one is unknown.
-fn worst(change: &[f64]) -> f64 {
+fn largest_change(change: &[f64]) -> f64 {
     change.iter().fold(0.0, |most: f64, c| if c.is_nan() { f64::INFINITY } else { most.max(*c) })
 }
 
@@ -116,7 +116,7 @@ impl RichardsonTable {
         }
         for column in 0..self.grids.iter().map(|grid| grid.columns.len()).min().unwrap_or(0) {
             if let Some(found) = self.estimate_by_ratio(column, owners, measure)
-                && found.worst() < best.worst()
+                && found.largest_change() < best.largest_change()
             {
                 best = found;
             }
@@ -158,7 +158,7 @@ impl RichardsonTable {
                 }
             }
             for each in found {
-                if worst(&each.1) < worst(&best.1) {
+                if largest_change(&each.1) < largest_change(&best.1) {
                     best = each;
                 }
             }

@@ -15,7 +15,7 @@ import friction
 import ftlm
 import loops
 from ftlm.cli.main import app
-from ftlm.structure_selection.automatic import AutomaticForm
+from ftlm.structure_selection.automatic import IntegerOrderForm
 from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, name_candidates
 from ftlm.structure_selection.cross_validation import (
     Folds,
@@ -280,7 +280,7 @@ def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival
 
 def test_auto_is_of_one_output_with_inputs(runs):
     assert automatic_output(runs) == "y"
-    made = AutomaticForm(2, 1, delayed=True, integrator=True).structure(runs, "y")
+    made = IntegerOrderForm(2, 1, delayed=True, integrator=True).structure(runs, "y")
     assert str(made.without_input_nonlinearities()) == "D^2 y = a1 D^1 y + b1 D^1 u + b0 u"
     assert list(made.free_delays) == ["u"]
     with pytest.raises(ftlm.ModelError, match="the outputs y, z; structure='auto' is of one"):

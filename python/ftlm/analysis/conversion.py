@@ -189,7 +189,9 @@ _LABEL_PATTERN = re.compile(r"([A-Za-z]+)\[(\d+)\]")
 
 @check_arguments
 def to_tf(model: Model) -> Any:
-    """Return the exact transfer functions of a model of integer orders as a python-control system.
+    """Return a model of integer orders as a python-control TransferFunction, without approximation.
+
+    Delays of inputs are not part of it; see the attribute ``delay``.
 
     Parameters
     ----------
@@ -210,8 +212,8 @@ def to_tf(model: Model) -> Any:
     Raises
     ------
     ModelError
-        A fractional order, friction, an input with saturation or dead zone, a filtered input, or python-control is not
-        installed.
+        A fractional order, friction, an input with saturation or dead zone, an input that passes the sensor filter, or
+        python-control is not installed.
     """
     try:
         control = importlib.import_module("control")

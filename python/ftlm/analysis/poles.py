@@ -141,7 +141,7 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
 
 @check_arguments
 def poles(model: Model, *, coupling: str = "simulated") -> Complex:
-    """Return the poles of a model on the principal sheet, for any orders.
+    """Return the poles of a model of any orders; with fractional orders, those on the principal Riemann sheet.
 
     Parameters
     ----------
@@ -153,26 +153,27 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     Returns
     -------
     ndarray of complex
-        Values of s [rad/s], ``|arg s| < pi`` (whole orders: ``<= pi``), slowest first, without those at the origin.
-        Roots on other sheets are no poles: they only shape how a response dies away.
+        Values of s [rad/s], sorted by magnitude, without s = 0. With fractional orders ``|arg s| < pi``; with integer
+        orders the negative real axis is included. Roots on other sheets are no poles: they only shape how a response
+        dies away.
 
     Raises
     ------
     ModelError
-        Poles out of the range of numbers, or a number of them that differs from that by the argument principle.
+        Poles outside the floating-point range, or another number of poles than the argument principle counts.
 
     Notes
     -----
     Orders with a common base q give a polynomial in s^q, whose roots are those of its companion matrix. Other orders:
-    Newton's method in ln s, and the argument principle counts whether all zeros were found.
+    Newton's method in ln s, and the argument principle checks that all roots were found.
     """
-    every = [s for p in characteristic(model, coupled=is_coupled(coupling)) for s in _principal_zeros(p, "poles")]
+    every = [s for p in characteristic(model, coupled=is_coupled(coupling)) for s in _principal_roots(p, "poles")]
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
 @check_arguments
 def zeros(model: Model, output: str | None = None, input: str | None = None) -> Complex:
-    """Return the zeros of a transfer function on the principal sheet, for any orders.
+    """Return the zeros of a transfer function of any orders; with fractional orders, those on the principal sheet.
 
     Parameters
     ----------
@@ -184,8 +185,8 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
     Returns
     -------
     ndarray of complex
-        Values of s [rad/s], ``|arg s| < pi`` (whole orders: ``<= pi``), slowest first, without those at the origin.
-        Zeros that a pole cancels are included.
+        Values of s [rad/s], sorted by magnitude, without s = 0. With fractional orders ``|arg s| < pi``; with integer
+        orders the negative real axis is included. Zeros that a pole cancels are included.
 
     Raises
     ------
@@ -202,12 +203,15 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
             raise ModelError(f"{what} {name!r} is not in the model; known: {', '.join(known)}")
         chosen.append(name)
     numerator = {power: value for value, power in transfer.numerators[chosen[0], chosen[1]]}
-    found = _principal_zeros(numerator, "zeros") if numerator else []
+    found = _principal_roots(numerator, "zeros") if numerator else []
     return np.array(sorted(found, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
-def _principal_zeros(polynomial: Polynomial, what: str) -> list[complex]:
-    """Return the zeros of a sum of c s^p on the principal sheet, conjugates included; ``what`` names them in errors."""
+def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
+    """Return the roots of a sum of c s^p on the principal sheet with their conjugates.
+
+    ``what`` is "poles" or "zeros" in errors.
+    """
     upper = zeros_of(polynomial, math.pi)
     if not _whole_orders(polynomial):
         upper = [w for w in upper if w.imag < math.pi - DISTINCT_ZERO_TOLERANCE]

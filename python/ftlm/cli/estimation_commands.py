@@ -72,7 +72,7 @@ from ftlm.progress import Progress
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection import select as choice
-from ftlm.structure_selection.automatic import AutomaticForm
+from ftlm.structure_selection.automatic import IntegerOrderForm
 from ftlm.structure_selection.select import automatic_output
 from ftlm.utils.files import COMMAND_MESSAGES, check_free
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
@@ -502,7 +502,7 @@ def select(
     judges = replace(reading, window=None).runs([str(validation)]) if of_its_own else validation
     with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
         tried = [candidates] if isinstance(candidates, Structure) else candidates
-        grown = [AutomaticForm(4, 3).structure(runs, automatic_output(runs))] if isinstance(tried, str) else tried
+        grown = [IntegerOrderForm(4, 3).structure(runs, automatic_output(runs))] if isinstance(tried, str) else tried
         seconds = sum(fit_seconds(runs, one, threads) for one in grown)
         listed = isinstance(candidates, list)
         progress.expect("choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if listed else STEPWISE_TIME_FACTORS))

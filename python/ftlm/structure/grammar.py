@@ -1,12 +1,17 @@
-"""Grammar of equation texts: a recursive-descent parser from text to sums of terms, with positions in errors.
+"""Recursive-descent parser of equation texts; syntax errors name the position.
+
+Braces stand for any number of an item, brackets for an optional one, a bar for an alternative. ``delay`` and ``limit``
+are a number or an interval ``low:high``, ``strength`` and ``speed`` a number or a name, ``order`` a number, a name or an
+expression in parentheses. Blanks between names, numbers and symbols do not matter.
 
 ::
 
     equation    = sum "=" (sum | "0")  |  transfer
-    sum         = {sign} item {sign {sign} item}
-    item        = "c"  |  "(c + ramp t)"  |  friction  |  product  |  number "(" sum ")"
-    product     = {number [* /]} [name [*]] derivative [/ number]
-    derivative  = ["D" ["^" order]] signal  |  signal "'"…  |  "dy/dt"  |  "d^2 y/dt^2"  |  "d/dt" signal
+    sum         = {sign} item {sign {sign} item}      (a sign is + or -)
+    item        = "c"  |  "(c + ramp t)"  |  "(c if the runs ask for it)"  |  friction  |  term
+                |  number ["*"] "(" sum ")" ["/" number]
+    term        = {number ["*" | "/"]} [name ["*"]] derivative ["/" number]
+    derivative  = ["D" ["^" order]] signal  |  signal {"'"}  |  "dy/dt"  |  "d^2 y/dt^2"  |  "d/dt" signal
     signal      = name ["(t" ["-" delay ["s"]] ")"]  |  "sat(" signal "," limit ")"  |  "dead(" signal "," limit ")"
     friction    = [strength [*]] ["exp(-(D y/" speed ")^2)" [*]] "sign(D y)"
     transfer    = signal "=" {sign} ratio signal {sign ratio signal}  |  signal "/" signal "=" ratio
@@ -37,15 +42,15 @@ _TOKEN_PATTERN = re.compile(
 )
 #: What follows the name of an offset in parentheses, by the kind of offset.
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
-#: Functions of signals, whose terms are refused by name.
+#: Functions that an error message names where they are applied to a signal.
 FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt", "sign", "atan", "arctan")
 #: Largest power of a polynomial in s that is multiplied out.
 MAX_POLYNOMIAL_POWER = 10
 
 
 @dataclass(frozen=True)
-class Product:
-    """Product ``factor * name * D^order signal`` of a sum; ``name`` is None for a known coefficient."""
+class ParsedTerm:
+    """Term ``factor * name * D^order signal`` of one side; ``name`` is None if the coefficient is known."""
 
     factor: float
     name: str | None
@@ -53,9 +58,9 @@ class Product:
     signal: str
 
 
-#: Sum of ``factor * name * s^order``, a polynomial in s.
-Polynomial = list[tuple[float, str | None, Order]]
-UNIT_POLYNOMIAL: Polynomial = [(1.0, None, Order())]
+#: Terms (factor, name, order) of a sum of ``factor * name * s^order``; orders may be fractional.
+SymbolicPolynomial = list[tuple[float, str | None, Order]]
+UNIT_POLYNOMIAL: SymbolicPolynomial = [(1.0, None, Order())]
 
 
 class EquationParser:
@@ -79,13 +84,13 @@ class EquationParser:
     plain
         Signals that occur without a limit.
     delays
-        Delays [s], by signal; (lower, upper) is estimated.
+        Delays [s] by signal: a number if known, (lower, upper) if estimated in that interval.
     """
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self.left: list[Product] = []
-        self.right: list[Product] = []
+        self.left: list[ParsedTerm] = []
+        self.right: list[ParsedTerm] = []
         self.friction: tuple[Friction, str] | None = None
         self.stribeck: tuple[Stribeck, str] | None = None
         self.offset: str | None = None
@@ -162,14 +167,14 @@ class EquationParser:
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-' or the end")
 
-    def _sum(self, *, left: bool = False, closed: bool = False) -> list[Product]:
+    def _sum(self, *, left: bool = False, closed: bool = False) -> list[ParsedTerm]:
         """Parse a sum up to a token that does not continue it."""
-        found: list[Product] = []
+        found: list[ParsedTerm] = []
         while True:
             sign = self._signs()
             if self._is_offset():
                 self._take_offset(sign, left=left)
-            elif closed or not (self._take_phrase() or self._take_friction(-sign if left else sign)):
+            elif closed or not (self._take_printed_offset() or self._take_friction(-sign if left else sign)):
                 found += self._item(sign)
             if self._peek()[1] not in "+-" or self._peek()[0] != "symbol":
                 return found
@@ -180,7 +185,7 @@ class EquationParser:
             sign *= -1.0 if self._take()[1] == "-" else 1.0
         return sign
 
-    def _item(self, sign: float) -> list[Product]:
+    def _item(self, sign: float) -> list[ParsedTerm]:
         """Parse a product, or a number times a sum in parentheses."""
         factor = self._numbers(sign)
         name: str | None = None
@@ -215,7 +220,7 @@ class EquationParser:
                 f"{signal} is multiplied at character {end}: products of signals are not computed, and a coefficient "
                 "stands before its signal"
             )
-        return [Product(self._divisors(factor), name, order or Order(), signal)]
+        return [ParsedTerm(self._divisors(factor), name, order or Order(), signal)]
 
     def _numbers(self, factor: float) -> float:
         """Parse the numbers at the head of a product."""
@@ -272,7 +277,7 @@ class EquationParser:
         self.offset = "constant"
         self._take()
 
-    def _take_phrase(self) -> bool:
+    def _take_printed_offset(self) -> bool:
         """Take an offset in parentheses, as structures with one are printed; False for any other term."""
         for kind, phrase in OFFSET_PHRASES.items():
             if self._sees("(") and self._peek(1)[0] == "name":
@@ -518,7 +523,7 @@ class EquationParser:
         output = self._transform()
         common = self._transform() if self._accept("/") else None
         self._expect("=")
-        paths: list[tuple[Polynomial, Polynomial, str]] = []
+        paths: list[tuple[SymbolicPolynomial, SymbolicPolynomial, str]] = []
         while True:
             sign = self._signs()
             top, bottom, delay = self._ratio(common)
@@ -531,19 +536,19 @@ class EquationParser:
                 break
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-' or the end")
-        denominators: list[Polynomial] = []
+        denominators: list[SymbolicPolynomial] = []
         for _, bottom, _ in paths:
             if bottom not in denominators:
                 denominators.append(bottom)
         whole = UNIT_POLYNOMIAL
         for bottom in denominators:
             whole = self._times(whole, bottom)
-        self.left = [Product(c, n, o, output) for c, n, o in whole]
+        self.left = [ParsedTerm(c, n, o, output) for c, n, o in whole]
         for top, own, signal in paths:
             scaled = top
             for bottom in denominators:
                 scaled = scaled if bottom == own else self._times(scaled, bottom)
-            self.right += [Product(c, n, o, signal) for c, n, o in scaled]
+            self.right += [ParsedTerm(c, n, o, signal) for c, n, o in scaled]
 
     def _transform(self) -> str:
         """Parse a signal, with or without ``(s)`` behind it."""
@@ -556,7 +561,7 @@ class EquationParser:
         self.plain.add(value)
         return value
 
-    def _ratio(self, common: str | None) -> tuple[Polynomial, Polynomial, Value]:
+    def _ratio(self, common: str | None) -> tuple[SymbolicPolynomial, SymbolicPolynomial, Value]:
         """Parse numerator, denominator and delay of a transfer function up to its signal."""
         top, bottom, divides, delay = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, 0.0
         while True:
@@ -599,9 +604,9 @@ class EquationParser:
         self._expect(close)
         return delay
 
-    def _polynomial(self) -> Polynomial:
+    def _polynomial(self) -> SymbolicPolynomial:
         """Parse a sum of products of numbers, names and powers of s."""
-        found: Polynomial = []
+        found: SymbolicPolynomial = []
         while True:
             sign = self._signs()
             product = self._factor()
@@ -617,7 +622,7 @@ class EquationParser:
             if self._peek()[0] != "symbol" or self._peek()[1] not in "+-":
                 return [item for item in found if item[0] != 0.0] or UNIT_POLYNOMIAL
 
-    def _factor(self) -> Polynomial:
+    def _factor(self) -> SymbolicPolynomial:
         """Parse one factor of a transfer function."""
         kind, value, at = self._peek()
         if kind == "number":
@@ -648,10 +653,10 @@ class EquationParser:
             found = self._times(found, inner)
         return found
 
-    def _times(self, first: Polynomial, second: Polynomial) -> Polynomial:
+    def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
         """Multiply two polynomials; equal powers with known coefficients are added."""
         found: dict[tuple[str | None, Order], float] = {}
-        out: Polynomial = []
+        out: SymbolicPolynomial = []
         for c1, n1, o1 in first:
             for c2, n2, o2 in second:
                 if n1 is not None and n2 is not None:
@@ -663,7 +668,7 @@ class EquationParser:
                     found[None, order] = found.get((None, order), 0.0) + c1 * c2
                 else:
                     out.append((c1 * c2, name, order))
-        known: Polynomial = [(c, n, o) for (n, o), c in found.items() if c != 0.0]
+        known: SymbolicPolynomial = [(c, n, o) for (n, o), c in found.items() if c != 0.0]
         names = [name for _, name, _ in out]
         twice = next((a for a, b in pairwise(sorted(filter(None, names))) if a == b), None)
         if twice is not None:

@@ -95,7 +95,7 @@ def equation(
         raise ModelError("the equation is empty; write it as in 'D^1.5 y = a0 y + b0 u'")
     parsed = [EquationParser(line) for line in lines]
     equations = [_equation_of(words) for words in parsed]
-    _check_products(equations)
+    _check_signal_products(equations)
     fixed = dict(fixed or {})
     check_known("fixed coefficient", fixed, [n for e in equations for n in e.coefficient_names])
     for name, value in fixed.items():
@@ -120,8 +120,8 @@ def equation(
     return structure.with_limits(saturation=saturation, dead_zone=dead_zone)
 
 
-def _check_products(equations: Sequence[Equation]) -> None:
-    """Raise for a product of signals, which reads as a coefficient that has the name of a signal."""
+def _check_signal_products(equations: Sequence[Equation]) -> None:
+    """Raise if a coefficient has the name of a signal: ``u y`` would be a product of signals."""
     signals = {signal for item in equations for signal in item.signals}
     for item in equations:
         product = next((t for t in item.terms if t.coefficient in signals), None)
@@ -154,7 +154,10 @@ def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None
 
 
 def _equation_of(words: EquationParser) -> Equation:
-    """Return the equation of a parsed text, solved for the highest derivative of its output."""
+    """Return a parsed equation solved for its leading derivative.
+
+    That is the highest one on the left-hand side, or the first one if an order there is a named parameter.
+    """
     derivatives = [item for item in words.left if item.order.names or item.order.constant != 0]
     if not derivatives:
         output = words.left[0].signal if words.left else "y"

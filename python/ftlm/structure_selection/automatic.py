@@ -18,35 +18,36 @@ from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
 MAX_ORDER = 4
 #: Largest delay in samples, and as a share of the shortest run.
 MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
-#: Number of best candidates of which variants are fitted (an integrator, feedthrough, a level), and that are validated.
+#: Number of best candidates for which variants are also fitted (an integrator, feedthrough, an offset), and number of
+#: candidates that are validated, of integer and of fractional orders.
 EXTENDED_CANDIDATES, VALIDATED_CANDIDATES, VALIDATED_FRACTIONAL = 3, 6, 2
 #: Difference of Schwarz criteria beyond which a candidate of integer orders is not validated, and one of fractional
 #: orders.
 MAX_BIC_GAP, MAX_FRACTIONAL_BIC_GAP = 60.0, 10.0
-#: Decrease of the criterion for which delays or levels are tried in every candidate.
-SIGNIFICANT_BIC = 6.0
-#: Integer order of a form with a damping term, of which the order of that term may be free.
-MIN_ORDER_OF_TWO_TERMS = 2
+#: Smallest decrease of the Schwarz criterion for which delays or an offset are tried in all candidates.
+MIN_BIC_DECREASE = 6.0
+#: Order of the best form of integer orders for which D^2 y = a1 D^mu y + a0 y + … is tried.
+FRACTIONAL_DAMPING_ORDER = 2
 #: Orders at which fractional forms start.
 INITIAL_FRACTIONAL_ORDERS = (0.5, 0.8, 1.2, 1.7)
 
 
 @dataclass(frozen=True)
-class AutomaticForm:
-    """Equation of one output with integer orders: order, zeros, delays, integrator and offset.
+class IntegerOrderForm:
+    """Integer-order transfer function of one output: degrees of denominator and numerator, delay, integrator, offset.
 
     Parameters
     ----------
     order
-        Order of the output.
+        Degree of the denominator.
     zeros
-        Highest derivative of each input.
+        Degree of the numerator of each input.
     delayed
         Whether every input has a free delay.
     integrator
-        Whether the output itself has no term.
+        Whether the equation has no term in the output itself: a pole at s = 0.
     offset
-        Offset of each run.
+        Kind of offset of each run: ``"none"``, or ``"level"``, the value at which the output rests.
     """
 
     order: int
@@ -89,7 +90,7 @@ class FittedForm:
     structure: Structure
     joint: JointFit
     bic: float
-    form: AutomaticForm | None = None
+    form: IntegerOrderForm | None = None
 
 
 @dataclass
@@ -102,13 +103,13 @@ class AutomaticSelection:
         Estimation runs.
     output
         The output.
-    work
+    evaluator
         Evaluator of the candidates.
     """
 
     runs: Sequence[Run]
     output: str
-    work: CandidateEvaluator
+    evaluator: CandidateEvaluator
 
     def run(self) -> list[Trial]:
         """Fit the candidates and validate the best; return all trials in order."""
@@ -117,33 +118,33 @@ class AutomaticSelection:
             best = self._validate(fits, VALIDATED_CANDIDATES, MAX_BIC_GAP, fits[0].bic)
             forms = self._fit_fractional_forms(fits, best)
             self._validate(forms, VALIDATED_FRACTIONAL, MAX_FRACTIONAL_BIC_GAP, fits[0].bic)
-        return self.work.trials
+        return self.evaluator.trials
 
-    def _fit(self, forms: Sequence[AutomaticForm]) -> list[FittedForm]:
+    def _fit(self, forms: Sequence[IntegerOrderForm]) -> list[FittedForm]:
         """Fit forms, best first; a form that cannot be fitted becomes a failed trial."""
         return self._fit_structures([(f.structure(self.runs, self.output), f, []) for f in dict.fromkeys(forms)])
 
     def _fit_structures(
-        self, items: Sequence[tuple[Structure, AutomaticForm | None, list[dict[str, float]]]]
+        self, items: Sequence[tuple[Structure, IntegerOrderForm | None, list[dict[str, float]]]]
     ) -> list[FittedForm]:
-        joints = self.work.map_candidates(lambda i: self.work.fit_candidate(i[0], i[2], refine=False), items)
+        joints = self.evaluator.map_candidates(lambda i: self.evaluator.fit_candidate(i[0], i[2], refine=False), items)
         found = []
         for (structure, form, _), joint in zip(items, joints, strict=True):
             if isinstance(joint, JointFit):
                 found.append(FittedForm(structure, joint, self._criterion(structure, joint), form))
             else:
-                self.work.trials.append(self.work.validate(describe_structure(structure), structure, joint))
+                self.evaluator.trials.append(self.evaluator.validate(describe_structure(structure), structure, joint))
         return sorted(found, key=lambda f: f.bic)
 
     def _criterion(self, structure: Structure, joint: JointFit) -> float:
-        return schwarz_criterion(joint, parameter_count(structure, joint, self.work.folds), 1.0)
+        return schwarz_criterion(joint, parameter_count(structure, joint, self.evaluator.folds), 1.0)
 
     def _fit_integer_orders(self) -> list[FittedForm]:
         """Fit integer orders, and variants of the best; best first."""
-        probe = AutomaticForm(2, 1)
+        probe = IntegerOrderForm(2, 1)
         probes = self._fit([probe, replace(probe, offset="level")])
-        offset = "level" if _gain(probes, lambda f: f.offset == "level") > SIGNIFICANT_BIC else "none"
-        forms = [AutomaticForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
+        offset = "level" if _gain(probes, lambda f: f.offset == "level") > MIN_BIC_DECREASE else "none"
+        forms = [IntegerOrderForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
         fits = self._fit_zeros(forms, probes)
         if self._is_delayed(fits, offset):
             fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
@@ -152,7 +153,7 @@ class AutomaticSelection:
         fits += self._fit(more)
         return sorted(fits, key=lambda f: f.bic)
 
-    def _fit_zeros(self, forms: Sequence[AutomaticForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
+    def _fit_zeros(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
         """Add the fits of forms with all zeros, and of those with fewer that can have the least criterion; best first.
 
         A form with fewer zeros leaves no less, so its criterion is lower by at most the penalty of its zeros.
@@ -175,20 +176,20 @@ class AutomaticSelection:
 
     def _is_delayed(self, fits: Sequence[FittedForm], offset: str) -> bool:
         """Whether a delay lowers the criterion of a low order without or with a zero."""
-        probes = self._fit([AutomaticForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])
+        probes = self._fit([IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])
         for probe in probes:
             plain = [f.bic for f in fits if probe.form is not None and f.form == replace(probe.form, delayed=False)]
-            if probe.bic < min(plain, default=math.inf) - SIGNIFICANT_BIC:
+            if probe.bic < min(plain, default=math.inf) - MIN_BIC_DECREASE:
                 return True
         return False
 
     def _validate(self, fits: Sequence[FittedForm], count: int, gap: float, least: float) -> FittedForm | None:
         """Validate the best fits; return the one with the best prediction."""
         ahead = [f for f in fits if f.bic < least + gap][:count]
-        found = self.work.map_candidates(
-            lambda f: self.work.validate(describe_structure(f.structure), f.structure, f.joint), ahead
+        found = self.evaluator.map_candidates(
+            lambda f: self.evaluator.validate(describe_structure(f.structure), f.structure, f.joint), ahead
         )
-        self.work.trials += found
+        self.evaluator.trials += found
         ranked = sorted(zip(found, ahead, strict=True), key=lambda pair: (pair[0].unstable, pair[0].score))
         return ranked[0][1] if ranked else None
 
@@ -197,7 +198,7 @@ class AutomaticSelection:
 
         They have the offset of the best one of integer orders. If that has a delay, the best of them gets one as well.
         """
-        form = best.form if best is not None and best.form is not None else AutomaticForm(1, 0)
+        form = best.form if best is not None and best.form is not None else IntegerOrderForm(1, 0)
         y, frequency = self.output, _frequency(fits, form.offset)
         names = list(self.runs[0].inputs)
         inputs = [(_number(names, name), name) for name in names]
@@ -209,7 +210,7 @@ class AutomaticSelection:
             f"D^alpha {y} = {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
             f"D^alpha {y} = {direct} + {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
         }
-        if form.order == MIN_ORDER_OF_TWO_TERMS:
+        if form.order == FRACTIONAL_DAMPING_ORDER:
             texts[f"D^2 {y} = a1 D^mu {y} + a0 {y} + {driving}"] = (2.0,)
 
         def start(text: str, alpha: float, delays: Mapping[str, float]) -> dict[str, float]:
@@ -232,7 +233,7 @@ class AutomaticSelection:
         return sorted(found, key=lambda f: f.bic)
 
 
-def _variants(form: AutomaticForm) -> list[AutomaticForm]:
+def _variants(form: IntegerOrderForm) -> list[IntegerOrderForm]:
     """Forms that differ in one property: an integrator, direct feedthrough, a level."""
     return [
         replace(form, integrator=True),
@@ -241,7 +242,7 @@ def _variants(form: AutomaticForm) -> list[AutomaticForm]:
     ]
 
 
-def _gain(fits: Sequence[FittedForm], has: Callable[[AutomaticForm], bool]) -> float:
+def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
     """Decrease of the least criterion by a property; 0 if no form has it."""
     with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
     without = [f.bic for f in fits if f.form is not None and not has(f.form)]

@@ -19,7 +19,7 @@ from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degene
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.structure import Structure
-from ftlm.structure_selection.automatic import AutomaticForm, AutomaticSelection, is_fractional
+from ftlm.structure_selection.automatic import AutomaticSelection, IntegerOrderForm, is_fractional
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
 from ftlm.structure_selection.cross_validation import Folds, Trial, scatter_factor, schwarz_criterion
@@ -173,7 +173,7 @@ def select(
         raise ModelError(
             f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
         )
-    automatic = [] if output is None else [AutomaticForm(2, 1).structure(folds.runs, output)]
+    automatic = [] if output is None else [IntegerOrderForm(2, 1).structure(folds.runs, output)]
     for structure in (*searched, *every.values(), *automatic):
         # Refused here, once, and not as a failure of every candidate.
         prepare(

@@ -3,8 +3,8 @@
 //! Let D^n y = Σ a_i D^i y + Σ b_j D^j u, A(s) = s^n − Σ a_i s^i. The samples of s^j/A u are states of one companion
 //! form, advanced from pulse to pulse by its matrix exponential. This is exact for an input that is held or linear over
 //! a pulse, with any delay of a held input. y is linear in b_j, its derivative with respect to a_i is s^i/A y, a state of
-//! two companion forms in series, and its derivative with respect to a delay is −D y. A power of t is the response to an
-//! impulse, a constant or a ramp. Time is scaled by the largest coefficient, so that no element of the companion form is
+//! two companion forms in series, and its derivative with respect to a delay is −D y. An initial term c t^e is the
+//! response of a chain of integrators to an impulse, a constant or a ramp. Time is scaled by the largest coefficient, so that no element of the companion form is
 //! above 1.
 
 use std::borrow::Cow;
@@ -26,8 +26,8 @@ use crate::state_space::{InputGains, Transition};
 const INTEGER_TOLERANCE: f64 = 1e-9;
 /// Largest order of an equation.
 const MAX_ORDER: usize = 12;
-/// Largest magnitude of a pole times the sampling interval: half the sampling frequency. Faster poles have no effect on
-/// the samples that noise would not have as well.
+/// Largest magnitude of a pole times the sampling interval, at the Nyquist frequency. The effect of faster poles on the
+/// samples cannot be told from noise.
 const MAX_POLE_PHASE_RAD: f64 = std::f64::consts::PI;
 
 /// Equations of integer orders whose inputs are held or linear in every experiment.
@@ -331,14 +331,14 @@ impl IntegerOrders {
         Some(Self { equations })
     }
 
-    /// True if no pole is faster than the sampling of an experiment resolves.
+    /// True if the shortest sampling interval of the experiments resolves every pole.
     pub(crate) fn is_resolved(&self, model: &FreeModel, experiments: &[Experiment], point: &Point) -> bool {
-        let longest =
+        let shortest_interval =
             experiments.iter().map(|e| e.record.step() * e.pulses_per_sample as f64).fold(f64::INFINITY, f64::min);
         self.equations.iter().enumerate().all(|(i, _)| {
             let mut divisor: Vec<f64> = self.own_coefficients(model, i, point).iter().map(|a| -a).collect();
             divisor.push(1.0);
-            spectral_radius(&divisor).is_some_and(|fastest| fastest * longest <= MAX_POLE_PHASE_RAD)
+            spectral_radius(&divisor).is_some_and(|fastest| fastest * shortest_interval <= MAX_POLE_PHASE_RAD)
         })
     }
 

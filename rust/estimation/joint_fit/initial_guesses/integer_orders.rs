@@ -1,11 +1,11 @@
-//! Optima of equations of integer orders: instrumental variables and lower orders as initial guesses, then variable
-//! projection over the poles.
+//! Fit of equations of integer orders: initial guesses by refined instrumental variables (SRIVC) and from lower orders,
+//! then variable projection over the poles.
 //!
 //! State-variable filters 1/(s + λ)^n give first coefficients for several λ (Garnier & Young). Refined instrumental
-//! variables improve them: with the exact simulation x as instrument and y − x as residual a step solves
-//! Σ Ψ_a (y − x − Σ Φ_b d_b) = 0, Ψ = s^i/A x, Φ = s^i/A y. Other guesses add a pole or a pair of poles to the optimum
-//! of a lower order. The best continue in the logarithms of p and q of the sections s² + p s + q, where every point is
-//! stable and no pole is faster than the samples show.
+//! variables improve them: with the exact simulation x as instrument and y − x as residual, the step d of the
+//! coefficients of the denominator A solves Σ_t Ψ_i (y − x − Σ_j Φ_j d_j) = 0, Ψ_i = s^i/A x, Φ_j = s^j/A y. Other
+//! guesses add a pole or a pair of poles to the optimum of a lower order. The best continue in the logarithms of p and q
+//! of the sections s² + p s + q, where every point is stable and no pole is faster than the samples resolve.
 
 use std::borrow::Cow;
 use std::f64::consts::PI;
@@ -48,7 +48,7 @@ const COST_TOLERANCE: f64 = 1e-8;
 /// Nyquist frequency are not determined by the samples.
 const MAX_DECAY_STEP: f64 = 1.0;
 const MAX_FREQUENCY_STEP: f64 = PI;
-/// Slowest pole relative to the duration of the longest run.
+/// Smallest magnitude of a pole times the duration of the longest run.
 const MIN_POLE_DURATION: f64 = 1e-4;
 /// Smallest damping of an initial guess.
 const MIN_DAMPING: f64 = 1e-4;
@@ -81,7 +81,9 @@ struct Guess {
     origin: String,
 }
 
-/// Optima of a problem of integer orders, best first, each equation for itself; None for other problems.
+/// Local optima of a problem of integer orders, best first; None for other problems.
+///
+/// Candidate k has the k-th optimum of every equation.
 ///
 /// # Errors
 /// [`Error::Interrupted`]; errors of the runs.
@@ -216,7 +218,7 @@ impl<'a> Equation<'a> {
             for (delay, poles) in delays.iter().zip(&mut lower) {
                 let begin = Point { inputs: delay.clone(), ..start.clone() };
                 let mut guesses = equation.instrumental_variables(&begin)?;
-                guesses.extend(equation.grown(&begin, poles)?);
+                guesses.extend(equation.with_added_poles(&begin, poles)?);
                 let ends = equation.refine(guesses)?;
                 let best = ends.first().map(|end| equation.poles(&end.point)).unwrap_or_default();
                 poles.push(best);
@@ -274,7 +276,7 @@ impl<'a> Equation<'a> {
     }
 
     /// Guesses with one real pole or one pair more than the optima of lower orders.
-    fn grown(&self, start: &Point, lower: &[Vec<Pole>]) -> Result<Vec<Guess>> {
+    fn with_added_poles(&self, start: &Point, lower: &[Vec<Pole>]) -> Result<Vec<Guess>> {
         let mut guesses = Vec::new();
         for more in 1..=2_usize {
             let Some(poles) = lower.len().checked_sub(more).map(|k| &lower[k]) else { continue };
