@@ -1,8 +1,8 @@
 """Recursive-descent parser of equation texts; syntax errors name the position.
 
 Braces stand for any number of an item, brackets for an optional one, a bar for an alternative. ``delay`` and ``limit``
-are a number or an interval ``low:high``, ``strength`` and ``speed`` a number or a name, ``order`` a number, a name or an
-expression in parentheses. Blanks between names, numbers and symbols do not matter.
+are a number or an interval ``low:high``, ``strength`` and ``speed`` a number or a name, ``order`` a number, a name or
+an expression in parentheses. Blanks between names, numbers and symbols do not matter.
 
 ::
 
