@@ -187,7 +187,7 @@ fn remaining_change_ratios(older: &Rows, old: &Rows, new: &Rows) -> Option<Vec<f
     now.iter().zip(&before).map(of).collect()
 }
 
-/// Limit for zero step of samples on grids of 1, 1/2, 1/4, … of a step, with numbers that belong to an output each.
+/// Limit for zero step of samples, and of initial terms, on grids of 1, 1/2, 1/4, … of a step.
 ///
 /// The estimate is the column of the Richardson table, or its extrapolation by Aitken's method, that another halving of
 /// the step changes least. None without grids.

@@ -152,7 +152,7 @@ impl Companion {
         states.chunks_exact(self.order.max(1)).zip(values).map(of).collect()
     }
 
-    /// Response to an input or an impulse: states of 1/A, and with an output row those of 1/A behind it.
+    /// States of 1/A driven by an input or an impulse; with an output row, the output of that row drives a second 1/A.
     ///
     /// The states come at the compared samples, with the input just after each. None on overflow.
     pub(crate) fn respond(
@@ -540,7 +540,8 @@ impl IntegerOrders {
     }
 }
 
-/// Input of a signal as it acts: means per pulse if held, values per edge if linear.
+/// Signal after its delay, saturation or dead zone, as it drives a companion form: means per pulse if held, values per
+/// edge if linear.
 pub(crate) fn source_input<'a>(
     model: &FreeModel,
     experiment: &'a Experiment,

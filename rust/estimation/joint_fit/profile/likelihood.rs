@@ -14,8 +14,8 @@ use crate::signal::statistics::inner;
 
 /// Maximum number of evaluations of one refit.
 pub const MAX_REFIT_EVALUATIONS: usize = 120;
-/// Half the refinement is enough if it moves the optimum by less than this many standard errors, or less than this
-/// fraction of each parameter.
+/// The profile uses a grid twice as coarse if that moves the optimum by less than this many standard errors, or by less
+/// than this fraction of each parameter.
 const MAX_OPTIMUM_SHIFT_ERRORS: f64 = 2.0;
 const MAX_OPTIMUM_SHIFT_RATIO: f64 = 1e-3;
 /// Tolerance of a refit as a fraction of the threshold, and the cost decrease that indicates another optimum.
@@ -88,7 +88,7 @@ pub struct ProfileLikelihood<'a> {
 }
 
 impl<'a> ProfileLikelihood<'a> {
-    /// Profile likelihood around the optimum that so many evaluations reach from a fit.
+    /// Profile likelihood around the optimum that is found from the fit with at most `evaluations` evaluations.
     ///
     /// # Errors
     /// As [`Objective::minimize`].
@@ -192,7 +192,7 @@ impl<'a> ProfileLikelihood<'a> {
 
     /// True if the optimum has a lower cost than the fit on the next finer grid as well.
     ///
-    /// Both are only evaluated there, because a mode of the scheme would otherwise adapt to that grid.
+    /// Both are evaluated there and not refitted, because a refit could exploit the discretization error of that grid.
     ///
     /// # Errors
     /// [`Error::Interrupted`].

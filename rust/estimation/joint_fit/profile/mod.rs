@@ -24,7 +24,8 @@ use bound_search::MAX_REFITS_PER_BOUND;
 const MAX_QUADRATIC_ERROR: f64 = 0.1;
 /// Smallest budget of simulations with which the search for a bound continues.
 const MIN_BUDGET_PER_BOUND: usize = 10;
-/// A lower optimum is reported if the sum of squares falls by more than this fraction of one standard error's rise.
+/// A lower optimum is reported if it lowers the sum of squares by more than this fraction of the rise at one standard
+/// error.
 const MIN_COST_REDUCTION: f64 = 0.1;
 /// Largest number of lower optima from which the search continues.
 const MAX_LOWER_OPTIMA: usize = 5;
