@@ -86,7 +86,7 @@ def arm(name: str, used: Sequence[str] = ("psf", "lqr")) -> None:
     structure = ftlm.equation(WORDS[name], sensor_filter=ftlm.SensorFilter.low_pass(FILTERED))
     identify, before, found = ftlm.identify, peak(), []
     seconds = spent(lambda: found.append(identify([runs[n] for n in used], structure, threads=1)))
-    numbers = ", ".join(f"{n} {v:.4g}" for n, v in found[0].parameter_values.items())
+    numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in found[0].parameters.values())
     fits = {n: found[0].model.compare(run).fit_percent["theta22"] for n, run in runs.items()}
     case = name if len(used) > 1 else f"{name} on {used[0]}"
     told(case, seconds, before, f"{found[0].fit_percent['theta22']:.2f} %: {percents(fits, used)}; {numbers}")
@@ -161,7 +161,7 @@ def long(samples: int) -> None:
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y})
     identify, before, found = ftlm.identify, peak(), []
     seconds = spent(lambda: found.append(identify(run, ftlm.equation("D^alpha y = a y + b u"), threads=1)))
-    numbers = ", ".join(f"{n} {v:.6g}" for n, v in found[0].parameter_values.items())
+    numbers = ", ".join(f"{p.name} {p.value:.6g}" for p in found[0].parameters.values())
     told(f"{samples} samples", seconds, before, f"{found[0].fit_percent['y']:.2f} %: {numbers}")
 
 

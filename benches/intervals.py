@@ -136,7 +136,7 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
         )
         profiles = found.profiles
     end = time.perf_counter()
-    values, errors = found.parameter_values, found.standard_errors
+    values, errors = {n: found.parameters[n].value for n in found.names}, found.standard_errors
     numbers = {}
     for n, truth in case.truth.items():
         half = NORMAL_95 * errors[n]

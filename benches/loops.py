@@ -90,7 +90,7 @@ def one_offset(task: tuple[str, float, int, str]) -> tuple[bool, bool, list[floa
     start = time.process_time()
     found = ftlm.identify(run, structure, offset=offset, threads=1)
     taken = time.process_time() - start
-    values = {**found.parameter_values, **found.coefficients}
+    values = {n: p.value for n, p in found.parameters.items()}
     errors = [values[n] - v for n, v in truth.items()]
     told = any("unknown constant" in w for w in found.warnings)
     return bool(found.comparison.offsets), told, errors, float(np.mean(covered(found, truth))), taken
@@ -124,11 +124,11 @@ def cell(seeds: int) -> Iterator[str]:
             run = loops.cell_run(50_000, 0.01, hold, seed, noise=0.01)
             start = time.process_time()
             found = ftlm.identify(run, loops.CELL_STRUCTURE, threads=1)
-            z = [(found.parameter_values[n] - v) / found.standard_errors[n] for n, v in truth.items()]
+            z = [(found.parameters[n].value - v) / found.standard_errors[n] for n, v in truth.items()]
             ended.append((z, time.process_time() - start, found))
         z = np.array([e[0] for e in ended])
         last = ended[-1][2]
-        words = ", ".join(f"{n} {last.parameter_values[n]:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)
+        words = ", ".join(f"{n} {last.parameters[n].value:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)
         yield (
             f"cell, {hold}, 50 000 rows, 1 % noise, {seeds} seeds: mean z "
             f"{', '.join(f'{v:.2f}' for v in z.mean(axis=0))}, covered {100 * np.mean(np.abs(z) < 1.96):.0f} %; the "

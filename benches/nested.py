@@ -108,7 +108,7 @@ def chain(run: ftlm.Run, name: str) -> Iterator[str]:
         cost = found.fit.noise["y"] ** 2
         ratio = cost / least
         worse = " **worse**" if ratio > 1.0 + TOLD else ""
-        numbers = ", ".join(f"{n} {v:.4g}" for n, v in found.parameter_values.items())
+        numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in found.parameters.values())
         spent = time.process_time() - begun
         yield (
             f"| {run.name} | {name} | {kind} | {found.fit_percent['y']:.2f} | {ratio:.4f}{worse} | {numbers}; "

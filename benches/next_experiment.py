@@ -57,7 +57,7 @@ def one(seed: int, criterion: str) -> dict[str, Any]:
         "binding": list(designed.active_constraints),
         "predicted": {k: dict(designed.errors[k]) for k in ("now", "square", "designed", "both")},
         "found": {n: v for n, v in second.standard_errors.items() if n in designed.values},
-        "estimates": {n: v for n, v in second.parameter_values.items()},
+        "estimates": {n: p.value for n, p in second.parameters.items()},
         "correlated": np.asarray(second.fit.covariance).tolist() if second.fit is not None else [],
         "names": second.fit.names if second.fit is not None else [],
         "largest": {o: float(np.max(np.abs(truth[o]))) for o in truth.outputs},

@@ -65,6 +65,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.io.preview import open_file as open_file
     from ftlm.model.model import Estimate as Estimate
     from ftlm.model.model import Model as Model
+    from ftlm.model.parameter_estimates import Parameter as Parameter
     from ftlm.model.serialization import load_model as load_model
     from ftlm.order_search.certificate import certify_orders as certify_orders
     from ftlm.order_search.result import OrderCertificate as OrderCertificate
@@ -134,6 +135,7 @@ _MODULE_BY_NAME = {
         "io.load_frequency": "load_frequency",
         "io.preview": "FileColumn OpenedFile open_file",
         "model.model": "Estimate Model",
+        "model.parameter_estimates": "Parameter",
         "model.serialization": "load_model",
         "order_search.certificate": "certify_orders",
         "order_search.result": "OrderCertificate SearchResult SearchRow StoreStatus",

@@ -56,7 +56,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
     Attributes
     ----------
     identification_ : Identification
-        What was found; its ``verdict()`` says whether to trust it.
+        What was found; its ``verdict`` says whether to trust it.
     model_ : Model
         The model.
     n_features_in_ : int

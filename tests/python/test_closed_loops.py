@@ -269,7 +269,7 @@ def test_residuals_are_orthogonal_to_what_follows_the_reference():
     run = loops.loop("closed, coloured", 3)
     found = ftlm.identify(run, STRUCTURE, method=ftlm.OutputError(reference="r"))
     assert found.fit.converged
-    values = found.parameter_values
+    values = {n: p.value for n, p in found.parameters.items()}
     (answer,), _ = instrument_runs([run], STRUCTURE, "r")
 
     def free(u: np.ndarray, alpha: float, a: float, b: float) -> np.ndarray:

@@ -77,7 +77,7 @@ def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str) -> None:
     scored = []
     for seed in range(4):
         found = ftlm.identify(loops.cell_run(800, 0.02, hold, seed, noise=0.01), loops.CELL_STRUCTURE)
-        scored.append([(found.parameter_values[n] - v) / found.standard_errors[n] for n, v in loops.CELL.items()])
+        scored.append([(found.parameters[n].value - v) / found.standard_errors[n] for n, v in loops.CELL.items()])
         assert found.standard_errors["d"] < 0.02
     assert np.max(np.abs(scored)) < 3.5
     assert np.mean(np.abs(scored) < 1.96) >= 0.8
@@ -87,7 +87,7 @@ def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str) -> None:
 def test_a_cell_without_noise_is_itself(hold: str) -> None:
     found = ftlm.identify(loops.cell_run(400, 0.05, hold, 1, noise=0.0), loops.CELL_STRUCTURE)
     for name, value in loops.CELL.items():
-        assert found.parameter_values[name] == pytest.approx(value, rel=2e-4)
+        assert found.parameters[name].value == pytest.approx(value, rel=2e-4)
 
 
 def test_the_relaxation_of_the_cell_is_the_series_of_mittag_leffler() -> None:

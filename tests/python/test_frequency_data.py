@@ -178,9 +178,9 @@ def test_a_model_that_leaves_something_out_says_so():
     found = ftlm.identify_frequency(data, ARC)
     assert not found.white
     assert any("residuals are not white" in w for w in found.warnings)
-    assert found.verdict().level == "with care"
+    assert found.verdict.level == "with care"
     straight = ftlm.FrequencyData.from_arrays(W, noisy(np.ones(W.size), 0.001, 2))
-    assert ftlm.identify_frequency(straight, "D y = b u").verdict().level == "do not use"
+    assert ftlm.identify_frequency(straight, "D y = b u").verdict.level == "do not use"
 
 
 def test_numbers_that_move_together_are_named():
@@ -188,7 +188,7 @@ def test_numbers_that_move_together_are_named():
     found = ftlm.identify_frequency(ftlm.FrequencyData.from_arrays(W, circuits.cpe(W, 2.0, 0.7)), words)
     assert not math.isfinite(found.standard_errors["b0"])
     assert any(w.startswith("moved together they change nothing: b0, b1") for w in found.warnings)
-    assert found.verdict().level == "do not use"
+    assert found.verdict.level == "do not use"
     assert json.dumps(found.to_dict(), allow_nan=False)
     assert found.model.estimate.covariance is None
 
@@ -218,7 +218,7 @@ def test_a_number_that_another_hides_is_said_and_their_ratio_holds():
 
 def test_a_second_record_decides_the_verdict():
     found = ftlm.identify_frequency(arc(1), ARC)
-    assert "has been tried" in found.verdict().reason
+    assert "has been tried" in found.verdict.reason
     assert found.validate(arc(2)).verdict.level == "trust"
     assert found.validate(arc(1)).verdict.level == "with care"
     other = ftlm.FrequencyData.from_arrays(W, 1.2 * circuits_of_arc(), name="older")

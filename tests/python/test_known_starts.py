@@ -54,7 +54,7 @@ def test_a_richer_structure_from_a_simpler_one_is_never_worse(run, simple):
         method=ftlm.OutputError(start=simple.model, intervals="quadratic"),
         threads=1,
     )
-    assert from_model.parameter_values == rich.parameter_values
+    assert from_model.parameters == rich.parameters
 
 
 def test_a_start_leads_where_automatic_ones_do_not():

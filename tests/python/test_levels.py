@@ -31,8 +31,8 @@ def test_a_right_model_under_large_noise_is_buried_and_not_useless(seed):
     found = ftlm.identify(run, ftlm.equation("D y = a y + b u", initial="rest"))
     assert "explains_little" not in codes(found)
     assert "buried_in_noise" in codes(found)
-    assert found.verdict().level == LEVEL_WITH_CARE
-    assert "output-error" not in found.verdict().sentence
+    assert found.verdict.level == LEVEL_WITH_CARE
+    assert "output-error" not in found.verdict.sentence
 
 
 def test_a_model_that_explains_nothing_stays_useless():
@@ -40,7 +40,7 @@ def test_a_model_that_explains_nothing_stays_useless():
     run = ftlm.Run.from_arrays(step=STEP, inputs={"u": steps(g, 3000)}, outputs={"y": g.standard_normal(3000)})
     found = ftlm.identify(run, ftlm.equation("D y = a y + b u", initial="rest"))
     assert "buried_in_noise" not in codes(found)
-    assert found.verdict().level == LEVEL_DO_NOT_USE
+    assert found.verdict.level == LEVEL_DO_NOT_USE
 
 
 @pytest.mark.parametrize("seed", range(30, 34))
@@ -65,7 +65,7 @@ def test_an_input_that_no_equation_reads_is_named_with_the_option(seed):
 
 def weighed(found):
     """Levels, codes and levels of verdict, which no name or unit may change."""
-    return found.verdict().level, sorted((f.level, f.code) for f in found.findings)
+    return found.verdict.level, sorted((f.level, f.code) for f in found.findings)
 
 
 @pytest.mark.parametrize("fault", ["none", "order", "outliers", "noise"])
@@ -108,5 +108,5 @@ def test_an_outlier_at_an_end_of_the_run_is_named_and_not_taken_for_a_poor_model
     assert found.coefficients["a"] == pytest.approx(-2.0, rel=0.02)
     assert "end_row_far_off" in codes(found)
     assert not {"explains_little", "buried_in_noise"} & set(codes(found))
-    assert found.verdict().level == LEVEL_WITH_CARE
-    assert found.verdict().reason.startswith("the first or the last row of y lies far off")
+    assert found.verdict.level == LEVEL_WITH_CARE
+    assert found.verdict.reason.startswith("the first or the last row of y lies far off")

@@ -339,7 +339,7 @@ def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_pat
         for name, value in truth.items():
             low, high = found.intervals[name]
             # Three standard errors: 95 % would fail one number in twenty.
-            assert abs(found.parameter_values[name] - value) < 3 * (high - low) / 3.92
+            assert abs(found.parameters[name].value - value) < 3 * (high - low) / 3.92
         assert "offset found by test: constant, since the runs ask for one" in found.details()
         # Estimated anew on the run that the model is judged on, and said.
         other, _, _ = loops.offset_run(kind, -2.0, 2)
@@ -363,7 +363,7 @@ def test_auto_leaves_a_record_without_an_offset_as_it_was():
     plain, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="auto")
     assert found.settings["offset_test"].startswith("none, since the runs ask for none (chi-squared")
     assert found.comparison.offsets == ()
-    assert found.parameter_values == plain.parameter_values
+    assert found.parameters == plain.parameters
     assert found.standard_errors == plain.standard_errors
 
 

@@ -39,7 +39,7 @@ def test_rank_1_carries_the_verdict_of_an_identification(seed, method):
     found = ftlm.search_orders(run, equation, grid, coefficients=method)
     kind = {m.name: m for m in (ftlm.MultiInnovation, ftlm.LeastSquares, ftlm.InstrumentalVariables)}[method]
     result = ftlm.identify(run, equation, method=kind(order_grid=grid))
-    assert found.verdict == result.verdict()
+    assert found.verdict == result.verdict
     assert {f.code for f in result.findings} <= set(codes(found)) | {"on_edge"}
     assert str(found.verdict) in str(found)
 

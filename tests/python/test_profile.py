@@ -198,7 +198,7 @@ def test_at_its_ends_the_cost_has_risen_by_the_threshold(
     u = switched(300, 15)
     run = record(answer(*truth.values(), u), u, noise, 4)
     found = quadratic(run, words)
-    values = np.array([found.parameter_values[n] for n in truth])
+    values = np.array([found.parameters[n].value for n in truth])
     valley = likelihood_of(found)
     asked = {n: valley.names.index(n) for n in truth}
     bent = nonlinear_parameters(valley, 0.95)
@@ -410,7 +410,7 @@ def test_a_lower_optimum_on_the_way_is_gone_on_from(bent: ftlm.Run) -> None:
 def test_a_budget_holds_for_every_optimum_on_the_way(bent: ftlm.Run) -> None:
     u = bent["u"]
     plain = quadratic(record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9), "D^2 y = c D y + a y + b u")
-    names, apart = tuple(plain.parameter_values), {"fit": one_error_beside(plain), "evaluations": 1}
+    names, apart = plain.names, {"fit": one_error_beside(plain), "evaluations": 1}
     free = intervals_of(plain, **apart)
     # It went on from a lower optimum; what it took until there counts.
     assert free.lower_optimum is not None

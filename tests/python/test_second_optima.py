@@ -94,7 +94,7 @@ def test_a_second_optimum_of_a_run_is_named(seed):
     shown = said.numbers["shown"].rpartition("delay_u = ")[2].split()
     # Held inputs act half a sample later than straight lines; the optima lie half a period or a period apart.
     values = np.array([float(shown[0]), float(shown[2])])
-    assert found.parameter_values["delay_u"] == pytest.approx(values[1], rel=1e-3)
+    assert found.parameters["delay_u"].value == pytest.approx(values[1], rel=1e-3)
     halves = (values - 0.275) * omega / np.pi
     assert np.abs(halves - np.round(halves)).max() < 0.1
 

@@ -36,7 +36,7 @@ def test_the_log_tells_files_fits_and_doubts(run, tmp_path, caplog):
     assert told[0].startswith("written: ")
     assert told[1] == "read: square, simulated: 200 rows, u, y"
     assert told[2] == "identifying equation from square, simulated by least-squares"
-    assert told[3] == f"identified: {found.verdict()}"
+    assert told[3] == f"identified: {found.verdict}"
     doubts = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert tuple(doubts) == tuple(found.warnings)
     caplog.clear()

@@ -38,12 +38,12 @@ def codes(found):
 def test_the_way_that_is_named_leads_to_the_truth(seed, noise):
     run = held(4.0, 2.0, 5.0, seed=seed, noise=noise)
     default = ftlm.identify(run, ftlm.equation(EQUATION))
-    assert default.verdict().level == "do not use"
+    assert default.verdict.level == "do not use"
     (said,) = (f for f in default.findings if f.code == "plant_needs_pieces")
-    assert default.verdict().reason == said.reason
+    assert default.verdict.reason == said.reason
     assert "initial='caputo'" in said.remedy
     assert "method='least-squares'" in said.remedy
-    assert "output-error" not in default.verdict().remedy
+    assert "output-error" not in default.verdict.remedy
     # The call that the remedy names.
     seconds = round(said.numbers["seconds"], 2)
     pieces = [run.window(k * seconds, (k + 1) * seconds) for k in range(int(run.length * STEP / seconds))]
@@ -51,7 +51,7 @@ def test_the_way_that_is_named_leads_to_the_truth(seed, noise):
     for name, truth in (("a", 4.0), ("b", 2.0)):
         assert abs(found.coefficients[name] - truth) < 4 * found.standard_errors[name] + 0.01 * truth
     assert "plant_unstable" in codes(found)
-    assert found.verdict().level == "with care"
+    assert found.verdict.level == "with care"
     assert found.verdict(found.validate(pieces[:3])).level == "with care"
     # What the file keeps is judged alike.
     assert ftlm.compare(found.model, pieces).output_error["y"].nr < 0.5
@@ -64,7 +64,7 @@ def test_an_equation_error_method_that_has_the_truth_is_not_refused_for_growing(
     assert found.coefficients["a"] == pytest.approx(4.0, rel=0.05)
     assert "plant_unstable_in_pieces" in codes(found)
     assert "free_run_grows" not in codes(found)
-    assert found.verdict().level == "with care"
+    assert found.verdict.level == "with care"
     found.model.save(tmp_path / "plant.json")
     again = ftlm.load_model(tmp_path / "plant.json")
     assert "plant_unstable_in_pieces" in [f.code for f in again.estimate.findings]
@@ -85,4 +85,4 @@ def test_a_stable_plant_whose_model_grows_is_still_refused(seed):
     grows = ftlm.equation(EQUATION).with_coefficients({"a": 2.0})
     found = ftlm.identify(run, grows, method="least-squares")
     assert "free_run_grows" in codes(found)
-    assert found.verdict().level == "do not use"
+    assert found.verdict.level == "do not use"

@@ -18,7 +18,7 @@ from ftlm import cli
 from ftlm.estimation import estimators as estimating
 from ftlm.estimation import nuisance_parameters as history
 from ftlm.estimation.output_error import ProfileInterval, fit_output_error
-from ftlm.estimation.verdict import saved_verdict
+from ftlm.estimation.verdict import saved_verdict, verdict
 from ftlm.findings import FINDING_CATALOGUE, FINDING_TOPICS, MAX_SUMMARY_FINDINGS, Finding, group_findings, make_finding
 from ftlm.report.html_report import model_page
 from loops import loop
@@ -62,7 +62,7 @@ def checked(found, other):
 
 
 def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
-    judged = found.verdict(checked)
+    judged = verdict(found, checked)
     assert (judged.level, judged.reasons, judged.trusted) == ("trust", (), True)
     assert judged.reason.startswith("it predicts runs it was not fitted to (y 99")
     assert checked.verdict == judged
@@ -85,12 +85,12 @@ def test_a_large_run_does_not_hide_that_a_small_one_is_lost(found, other):
 
 def test_a_validation_that_leaves_much_more_is_with_care(found, checked):
     far = replace(checked, output_error={"y": replace(checked.output_error["y"], nr=0.15, fit=85.0)})
-    judged = found.verdict(far)
+    judged = verdict(found, far)
     assert (judged.level, judged.reason.endswith("85 % on validation")) == ("with care", True)
     for own, left, level in ((1.0, 9.5, "with care"), (1.0, 4.9, "trust"), (3.0, 9.5, "trust"), (1.2, 5.9, "trust")):
         fitted = replace(found.comparison, output_error={"y": replace(found.output_error["y"], fit=100.0 - own)})
         less = replace(checked, output_error={"y": replace(checked.output_error["y"], nr=left / 100, fit=100.0 - left)})
-        assert worse(found, comparison=fitted).verdict(less).level == level, (own, left)
+        assert verdict(worse(found, comparison=fitted), less).level == level, (own, left)
 
 
 @pytest.mark.parametrize(
@@ -103,20 +103,20 @@ def test_a_validation_that_leaves_much_more_is_with_care(found, checked):
 )
 def test_what_no_number_says_speaks_against_a_model(found, checked, doubt):
     doubted = replace(found, findings=(*found.findings, doubt))
-    assert doubted.verdict(checked).level == "with care"
+    assert verdict(doubted, checked).level == "with care"
 
 
 def test_without_a_validation_nothing_is_trusted(found, run):
-    assert found.verdict().level == "with care"
-    assert found.verdict().reasons == ("no run that it was not fitted to has been tried",)
+    assert found.verdict.level == "with care"
+    assert found.verdict.reasons == ("no run that it was not fitted to has been tried",)
     # Its own run validates nothing.
-    assert found.verdict(found.validate(run)).reason == "no run that it was not fitted to has been tried"
+    assert found.validate(run).verdict.reason == "no run that it was not fitted to has been tried"
 
 
 def test_a_missing_mode_is_with_care(other):
     words = "D^3 y = -6 D^2 y - 14 D y - 36 y + 24 u"
     poor = ftlm.identify(record(SQUARE, words), ftlm.equation("D^2 y = a1 D y + a0 y + b0 u"))
-    judged = poor.verdict(poor.validate(record(CHIRP, words, seed=3)))
+    judged = poor.validate(record(CHIRP, words, seed=3)).verdict
     assert judged.level == "with care"
     assert judged.reason.startswith("residuals of y")
     assert "leaves something out" in judged.reason
@@ -125,13 +125,13 @@ def test_a_missing_mode_is_with_care(other):
 
 def test_a_model_that_explains_nothing_is_not_to_be_used():
     poor = ftlm.identify(record(SQUARE, "D^2 y = -0.2 D y - 900 y + u", noise=1.5), ftlm.equation("D y = b u"))
-    assert poor.verdict().level == "do not use"
-    assert "explains little of y (fit" in poor.verdict().reason
+    assert poor.verdict.level == "do not use"
+    assert "explains little of y (fit" in poor.verdict.reason
 
 
 def test_a_closed_loop_is_named():
     poor = ftlm.identify(loop("closed, coloured, biased", 0), ftlm.equation("D^alpha y = a y + b u"))
-    judged = poor.verdict()
+    judged = poor.verdict
     assert judged.level == "with care"
     assert judged.reason == "u answers y, a closed loop, and what comes back biases the numbers"
     assert "reference=" in judged.remedy
@@ -144,7 +144,7 @@ def test_a_free_run_that_grows_is_not_to_be_used():
     y = ftlm.Model(ftlm.equation("D y = 0.3 y + u")).simulate(empty)["y"]
     y = y + 0.01 * np.random.default_rng(1).standard_normal(y.size)
     grown = ftlm.Run.from_arrays(step=0.02, inputs={"u": volts}, outputs={"y": y})
-    judged = ftlm.identify(grown, ftlm.equation("D y = a y + b u")).verdict()
+    judged = ftlm.identify(grown, ftlm.equation("D y = a y + b u")).verdict
     assert judged.level == "do not use"
     assert judged.reason == "the free run grows without bound (1 pole with a positive real part)"
 
@@ -154,7 +154,7 @@ def test_numbers_that_no_run_tells_apart_are_not_to_be_used(run, monkeypatch):
     start = {"a1": -0.6, "a0": -9.0, "b0": 2.0, "b1": 2.0}
     monkeypatch.setattr(history, "fit_output_error", partial(fit_output_error, start=start))
     twice = ftlm.Run.from_arrays(step=0.02, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]})
-    judged = ftlm.identify(twice, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u + b1 v")).verdict()
+    judged = ftlm.identify(twice, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u + b1 v")).verdict
     assert judged.level == "do not use"
     assert judged.reason == "the runs do not tell b0 and b1 apart"
     assert "richer input" in judged.remedy
@@ -163,7 +163,7 @@ def test_numbers_that_no_run_tells_apart_are_not_to_be_used(run, monkeypatch):
 def test_a_method_without_errors_says_nothing_of_its_numbers(run, other):
     plain = ftlm.identify(run, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u"), method="multi-innovation")
     assert not plain.standard_errors
-    reasons = plain.verdict(plain.validate(other)).reasons
+    reasons = plain.validate(other).verdict.reasons
     assert "multi-innovation gives no standard errors, so nothing says how sure its numbers are" in reasons
 
 
@@ -180,21 +180,20 @@ def test_each_rule_finds_its_own_fault(found, checked):
         bad = replace(comparison.output_error["y"], fit=percent, nr=1 - percent / 100)
         return replace(comparison, output_error={"y": bad})
 
-    lost = found.verdict(fit(checked, 70.0))
+    lost = verdict(found, fit(checked, 70.0))
     assert lost.reason == f"the fit of y falls from {found.fit_percent['y']:.3g} to 70 % on validation"
     assert lost.level == "with care"
-    gone = found.verdict(fit(checked, 40.0))
+    gone = verdict(found, fit(checked, 40.0))
     assert (gone.level, gone.reason) == (
         "do not use",
         "the free run explains little of the validation run of y (fit 40 %)",
     )
-    never = worse(
-        found, comparison=replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=math.inf)})
-    ).verdict(checked)
+    far = replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=math.inf)})
+    never = verdict(worse(found, comparison=far), checked)
     assert (never.level, never.reason) == ("do not use", "the free run leaves the range of numbers")
-    stuck = worse(found, fit=replace(found.fit, converged=False)).verdict(checked)
+    stuck = verdict(worse(found, fit=replace(found.fit, converged=False)), checked)
     assert (stuck.level, stuck.reason) == ("with care", "the fit ended before it stood still")
-    short = worse(found, residuals=None).verdict(checked)
+    short = verdict(worse(found, residuals=None), checked)
     assert short.reason == "the runs are too short for residual tests"
 
 
@@ -204,11 +203,11 @@ def test_a_number_is_vague_by_its_own_size(found, checked):
     # Half of a1 is the limit: 0.3 of 0.6.
     for share, vague in ((0.4, False), (0.6, True)):
         spread[a1, a1] = (share * found.coefficients["a1"]) ** 2
-        judged = worse(found, fit=replace(found.fit, covariance=spread, profiles={})).verdict(checked)
+        judged = verdict(worse(found, fit=replace(found.fit, covariance=spread, profiles={})), checked)
         assert judged.trusted != vague
         assert not vague or judged.reason.startswith("the runs hardly tell a1 = -0.6")
     spread[a1, a1], spread[alpha, alpha] = 0.0, 0.3**2
-    judged = worse(found, fit=replace(found.fit, covariance=spread, profiles={})).verdict(checked)
+    judged = verdict(worse(found, fit=replace(found.fit, covariance=spread, profiles={})), checked)
     assert judged.reason == f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± 0.3"
 
 
@@ -220,14 +219,14 @@ def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, chec
         ("alpha", 1.5, math.inf, f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± "),
     ):
         open_ended = replace(found.fit, profiles={name: ProfileInterval(low, high, 0.95)})
-        judged = worse(found, fit=open_ended, model=late).verdict(checked)
+        judged = verdict(worse(found, fit=open_ended, model=late), checked)
         assert judged.reason.startswith(reason)
         assert judged.level == ("with care" if reason else "trust")
 
 
 def test_rough_intervals_are_a_fact(found, checked):
     doubted = worse(found, findings=(ROUGH,))
-    assert doubted.verdict(checked).trusted
+    assert verdict(doubted, checked).trusted
     assert doubted.warnings == (
         "the cost is no parabola along a0, and its profile there would take long: these intervals are rough; "
         "intervals='profile' finds them",
@@ -259,7 +258,7 @@ def test_a_swing_that_nothing_damps_is_with_care(found, checked):
         covariance[:] = 0.0
         covariance[order, order] = spread**2
         known = replace_estimate(found.model, covariance=tuple(map(tuple, covariance.tolist())))
-        judged = worse(found, model=known).verdict(checked)
+        judged = verdict(worse(found, model=known), checked)
         assert judged.trusted == told
         assert told or "may never die away (damping 0.27 ± " in judged.reason
 
@@ -293,7 +292,7 @@ def test_a_saved_model_is_judged_as_its_result_was(fault, tmp_path, monkeypatch)
     other = record(CHIRP, plant, seed=2, name="chirp")
     saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
     for runs in ([], [other]):
-        live = found.verdict(found.validate(runs) if runs else None)
+        live = verdict(found, found.validate(runs) if runs else None)
         judged = saved_verdict(saved, [saved.compare(run) for run in runs])
         assert (judged.level, judged.reasons) == (live.level, live.reasons)
         assert live.trusted == (bool(runs) and fault in TRUSTED)
@@ -339,12 +338,12 @@ def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checke
     red = replace(tests, whiteness=replace(tests.whiteness, passed=False), inputs=follows)
     for nr, trusted in ((0.01, False), (0.0009, True)):
         part = replace(found.residuals, outputs={"y": replace(red, nr=nr)})
-        assert worse(found, residuals=part).verdict(checked).trusted == trusted
+        assert verdict(worse(found, residuals=part), checked).trusted == trusted
     # Colored noise that follows no input is a fact.
     part = replace(found.residuals, outputs={"y": replace(red, inputs=tests.inputs)})
-    assert worse(found, residuals=part).verdict(checked).trusted
+    assert verdict(worse(found, residuals=part), checked).trusted
     part = replace(found.residuals, outputs={"y": replace(tests, inputs=follows)})
-    assert worse(found, residuals=part).verdict(checked).reason == (
+    assert verdict(worse(found, residuals=part), checked).reason == (
         "residuals of y still follow u: it leaves something out"
     )
 
@@ -352,7 +351,7 @@ def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checke
 def test_a_hidden_offset_is_named(found, checked):
     past = [{"y": {0.5: 1.0}}]
     hidden = worse(found, comparison=replace(found.comparison, offsets=({"y": {}},), initial=past))
-    judged = hidden.verdict(checked)
+    judged = verdict(hidden, checked)
     assert judged.level == "with care"
     assert judged.reason == "the offset of y is not told apart from what a run did before its start"
     assert "offset in the equation of y in square: not told apart" in str(hidden)
@@ -370,7 +369,7 @@ def test_what_may_not_be_used_comes_before_what_needs_care(found):
         fit=replace(found.fit, converged=False),
         comparison=replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=0.8, fit=20.0)}),
     )
-    judged = poor.verdict()
+    judged = poor.verdict
     assert judged.level == "do not use"
     assert len(judged.reasons) == 3
     assert judged.reasons[0] == judged.reason
@@ -379,9 +378,8 @@ def test_what_may_not_be_used_comes_before_what_needs_care(found):
 
 @pytest.mark.parametrize("bad", [3, "chirp", [], {}])
 def test_what_is_no_validation_is_refused(found, bad):
-    for ask in (found.verdict, found.summary):
-        with pytest.raises(ftlm.errors.ModelError, match=r"give what validate\(run\) returns"):
-            ask(bad)
+    with pytest.raises(ftlm.errors.ModelError, match=r"give what validate\(run\) returns"):
+        found.summary(bad)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -410,13 +408,13 @@ def test_nothing_reads_a_sentence():
 def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_path):
     poor = replace(found, findings=(BOUND, TIED, make_finding("offset_missing", output="y", share=30.0, test="x")))
     model = replace_estimate(found.model, findings=(BOUND.to_file(),), against=(BOUND.to_file(),))
-    before = poor.verdict(checked), saved_verdict(model, [])
+    before = verdict(poor, checked), saved_verdict(model, [])
     for code, kind in FINDING_CATALOGUE.items():
         reason = f"{code} a closed loop" if kind.reason else ""
         monkeypatch.setitem(
             FINDING_CATALOGUE, code, replace(kind, template="grows without bound| is quantised", reason=reason)
         )
-    after = poor.verdict(checked), saved_verdict(model, [])
+    after = verdict(poor, checked), saved_verdict(model, [])
     assert [v.level for v in after] == [v.level for v in before]
     assert [len(v.reasons) for v in after] == [len(v.reasons) for v in before]
     assert poor.warnings == ("grows without bound is quantised",) * 3
@@ -429,7 +427,7 @@ def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_
 )
 def test_the_name_of_a_run_is_no_reason(found, checked, name):
     noted = make_finding("data_note", run=name, text=f"resampled as {name}")
-    judged = replace(found, findings=(noted,)).verdict(checked)
+    judged = verdict(replace(found, findings=(noted,)), checked)
     assert judged.trusted
     assert noted.text == f"run {name}: resampled as {name}"
     fallen = make_finding("fit_falls", run=name, output=name, before=99.0, after=50.0, where="")
@@ -542,7 +540,7 @@ def test_delay_offset_and_friction_stand_in_the_equation():
 
 
 def test_json_and_page_say_the_same(found, checked, other, tmp_path):
-    document = json.loads(json.dumps(found.verdict(checked).to_dict()))
+    document = json.loads(json.dumps(verdict(found, checked).to_dict()))
     assert document["level"] == "trust"
     html = found._repr_html_()
     assert "<strong>With care</strong>: no run that it was not fitted to has been tried" in html
@@ -620,14 +618,14 @@ def test_an_integrator_is_no_growth_by_chance():
         positive += found.coefficients["a0"] > 0
         codes = [f.code for f in found.findings]
         assert ("growth_not_told" in codes) == (found.coefficients["a0"] > 0)
-        assert found.verdict().level == "with care"
+        assert found.verdict.level == "with care"
         assert saved_verdict(found.model, []).level == "with care"
     assert positive >= 2
 
 
 def test_a_pole_that_grows_is_still_found():
     found = ftlm.identify(integrator_record(1, pole=0.15), ftlm.equation("D y = a0 y + b u"))
-    assert found.verdict().level == "do not use"
+    assert found.verdict.level == "do not use"
     assert "free_run_grows" in [f.code for f in found.findings]
     assert saved_verdict(found.model, []).level == "do not use"
 
@@ -642,7 +640,7 @@ def test_a_noise_with_a_color_is_a_fact(other):
     found = ftlm.identify(red, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u"))
     assert [f.level for f in found.findings if f.code == "noise_coloured"] == ["fact"]
     assert "residuals_not_white" not in [f.code for f in found.findings]
-    assert found.verdict(found.validate(other)).trusted
+    assert found.validate(other).verdict.trusted
 
 
 def test_a_machine_that_stands_still_has_no_outliers_and_no_dead_channel():

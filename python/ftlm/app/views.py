@@ -16,6 +16,7 @@ from ftlm.app.forms import LOSS_NAMES, METHOD_NAMES, OFFSET_KINDS, FittedModel
 from ftlm.app.session import MAX_FILE_BYTES, STATE_MADE, STATE_RUNNING, File, Model, Session
 from ftlm.data.run import Run
 from ftlm.data.units import SIGNAL_UNITS, TIME_UNITS
+from ftlm.estimation.verdict import verdict
 from ftlm.io.dialect import DATE_ORDERS, DECIMAL_CHARACTERS, SEPARATOR_CHARACTERS, THOUSANDS_CHARACTERS
 from ftlm.plot.comparison_charts import comparison_charts
 from ftlm.report.html_report import behavior_tables, first_findings, title_of, verdict_box
@@ -186,7 +187,7 @@ MAX_FIGURES = 12
 def model_summary(made: FittedModel) -> dict[str, Any]:
     """Return the page content of a model; markup consists of escaped parts."""
     result, checked = made.result, made.validation
-    judged = result.verdict(checked)
+    judged = verdict(result, checked)
     warnings, left = first_findings([*result.findings, *(checked.findings if checked else ())])
     figures = []
     if checked is not None:

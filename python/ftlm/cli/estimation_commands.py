@@ -144,7 +144,7 @@ def identify(
         result.report(report, validation=others or None, force=force)
     checked = result.validate(others) if others else None
     if as_json:
-        judged = {"verdict": result.verdict(checked).to_dict()}
+        judged = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
     print_text(result.summary(checked))
@@ -447,7 +447,7 @@ def identify_frequency(
     if report is not None:
         result.report(report, validation=checked, force=force)
     if as_json:
-        judged = {"verdict": result.verdict(checked).to_dict()}
+        judged = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
     print_text(result.summary(checked))

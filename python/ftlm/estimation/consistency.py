@@ -275,7 +275,7 @@ def _cell(value: Cell) -> str:
 
 def values_of(result: Identification) -> dict[str, float]:
     """Return all parameters with a standard error, by name."""
-    return {**result.orders, **result.coefficients, **result.parameter_values}
+    return {n: p.value for n, p in result.parameters.items() if not p.fixed}
 
 
 @check_arguments

@@ -653,7 +653,7 @@ def identify_frequency(
         exact=best.cost <= NEGLIGIBLE_RESIDUAL_SHARE**2 * total,
         ends=ends,
     )
-    PACKAGE_LOGGER.info("identified: %s", result.verdict())
+    PACKAGE_LOGGER.info("identified: %s", result.verdict)
     for item in result.findings:
         PACKAGE_LOGGER.warning("%s", item)
     return result

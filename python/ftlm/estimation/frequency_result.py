@@ -20,6 +20,7 @@ from ftlm.estimation.model_checks import has_growing_mode, unstable_poles_text
 from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_from, verdict_html
 from ftlm.findings import Finding, group_findings, make_finding, texts
 from ftlm.model.model import Model
+from ftlm.model.parameter_estimates import Parameter, parameter_estimates, parameter_frame
 from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
@@ -271,16 +272,32 @@ class FrequencyIdentification:
         errors = tuple(error_of(self.model, record) for record in others)
         return FrequencyValidation(others, errors, self._assess(errors, others))
 
-    @check_arguments
-    def verdict(self, validation: FrequencyValidation | None = None) -> Verdict:
-        """Return the verdict on the model.
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """Orders, coefficients and delays by name, with standard errors, intervals and units."""
+        return parameter_estimates(
+            self.model, self.values, errors=self.standard_errors, intervals=self.intervals, free=self.names
+        )
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of each response in percent, by record: 100 minus its error relative to the measured response."""
+        return {e.name: 100.0 - e.rms for e in self.errors}
+
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""
+        return parameter_frame(self.parameters.values(), self.model.structure.reference)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict on the model without a validation; :meth:`validate` returns the one with it.
 
         "do not use": parameters that are not identifiable, an error of half of a response or more, or an unstable
         model. "with care": residuals that are not white or exceed the stated standard deviations, uncertain parameters,
         a fit that did not converge or ended on a bound, a validation error above 2 % and three times the estimation
         error, or no validation.
         """
-        return self._assess(None) if validation is None else validation.verdict
+        return self._assess(None)
 
     def _assess(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
         found: list[Finding] = []
@@ -318,7 +335,8 @@ class FrequencyIdentification:
         """Return the summary: verdict, equations, parameters, modes, errors and warnings."""
         from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 
-        lines = [*wrap_text(str(self.verdict(validation))), "", *equation_lines(self.model), ""]
+        judged = self.verdict if validation is None else validation.verdict
+        lines = [*wrap_text(str(judged)), "", *equation_lines(self.model), ""]
         lines += self._numbers()
         lines += [*behavior_lines(self.model), ""]
         lines += _errors_in_words(self.errors)
@@ -340,16 +358,11 @@ class FrequencyIdentification:
         )
 
     def _numbers(self) -> list[str]:
-        from ftlm.report.typesetting import units_of
-
-        units = units_of(self.model)
         rows = []
-        for name, value in self.values.items():
-            low, high = self.intervals[name]
+        for p in self.parameters.values():
+            low, high = p.interval
             ends = f"[{format_bound(low, '.5g')}, {format_bound(high, '.5g')}]"
-            rows.append(
-                (name, f"{value:.6g}", f"± {format_bound(self.standard_errors[name])}", ends, units.get(name, ""))
-            )
+            rows.append((p.name, f"{p.value:.6g}", f"± {format_bound(p.standard_error)}", ends, p.unit))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         lines = [
             f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip()
@@ -419,7 +432,7 @@ class FrequencyIdentification:
             title=title_of(self.model),
             sections=[first, response],
             force=force,
-            verdict=verdict_box(self.verdict(validation)),
+            verdict=verdict_box(self.verdict if validation is None else validation.verdict),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -453,7 +466,7 @@ class FrequencyIdentification:
             Markup("<p>{}</p>").format(equation_html(e, self.model.structure.delay)) for e in self.model.equations
         )
         drawn = Markup("").join(Markup(f._repr_html_()) for f in self.figures())
-        return str(verdict_html(self.verdict()) + equations + parameter_table(self.model).to_html() + drawn)
+        return str(verdict_html(self.verdict) + equations + parameter_table(self.model).to_html() + drawn)
 
 
 def assign_signals(model: Model, record: FrequencyData) -> FrequencyData:

@@ -270,7 +270,7 @@ def identify(
 
     PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
     result = assess_fit(fit_with_offset_decision(several, structure, estimate))
-    PACKAGE_LOGGER.info("identified: %s", result.verdict())
+    PACKAGE_LOGGER.info("identified: %s", result.verdict)
     for item in result.findings:
         PACKAGE_LOGGER.warning("%s", item)
     return result

@@ -120,7 +120,8 @@ class OutputError:
         if self.reference is not None:
             answers, weak = instrument_runs(runs, structure, self.reference)
         begin = self.start.model if isinstance(self.start, Identification) else self.start
-        more = self.start.parameter_values if isinstance(self.start, Identification) else {}
+        values = self.start.parameters.items() if isinstance(self.start, Identification) else ()
+        more = {n: p.value for n, p in values if not p.fixed}
         task = Task(tuple(runs), structure)
         fit = estimate_output_error(task, m, workers, progress, answers, self.loss, self.intervals, begin, more)
         return fit if self.reference is None else mark_reference_fit(fit, self.reference, weak)

@@ -163,7 +163,7 @@ def with_verdict(
         failed = make_finding("rank_not_judged", method=settings.coefficients, text=str(error))
         return replace(search, verdict=verdict_from([failed]), model_findings=(failed,))
     alike = [] if result.residuals is None else _alike_findings(search, result.residuals)
-    return replace(search, verdict=result.verdict(), model_findings=unique([*alike, *result.findings]))
+    return replace(search, verdict=result.verdict, model_findings=unique([*alike, *result.findings]))
 
 
 def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
@@ -15,15 +16,15 @@ from ftlm.estimation.output_error import JointFit, ProfileInterval
 from ftlm.estimation.physical_parameters import PhysicalParameter, physical_parameters
 from ftlm.findings import Finding, texts
 from ftlm.model.model import Model
+from ftlm.model.parameter_estimates import Parameter, parameter_estimates, parameter_frame
 from ftlm.order_search.result import SearchResult
 from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import check_threads
+from ftlm.utils.validation import Floats, check_threads
 from ftlm.validation.comparison import Comparison, Metrics, filter_state, finite
 from ftlm.validation.information_criteria import InformationCriteria
 from ftlm.validation.residual_tests import Residuals, resid
@@ -126,8 +127,7 @@ class Identification:
         Value ± 1.96 standard errors. Parameters of a joint fit with a nonquadratic cost have profile-likelihood
         intervals, which may be asymmetric or unbounded.
         """
-        values = {**self.orders, **self.coefficients, **self.parameter_values}
-        errors = self.standard_errors
+        values, errors = self._values, self.standard_errors
         quadratic = {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
         return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}
 
@@ -148,9 +148,33 @@ class Identification:
         return {n: float(v) for n, v in known if not isinstance(v, tuple)}
 
     @property
-    def parameter_values(self) -> dict[str, float]:
-        """Parameters of the joint fit by name: orders, coefficients and input parameters; empty without one."""
-        return {} if self.fit is None else dict(zip(self.fit.names, self.fit.values.tolist(), strict=True))
+    def parameters(self) -> dict[str, Parameter]:
+        """Parameters by name: orders, coefficients, delays and limits, with standard errors, intervals and units."""
+        model = self.model
+        coefficients = model.coefficients if self.task is None else self.task.structure.coefficient_names
+        free = {*model.orders, *coefficients, *self.standard_errors}
+        given = {f"delay_{n}": v for n, v in self.delays.items()} | self.limits
+        values = self._values | {n: v for n, v in given.items() if n not in self._values}
+        return parameter_estimates(model, values, errors=self.standard_errors, intervals=self.intervals, free=free)
+
+    @property
+    def _values(self) -> dict[str, float]:
+        """Orders, coefficients and estimated delays and limits by name."""
+        fit = {} if self.fit is None else dict(zip(self.fit.names, self.fit.values.tolist(), strict=True))
+        return {**self.orders, **fit, **self.coefficients}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the rows and columns of ``covariance``."""
+        return () if self.fit is None else tuple(self.fit.names)
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance matrix of the estimated parameters, robust to colored residuals; 0 by 0 for other methods.
+
+        Variances are infinite for parameters that the data do not determine, and their covariances NaN.
+        """
+        return np.zeros((0, 0)) if self.fit is None else self.fit.covariance
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -305,22 +329,8 @@ class Identification:
         return identification_page(self, path, validation=validation, force=force)
 
     def to_frame(self) -> Any:
-        """Return the parameters as a pandas frame: value, standard error, 95 % interval, nominal value."""
-        values = {**self.orders, **self.parameter_values, **self.coefficients}
-        errors, intervals = self.standard_errors, self.intervals
-        none = (math.nan, math.nan)
-        rows = [
-            {
-                "parameter": n,
-                "value": v,
-                "standard_error": errors.get(n, math.nan),
-                "low": intervals.get(n, none)[0],
-                "high": intervals.get(n, none)[1],
-                "stated": self.model.structure.reference.get(n, math.nan),
-            }
-            for n, v in values.items()
-        ]
-        return to_frame(rows, ["parameter"])
+        """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""
+        return parameter_frame(self.parameters.values(), self.model.structure.reference)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
@@ -344,25 +354,13 @@ class Identification:
             "warnings": list(self.warnings),
         }
 
-    @check_arguments
-    def verdict(self, validation: Comparison | None = None) -> Verdict:
-        """Return the verdict ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
 
-        Parameters
-        ----------
-        validation
-            What :meth:`validate` said of runs that the model was not identified from. Without any, no model is
-            trusted: how well it predicts other data is not known.
-
-        Returns
-        -------
-        Verdict
-            Prints as one sentence; ``.reasons`` has all that speaks against the model, most serious first.
-
-        Raises
-        ------
-        ModelError
-            What is no answer of :meth:`validate`.
+        It prints as one sentence; ``.reasons`` has all that speaks against the model, most serious first. Without a
+        validation no model is trusted, because it is not known how well it predicts other data: ``validate(runs)``
+        returns the verdict that includes other runs.
 
         Notes
         -----
@@ -386,9 +384,7 @@ class Identification:
         """
         from ftlm.estimation.verdict import verdict
 
-        if not (validation is None or isinstance(validation, Comparison)):
-            raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")
-        return verdict(self, validation)
+        return verdict(self)
 
     @check_arguments
     def summary(self, validation: Comparison | None = None) -> str:
@@ -398,10 +394,16 @@ class Identification:
         ----------
         validation
             What :meth:`validate` said of runs that the model was not identified from.
+
+        Raises
+        ------
+        ModelError
+            The validation does not come from :meth:`validate`.
         """
         from ftlm.report.text_summary import summary
 
-        self.verdict(validation)
+        if not (validation is None or isinstance(validation, Comparison)):
+            raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")
         return summary(self, validation)
 
     def details(self) -> str:
@@ -412,7 +414,7 @@ class Identification:
         lines += [f"  {self.model.structure.equation_text(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
         errors = self.standard_errors
-        for name, value in {**self.orders, **self.parameter_values, **self.coefficients}.items():
+        for name, value in self._values.items():
             spread = f" ± {format_bound(errors[name]):<10}" if name in errors else ""
             if name in self.profiles:
                 spread += f"   {self.profiles[name]}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from statistics import median
 from typing import Any
 
@@ -97,14 +97,13 @@ class Validation(Comparison):
         Verdict on the model after this validation.
     """
 
-    verdict: Verdict | None = None
+    verdict: Verdict = field(kw_only=True)
 
     def __str__(self) -> str:
-        return f"{self.verdict}\n{super().__str__()}" if self.verdict is not None else super().__str__()
+        return f"{self.verdict}\n{super().__str__()}"
 
     def _repr_html_(self) -> str:
-        lead = "" if self.verdict is None else str(verdict_html(self.verdict))
-        return lead + super()._repr_html_()
+        return str(verdict_html(self.verdict)) + super()._repr_html_()
 
 
 def verdict_html(judged: Verdict) -> Markup:
@@ -119,7 +118,7 @@ def validation_with_verdict(result: Identification, comparison: Comparison) -> V
 
 
 def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
-    """Return the verdict on a result, by the rules of :meth:`ftlm.Identification.verdict`.
+    """Return the verdict on a result, by the rules of :attr:`ftlm.Identification.verdict`.
 
     Findings of weight that no rule covers count in the order of :data:`ftlm.findings.FINDING_TOPICS`.
     """
@@ -267,7 +266,7 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
 
 def is_degenerate(result: Identification) -> bool:
     """Whether a fit must not be used by itself, so that no comparison with it says anything."""
-    return result.verdict().level == LEVEL_DO_NOT_USE
+    return result.verdict.level == LEVEL_DO_NOT_USE
 
 
 def have_common_value(intervals: Any) -> bool:
@@ -399,5 +398,4 @@ def _is_of_input(result: Identification, name: str) -> bool:
 
 
 def _format_uncertain(result: Identification, name: str) -> str:
-    values = {**result.orders, **result.coefficients, **result.parameter_values}
-    return f"{name} = {values[name]:.3g} ± {format_bound(result.standard_errors[name], '.2g')}"
+    return f"{name} = {result.parameters[name].value:.3g} ± {format_bound(result.standard_errors[name], '.2g')}"

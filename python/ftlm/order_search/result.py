@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding, unique
 from ftlm.model.model import Model
+from ftlm.model.parameter_estimates import Parameter, parameter_estimates
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, Exact, number, symbol, symbol_html
@@ -213,6 +214,12 @@ class SearchResult:
     def coefficients(self) -> dict[str, float]:
         """Coefficients of the best model."""
         return self.table[0].coefficients
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """Parameters of the best model by name; a search gives no standard errors."""
+        values = {**self.orders, **self.coefficients}
+        return parameter_estimates(self.model, values, errors={}, intervals={}, free=values)
 
     @property
     def score(self) -> float:

@@ -16,7 +16,7 @@ from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import verdict
 from ftlm.findings import MAX_SUMMARY_FINDINGS, Finding, group_findings, hidden_findings_text
 from ftlm.model.model import Model
-from ftlm.report.typesetting import ORDER_DECIMALS, units_of
+from ftlm.report.typesetting import ORDER_DECIMALS
 from ftlm.structure.equation import Equation, format_equation
 from ftlm.structure.order import Order
 from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, with_error, wrap_text
@@ -72,15 +72,14 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
 
 def parameter_lines(result: Identification) -> list[str]:
     """Return orders and coefficients with standard errors, units and nominal values, one line each."""
-    errors, units, stated = result.standard_errors, units_of(result.model), result.model.structure.reference
-    values = {**result.orders, **result.parameter_values, **result.coefficients}
+    errors, stated = result.standard_errors, result.model.structure.reference
     rows = []
-    for name, value in values.items():
-        spread = f"± {format_bound(errors[name])}" if name in errors else ""
+    for name, p in result.parameters.items():
+        spread = f"± {format_bound(p.standard_error)}" if name in errors else "fixed" if p.fixed else ""
         tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
         if name in stated:
             tail = f"{tail}  (stated {stated[name]:.6g})".strip()
-        rows.append((name, f"{value:.6g}", spread, units.get(name, ""), tail))
+        rows.append((name, f"{p.value:.6g}", spread, p.unit, tail))
     if not rows:
         return []
     a, b, c, d = (max(len(row[k]) for row in rows) for k in range(4))

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from markupsafe import Markup
 from msgspec import UNSET
 
-from ftlm.data.units import coefficient_unit
 from ftlm.estimation.output_error import JointFit
 from ftlm.model.model import Model
+from ftlm.model.parameter_estimates import parameter_units
 from ftlm.structure.equation import Equation
 from ftlm.structure.input_nonlinearity import (
     INPUT_EFFECT_ABBREVIATIONS,
@@ -104,28 +104,6 @@ def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, flo
     ]
 
 
-def units_of(model: Model) -> dict[str, str]:
-    """Unit of every named coefficient, friction, delay and limit whose unit is known."""
-    out = {}
-    for item in model.equations:
-        alpha = item.order.constant
-        for term in item.terms:
-            if term.name is not None:
-                unit = coefficient_unit(model.units, item.output, alpha, term.signal, term.order.constant)
-                out[term.name] = unit
-        if item.friction is not None:
-            own = model.units.get(item.output, "")
-            force = f"s^{-alpha:g} {own}" if own else ""
-            near = item.friction.stribeck
-            named = [(item.friction.name, force)]
-            if near is not None:
-                named += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
-            out |= {name: unit for name, unit in named if name is not None}
-    out |= {f"delay_{name}": "s" for name in model.structure.delay}
-    out |= {limit.name: model.units.get(limit.signal, "") for limit in model.structure.limits}
-    return {name: unit for name, unit in out.items() if unit}
-
-
 def _math(content: Markup, name: str = "") -> Markup:
     kind = Markup(' class="{}"').format(name) if name else Markup("")
     return Markup("<math{}><mrow>{}</mrow></math>").format(kind, content)
@@ -197,7 +175,7 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
         Caption.
     """
     reference = model.structure.reference
-    units = units_of(model)
+    units = parameter_units(model)
     errors: Mapping[str, float | None] = {}
     extra: Mapping[str, float] = {}
     profiles: Mapping[str, tuple[float, float]] = {}

@@ -662,8 +662,8 @@ def demo_text(demo: Demo) -> str:
     for stage, results in demo.results.items():
         best = results["output error"]
         checked = demo.validations[stage]
-        estimates = {**best.orders, **best.parameter_values}
-        near = sum(abs(v - demo.truth[stage][n]) <= 2 * best.standard_errors[n] for n, v in estimates.items())
+        estimates = [p for n, p in best.parameters.items() if n in best.names]
+        near = sum(abs(p.value - demo.truth[stage][p.name]) <= 2 * p.standard_error for p in estimates)
         lines += wrap_text(f"Stage {stage}, output error: {checked.verdict}")
         lines += [f"  {line}" for line in equation_lines(best.model)]
         lines += [line for line in behavior_lines(best.model) if "mode" in line or "integrates" in line][:3]

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ftlm.data.run import Run
 from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import Validation, Verdict
 from ftlm.findings import Finding, texts
+from ftlm.model.model import Model
+from ftlm.model.parameter_estimates import Parameter
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell
+from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import finite
 
 #: Maximum number of printed rows, and the fit [%] below which values are not distinguished.
@@ -57,6 +63,39 @@ class Selection(ReportMixin):
     def warnings(self) -> tuple[str, ...]:
         """Sentences of the findings."""
         return texts(self.findings)
+
+    @property
+    def model(self) -> Model:
+        """Model of the chosen structure, identified from all runs."""
+        return self.best.model
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """Parameters of the model by name, with standard errors, intervals and units."""
+        return self.best.parameters
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance matrix of the estimated parameters; see :attr:`ftlm.Identification.covariance`."""
+        return self.best.covariance
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict on the model; :meth:`validate` returns the one that includes other runs."""
+        return self.best.verdict
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of the simulation on the estimation runs in percent, by output."""
+        return self.best.fit_percent
+
+    def validate(self, runs: Run | Sequence[Run]) -> Validation:
+        """Compare the model with runs that took no part in the selection; see :meth:`ftlm.Identification.validate`."""
+        return self.best.validate(runs)
+
+    def summary(self) -> str:
+        """Return the printed summary: candidates, reason of the choice, and the summary of the model."""
+        return str(self)
 
     @property
     def winner(self) -> Trial:

@@ -1,0 +1,117 @@
+"""Parameters of an identified model: value, standard error, interval and unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ftlm.data.units import coefficient_unit
+from ftlm.model.model import Model
+from ftlm.utils.files import to_frame
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Parameter of an identified model.
+
+    Parameters
+    ----------
+    name
+        Name in the equation; ``delay_u``, ``sat_u`` and ``dead_u`` for the delay, saturation and dead zone of input u.
+    value
+        Estimate, or the given value of a fixed parameter.
+    standard_error
+        Standard error; NaN if the parameter is fixed or the method gives none, infinite if the data do not determine
+        it.
+    interval
+        Ends of the 95 % interval; NaN where there is no standard error.
+    unit
+        Unit; empty if the parameter is dimensionless or the unit of a signal is unknown.
+    fixed
+        Whether the value was given and not estimated.
+    """
+
+    name: str
+    value: float
+    standard_error: float = math.nan
+    interval: tuple[float, float] = (math.nan, math.nan)
+    unit: str = ""
+    fixed: bool = False
+
+    def __str__(self) -> str:
+        value = f"{self.value:.6g}{f' {self.unit}' if self.unit else ''}"
+        if self.fixed:
+            return f"{self.name} = {value} (fixed)"
+        if math.isnan(self.standard_error):
+            return f"{self.name} = {value}"
+        low, high = self.interval
+        return f"{self.name} = {value} ± {self.standard_error:.3g} (95 % interval {low:.6g} to {high:.6g})"
+
+
+def parameter_estimates(
+    model: Model,
+    values: Mapping[str, float],
+    *,
+    errors: Mapping[str, float],
+    intervals: Mapping[str, tuple[float, float]],
+    free: Collection[str],
+) -> dict[str, Parameter]:
+    """Return the parameters of a model by name.
+
+    Parameters
+    ----------
+    model
+        Model, for the units.
+    values, errors, intervals
+        Values, and standard errors and 95 % intervals of those that have them.
+    free
+        Names of the estimated parameters; the others are fixed.
+    """
+    units = parameter_units(model)
+    none = (math.nan, math.nan)
+    return {
+        n: Parameter(n, v, errors.get(n, math.nan), intervals.get(n, none), units.get(n, ""), n not in free)
+        for n, v in values.items()
+    }
+
+
+def parameter_frame(parameters: Iterable[Parameter], stated: Mapping[str, float]) -> Any:
+    """Return parameters as a pandas frame by name: value, standard error, 95 % interval, unit, nominal value."""
+    rows = [
+        {
+            "parameter": p.name,
+            "value": p.value,
+            "standard_error": p.standard_error,
+            "low": p.interval[0],
+            "high": p.interval[1],
+            "unit": p.unit,
+            "fixed": p.fixed,
+            "stated": stated.get(p.name, math.nan),
+        }
+        for p in parameters
+    ]
+    return to_frame(rows, ["parameter"])
+
+
+def parameter_units(model: Model) -> dict[str, str]:
+    """Return the unit of every named coefficient, friction, delay and limit whose unit is known."""
+    out = {}
+    for item in model.equations:
+        alpha = item.order.constant
+        for term in item.terms:
+            if term.name is not None:
+                unit = coefficient_unit(model.units, item.output, alpha, term.signal, term.order.constant)
+                out[term.name] = unit
+        if item.friction is not None:
+            own = model.units.get(item.output, "")
+            force = f"s^-{alpha:g} {own}" if own else ""
+            near = item.friction.stribeck
+            named = [(item.friction.name, force)]
+            if near is not None:
+                named += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
+            out |= {name: unit for name, unit in named if name is not None}
+    out |= {f"delay_{name}": "s" for name in model.structure.delay}
+    out |= {limit.name: model.units.get(limit.signal, "") for limit in model.structure.limits}
+    return {name: unit for name, unit in out.items() if unit}

@@ -1,0 +1,99 @@
+"""Parameters of results: the same names for time, frequency, search and selection results."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import ftlm
+
+PLANT = "D y = -2 y + 3 u"
+STRUCTURE = "D y = a y + b u"
+DELAY = 0.06
+
+
+@cache
+def run(seed=1, samples=500):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.choice([-1.0, 1.0], samples // 10), 10)
+    plant = ftlm.Model(ftlm.equation(PLANT, delay={"u": DELAY}))
+    empty = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u}, units={"u": "V", "y": "rad"})
+    clean = plant.simulate(empty)
+    return clean.with_outputs({"y": clean["y"] + 0.01 * rng.standard_normal(samples)})
+
+
+@cache
+def identified():
+    return ftlm.identify(run(), ftlm.equation(STRUCTURE, delay={"u": (0.0, 0.2)}))
+
+
+def test_parameters_have_values_errors_intervals_and_units():
+    found = identified().parameters
+    assert list(found) == ["a", "b", "delay_u"]
+    for name, truth in {"a": -2.0, "b": 3.0, "delay_u": DELAY}.items():
+        parameter = found[name]
+        assert parameter.name == name
+        assert not parameter.fixed
+        assert abs(parameter.value - truth) < 4 * parameter.standard_error
+        low, high = parameter.interval
+        assert low < parameter.value < high
+    assert {n: p.unit for n, p in found.items()} == {"a": "s^-1", "b": "s^-1 rad/V", "delay_u": "s"}
+    assert str(found["b"]).startswith(f"b = {found['b'].value:.6g} s^-1 rad/V ± ")
+
+
+def test_covariance_agrees_with_standard_errors():
+    found = identified()
+    deviations = np.sqrt(np.diag(found.covariance))
+    assert deviations == pytest.approx([found.parameters[n].standard_error for n in found.names])
+
+
+def test_given_delay_is_fixed():
+    found = ftlm.identify(run(), ftlm.equation(STRUCTURE, delay={"u": DELAY}))
+    delay = found.parameters["delay_u"]
+    assert (delay.value, delay.fixed, delay.unit) == (DELAY, True, "s")
+    assert np.isnan(delay.standard_error)
+    assert str(delay) == "delay_u = 0.06 s (fixed)"
+    assert [n for n, p in found.parameters.items() if not p.fixed] == ["a", "b"]
+    assert "fixed" in str(found)
+
+
+def test_method_without_errors_has_free_parameters_without_errors():
+    found = ftlm.identify(run(), ftlm.equation(STRUCTURE, delay={"u": DELAY}), method="least-squares")
+    assert found.covariance.shape == (0, 0)
+    assert not found.parameters["a"].fixed
+    assert str(found.parameters["a"]) == f"a = {found.coefficients['a']:.6g} s^-1"
+
+
+def test_frame_has_a_row_for_each_parameter():
+    frame = identified().to_frame()
+    assert list(frame.index) == list(identified().parameters)
+    assert frame.loc["b", "unit"] == "s^-1 rad/V"
+    assert frame.loc["a", "low"] == identified().parameters["a"].interval[0]
+
+
+def test_frequency_result_has_the_same_names():
+    omega = np.geomspace(0.1, 100, 40)
+    rng = np.random.default_rng(4)
+    exact = 3 / (1j * omega + 2)
+    noise = 0.002 * (rng.standard_normal(40) + 1j * rng.standard_normal(40))
+    data = ftlm.FrequencyData(omega, exact * (1 + noise), output="y", input="u")
+    found = ftlm.identify_frequency(data, ftlm.equation(STRUCTURE))
+    assert found.parameters["a"].value == pytest.approx(-2.0, rel=0.01)
+    assert found.parameters["a"].interval == found.intervals["a"]
+    assert found.verdict.level == "with care"
+    assert found.validate(data).verdict.level == "with care"
+    assert all(fit > 99 for fit in found.fit_percent.values())
+    assert list(found.to_frame().index) == ["a", "b"]
+
+
+def test_search_and_selection_have_the_same_names():
+    free = ftlm.equation("D^alpha y = a y + b u", delay={"u": DELAY})
+    search = ftlm.search_orders(run(), free, ftlm.OrderGrid(alpha=(0.5, 1.5, 0.5)))
+    assert {n: p.value for n, p in search.parameters.items()} == {**search.orders, **search.coefficients}
+    assert search.verdict is not None
+    chosen = ftlm.select(run(), [ftlm.equation(STRUCTURE, delay={"u": DELAY})])
+    assert chosen.parameters == chosen.best.parameters
+    assert chosen.verdict == chosen.best.verdict
+    assert chosen.covariance.shape == (2, 2)
+    assert chosen.validate(run(seed=2)).fit_percent["y"] > 95
+    assert chosen.summary() == str(chosen)
