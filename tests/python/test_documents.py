@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,11 +36,23 @@ def test_the_python_blocks_run_one_after_the_other(document: Path, tmp_path: Pat
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
+    if document == README:
+        (printed,) = blocks(document, "text")
+        assert words_of(printed) == words_of(ran.stdout)
     if document.name == "start.md":
         assert len(found) >= 2
         assert "order search (y)" in ran.stdout
     if document.name == "tutorial.md":
         assert (tmp_path / "model.html").stat().st_size > 50_000
+
+
+def words_of(text: str) -> list[Any]:
+    """Words of a text; numbers equal where they agree to three digits, as those of another processor do."""
+    numbers = r"-?\d+\.\d+"
+    return [
+        pytest.approx(float(w), rel=2e-3) if re.fullmatch(numbers, w) else w
+        for w in re.split(f"({numbers}|\\s+)", text)
+    ]
 
 
 def test_the_pages_that_teach_have_blocks_that_run() -> None:
