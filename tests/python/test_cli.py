@@ -231,7 +231,6 @@ BAD = [
     (("identify", "square-foreign.csv", *SEARCH, "-u", "u=volts", "-y", "y=mm", "--units", "y=furlong"), 3, "furlong"),
     (("identify", "square-foreign.csv", *SEARCH, "-u", "=volts", "-y", "y=mm"), 2, "NAME=VALUE"),
     (("inspect", "square-foreign.csv", "-u", "Motor (A)", "-y", "y=mm"), 2, '-u "motor=Motor (A)"'),
-    (("inspect", "square-foreign.csv"), 3, "-u NAME=COLUMN and -y NAME=COLUMN"),
     (("inspect", "square-foreign.csv", "-u", "x[0]", "-y", "y=mm"), 3, "column 'x[0]'"),
     (("identify", "square.csv", *SEARCH, "-o", "."), 3, ". is a folder; name a file in it"),
     (("search", "square.csv", "--structure", "D^1.5 y = a0 y + b0 u"), 2, "nothing to search"),

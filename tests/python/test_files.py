@@ -271,7 +271,6 @@ def test_bad_text_is_refused(tmp_path, case):
 
 
 BAD_CALLS = {
-    "no signals": ({}, ["outputs=", "inputs={name: column}", "'t', 'u', 'y'"]),
     "no outputs": ({"inputs": ["u"]}, ["outputs="]),
     "time and step": ({**HEADED, "time": "t", "step": 1}, ["time= and step=", "both"]),
     "position": ({**HEADED, "time": 3}, ["column 3 (time)", "0 to 2"]),

@@ -9,7 +9,7 @@ import pytest
 import ftlm
 from ftlm.data.units import SIGNAL_UNITS, parse_unit
 from ftlm.io.cell_parsing import split_unit
-from ftlm.io.preview import guess_roles, known_unit, signal_names
+from ftlm.io.column_roles import guess_roles, known_unit, signal_names
 from test_files import messages, rows, write
 from test_strangers import command
 

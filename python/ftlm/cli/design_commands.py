@@ -233,7 +233,7 @@ def design_input(
     check_ending(out, ".csv", ", as a run for a rig does")
     figure_kind(plot)
     loaded = load_model(model)
-    run = None if reference_run is None else reading.runs([reference_run])[0]
+    run = None if reference_run is None else reading.runs([reference_run], loaded.structure)[0]
     with Progress("designing", quiet=as_json) as progress:
         found = experiment.design_input(
             loaded,

@@ -116,15 +116,15 @@ def identify(
 ) -> None:
     """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
     check_free(out, report, force=force, words=COMMAND_MESSAGES)
-    shape.structure(structure)
+    equation = shape.structure(structure)
     given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
     given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
     given |= {} if fit.start is None else {"start": load_model(fit.start)}
     chosen = method_with_options(method, given)
-    runs = reading.runs(files)
+    runs = reading.runs(files, equation)
     wanted = shape.structure_for_runs(structure, runs)
     # The window is of the runs that are identified from.
-    others = replace(reading, window=None).runs([validation]) if validation is not None else []
+    others = replace(reading, window=None).runs([validation], equation) if validation is not None else []
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(ranking.store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
@@ -175,8 +175,7 @@ def search(
     as_json: Json = False,
 ) -> None:
     """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
-    shape.structure(structure)
-    runs = reading.runs(files)
+    runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
     parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
     every = grid.grid() or OrderGrid()
@@ -241,8 +240,7 @@ def certify(
     as_json: Json = False,
 ) -> None:
     """Prove a lower bound of the squared equation error of each equation at rest, over all orders in intervals."""
-    shape.structure(structure)
-    runs = reading.runs(files)
+    runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
     every = OrderGridOptions(order_grid=order_grid, increment=increment).grid() or OrderGrid()
     check_order_names(every, wanted)
@@ -490,16 +488,15 @@ def select(
         if given:
             raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")
         candidates: str | Structure | list[Structure] = "auto"
-    else:
-        made = [shape.structure(text) for text in structures]
-        candidates = made[0] if len(made) == 1 else made
-    runs = reading.runs(files)
+    parsed = [] if structures == ["auto"] else [shape.structure(text) for text in structures]
+    equation = parsed[0] if parsed else None
+    runs = reading.runs(files, equation)
     if structures != ["auto"]:
         made = [shape.structure_for_runs(text, runs) for text in structures]
         candidates = made[0] if len(made) == 1 else made
     # The window is of the runs that are fitted to.
     of_its_own = validation not in (None, "runs", "blocks")
-    judges = replace(reading, window=None).runs([str(validation)]) if of_its_own else validation
+    judges = replace(reading, window=None).runs([str(validation)], equation) if of_its_own else validation
     with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
         tried = [candidates] if isinstance(candidates, Structure) else candidates
         grown = [IntegerOrderForm(4, 3).structure(runs, automatic_output(runs))] if isinstance(tried, str) else tried
@@ -535,8 +532,7 @@ def consistency(
 ) -> None:
     """Identify segments of a run separately, and list the parameters that differ significantly."""
     check_free(report, force=force, words=COMMAND_MESSAGES)
-    shape.structure(structure)
-    runs = reading.runs(files)
+    runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
     method = OutputError() if loss is None else OutputError(loss=loss)
     with Progress("fitting segments", quiet=as_json) as progress:

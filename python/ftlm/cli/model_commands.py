@@ -36,7 +36,7 @@ def _with_runs(
 ) -> tuple[Model, list[Run]]:
     """Load a saved model and its runs."""
     loaded = load_model(model)
-    runs = reading.runs(files)
+    runs = reading.runs(files, loaded.structure)
     announce_simulation(runs, len(loaded.outputs), quiet=quiet)
     return loaded, runs
 

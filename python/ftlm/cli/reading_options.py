@@ -13,8 +13,9 @@ from ftlm.cli.framework import announce_reading, interval, pairs
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.io.dialect import Layout
-from ftlm.io.load import load
+from ftlm.io.load import LoadOptions, Signals, load_selection, select_columns
 from ftlm.io.preview import OpenedFile, open_file
+from ftlm.structure.structure import Structure
 
 #: Panels of options in a command's help.
 FILE_PANEL, STRUCTURE_PANEL, METHOD_PANEL, OUTPUT_PANEL = "File", "Structure", "Method", "Output"
@@ -93,41 +94,50 @@ class ReadingOptions:
         Literal["constant", "linear"] | None, Option(help="Subtract the mean or a straight line from every signal.")
     ] = None
 
-    def runs(self, files: Sequence[str] | None, *, apart: bool = False) -> list[Run]:
-        """Load each file as a run, detrended if requested; see :meth:`_read`."""
-        runs = self._read(files, apart=apart)
+    def runs(
+        self, files: Sequence[str] | None, structure: Structure | None = None, *, apart: bool = False
+    ) -> list[Run]:
+        """Load each file as a run, detrended if requested.
+
+        .mat files with one signal each form one run unless `apart`. Columns that no option names are the signals of
+        `structure`, if the files have them.
+        """
+        runs = self._read(files, structure, apart=apart)
         return runs if self.detrend is None else [run.detrend(self.detrend) for run in runs]
 
-    def _read(self, files: Sequence[str] | None, *, apart: bool) -> list[Run]:
-        """Load each file as a run; .mat files with one signal each form one run unless ``apart``."""
-        given: dict[str, Any] = {
-            "time": self.time,
-            "step": self.step,
-            "inputs": pairs("-u", self.inputs),
-            "outputs": pairs("-y", self.outputs),
-            "units": pairs("--units", self.units),
-            "columns": self.columns,
-            "time_unit": self.time_unit,
-            "intersample": pairs("--intersample", self.intersample),
-            "resample": self.resample,
-            "missing": self.missing,
-            "layout": layout_options(self),
-        }
+    def _read(self, files: Sequence[str] | None, structure: Structure | None, *, apart: bool) -> list[Run]:
         if not files:
             return []
         announce_reading(files)
-        options = {name: value for name, value in given.items() if value not in (None, {}, "")}
-        if self.window is not None:
-            options["window"] = interval(self.window, "--window", "1.1:19.5")
+        signals: Signals | None = None
+        if structure is not None:
+            signals = [s for s in structure.signals if s not in structure.outputs], structure.outputs
         if not apart and len(files) > 1 and all(f.lower().endswith(".mat") for f in files):
             try:
-                load(files[0], **options)
+                self._load(files[0], signals)
             except DataError:
                 # The first file alone lacks a column that is asked for, so the files belong together.
-                run = load(list(files), **options)
+                run = self._load(list(files), signals)
                 print(f"ftlm: {len(files)} .mat files read as one run", file=sys.stderr)
                 return [run]
-        return [load(f, **options) for f in files]
+        return [self._load(f, signals) for f in files]
+
+    def _load(self, path: str | list[str], signals: Signals | None) -> Run:
+        wanted = select_columns(
+            self.columns,
+            self.time,
+            self.step,
+            pairs("-u", self.inputs),
+            pairs("-y", self.outputs),
+            pairs("--units", self.units),
+            pairs("--intersample", self.intersample),
+            layout_options(self),
+        )
+        options = LoadOptions(self._window(), self.resample, None, self.time_unit, self.missing)
+        return load_selection(path, wanted, options, signals)
+
+    def _window(self) -> tuple[float | None, float | None] | None:
+        return None if self.window is None else interval(self.window, "--window", "1.1:19.5")
 
     def preview_file(self, file: str) -> OpenedFile:
         """Preview a file that is not loaded as a run."""
@@ -145,7 +155,7 @@ class ReadingOptions:
             time_unit=self.time_unit,
             intersample=pairs("--intersample", self.intersample),
             layout=layout_options(self),
-            window=None if self.window is None else interval(self.window, "--window", "1.1:19.5"),
+            window=self._window(),
             resample=self.resample,
             missing=self.missing,
         )

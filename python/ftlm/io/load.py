@@ -18,8 +18,9 @@ from ftlm.data.sampling import MissingPolicy, check_missing_policy
 from ftlm.data.units import split_time_header, time_unit_of
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import split_unit
+from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles
 from ftlm.io.delimited_text import read_text
-from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Layout
+from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Assumption, Layout
 from ftlm.io.isolated_reader import binary_format_of, read_isolated
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
@@ -41,19 +42,6 @@ class _ColumnsFile(msgspec.Struct, forbid_unknown_fields=True):
     units: dict[str, str] | None = None
     intersample: dict[str, str] | None = None
     layout: dict[str, str | int] | None = None
-
-
-@dataclass
-class ColumnSelection:
-    """Selection of columns and layout, from the arguments, the columns file and the ftlm header."""
-
-    time: Hashable | None
-    step: float | None
-    inputs: dict[str, Hashable]
-    outputs: dict[str, Hashable]
-    units: dict[str, str]
-    intersample: dict[str, str]
-    layout: Layout
 
 
 @check_arguments
@@ -93,10 +81,12 @@ def load(
         with a unit of time. Otherwise the first column of every matrix in use; these must be equal. Dates and times of
         day are converted to seconds since the first row.
     inputs, outputs : mapping of str to column, or list of str, optional
-        Columns by signal name; a list names columns that keep their names. Required unless `columns` or the ftlm
-        header of the file gives them; at least one output. The unit in a name such as ``I (A)`` may be omitted.
+        Columns by signal name; a list names columns that keep their names; at least one output. The unit in a name
+        such as ``I (A)`` may be omitted. Without both, and without `columns` and an ftlm header, they are chosen by the
+        words in the column names as by :func:`ftlm.open_file`, with the units of the file; the choice is listed in the
+        `warnings` of the run, and ambiguous names raise an error.
     units : mapping of str to str, optional
-        Units of signals, converted to SI. Units that the file states are not applied automatically;
+        Units of signals, converted to SI. Units that the file states are not applied to columns that are named here;
         :func:`ftlm.open_file` shows them.
     columns : mapping or path of a TOML file, optional
         Keys ``time`` or ``step``, tables ``inputs``, ``outputs``, ``units``, ``intersample``, ``layout``; the arguments
@@ -138,8 +128,17 @@ def load(
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
     wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
-    options = LoadOptions(window, resample, name, time_unit, missing)
-    run = run_from_tables(read_tables(path, wanted.layout), wanted, options)
+    return load_selection(path, wanted, LoadOptions(window, resample, name, time_unit, missing))
+
+
+def load_selection(
+    path: PathLike | Sequence[PathLike],
+    wanted: ColumnSelection,
+    options: LoadOptions,
+    signals: Signals | None = None,
+) -> Run:
+    """Load a run; `signals` are the inputs and outputs of an equation, for columns that are not selected."""
+    run = run_from_tables(read_tables(path, wanted.layout), wanted, options, signals)
     PACKAGE_LOGGER.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
     return run
 
@@ -164,8 +163,14 @@ class LoadOptions:
         return check_missing_policy(self.missing or "refuse")
 
 
-def run_from_tables(tables: list[FileTable], wanted: ColumnSelection, options: LoadOptions) -> Run:
-    """Build the run of selected columns from file tables."""
+#: Inputs and outputs of an equation or a model.
+Signals = tuple[Sequence[str], Sequence[str]]
+
+
+def run_from_tables(
+    tables: list[FileTable], wanted: ColumnSelection, options: LoadOptions, signals: Signals | None = None
+) -> Run:
+    """Build the run of selected columns from file tables; see :func:`load` for columns that are not selected."""
     header = tables[0].header
     chosen = options.missing_policy(header)
     if header is not None and len(tables) > 1:
@@ -173,11 +178,13 @@ def run_from_tables(tables: list[FileTable], wanted: ColumnSelection, options: L
     if header is not None:
         _apply_header(wanted, header)
     pool = Pool(tables)
+    roles = _assume_roles(wanted, pool, signals) if header is None else ()
     _check_disjoint_roles(wanted, pool)
     if not wanted.outputs:
         raise DataError(
-            f"no output is named; name the signals with {parameter('inputs', NAMED_COLUMNS)} and "
-            f"{parameter('outputs', NAMED_COLUMNS)}, or in a file for {parameter('columns')}; {pool.describe()}"
+            "no output is named, and the names of the columns do not say which they are; name the signals with "
+            f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}, or in a file for "
+            f"{parameter('columns')}; {pool.describe()}"
         )
     labels: dict[str, str] = {}
     used: list[Column] = []
@@ -202,7 +209,7 @@ def run_from_tables(tables: list[FileTable], wanted: ColumnSelection, options: L
     facts = tuple(
         f"{table.path.name}: {a}" if several else str(a) for table in tables for a in table.assumed if a.counts
     )
-    facts += clock.notes
+    facts += (*map(str, roles), *clock.notes)
     asked = RunArguments(
         given_inputs,
         given_outputs,
@@ -261,6 +268,19 @@ def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: Loa
     facts += () if order is None else (str(order),)
     facts += (f"time counted from {column.timestamps.first!r} on",)
     return _TimeColumn(seconds, "s", label, column.name, facts)
+
+
+def _assume_roles(wanted: ColumnSelection, pool: Pool, signals: Signals | None) -> tuple[Assumption, ...]:
+    """Choose inputs and outputs by column names if none are named, with the units of the file."""
+    if wanted.inputs or wanted.outputs:
+        return ()
+    matrices = list(dict.fromkeys(c.matrix for c in pool.columns if c.matrix is not None))
+    clock = None
+    if wanted.step is None:
+        clock, _ = pool.time(wanted.time, matrices if len(matrices) == 1 else [], set())
+    assumed = assume_roles(wanted, [c for c in pool.columns if c is not clock], signals)
+    add_file_units(wanted, pool)
+    return assumed
 
 
 def base_name(path: Path) -> str:

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 
 from ftlm.data.run import Run
-from ftlm.data.units import parse_unit, split_time_header
+from ftlm.data.units import split_time_header
 from ftlm.errors import DataError
-from ftlm.io.cell_parsing import split_unit
+from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles, has_numbers
 from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.load import (
-    ColumnSelection,
     LoadOptions,
     PathLike,
     load,
@@ -32,128 +31,6 @@ from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, flag_of, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
-
-_INPUT_WORDS = frozenset(
-    (
-        "u",
-        "in",
-        "inp",
-        "input",
-        "eingang",
-        "cmd",
-        "command",
-        "current",
-        "strom",
-        "torque",
-        "drehmoment",
-        "pwm",
-        "duty",
-        "drive",
-        "force",
-        "kraft",
-        "power",
-        "leistung",
-        "heater",
-        "heating",
-        "excitation",
-        "anregung",
-        "actuator",
-        "i",
-        "im",
-        "valve",
-        "ventil",
-        "throttle",
-    )
-)
-_OUTPUT_WORDS = frozenset(
-    (
-        "y",
-        "out",
-        "output",
-        "ausgang",
-        "angle",
-        "winkel",
-        "position",
-        "pos",
-        "weg",
-        "displacement",
-        "deflection",
-        "auslenkung",
-        "theta",
-        "th",
-        "temp",
-        "temperature",
-        "temperatur",
-        "speed",
-        "velocity",
-        "drehzahl",
-        "geschwindigkeit",
-        "acceleration",
-        "accel",
-        "beschleunigung",
-        "level",
-        "pressure",
-        "druck",
-        "response",
-        "antwort",
-        "strain",
-        "dehnung",
-        "tip",
-    )
-)
-#: Voltage is an input of motors and an output of cells.
-_AMBIGUOUS_WORDS = frozenset(["voltage", "volt", "volts", "spannung", "v"])
-#: Words of temperature columns, whose degrees are no angles.
-_TEMPERATURE_WORDS = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
-
-
-def _words(column: str) -> set[str]:
-    """Case-folded words of a column name, without unit and digits."""
-    bare = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])", " ", split_unit(column)[0])
-    return set(re.split(r"[\W\d_]+", bare.casefold())) - {""}
-
-
-def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Guess inputs and outputs from column names; both are empty if the names are ambiguous."""
-    told = {column: _words(column) for column in columns}
-    drives = [c for c, words in told.items() if words & _INPUT_WORDS and not words & _OUTPUT_WORDS]
-    follows = [c for c, words in told.items() if words & _OUTPUT_WORDS and not words & _INPUT_WORDS]
-    either = [c for c, words in told.items() if words & _AMBIGUOUS_WORDS and c not in drives and c not in follows]
-    if either and not drives:
-        drives, either = either, []
-    rest = [c for c in columns if c not in drives and c not in follows]
-    if len(rest) == 1 and rest != either:
-        if drives and not follows:
-            follows, rest = rest, []
-        elif follows and not drives:
-            drives, rest = rest, []
-    return (drives, follows) if drives and follows else ([], [])
-
-
-def known_unit(stated: str, column: str = "") -> str:
-    """Return the ftlm unit of a unit in a file; "" if unknown, or if degrees may mean a temperature."""
-    unit = parse_unit(stated) or ""
-    return "" if unit in ("deg", "°") and _words(column) & _TEMPERATURE_WORDS else unit
-
-
-def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
-    """Return valid, unique signal names by column; fallback names are "u" for inputs and "y" for outputs."""
-    names: dict[str, str] = {}
-    for column, role in columns.items():
-        bare = re.sub(r"\W+", "_", split_unit(column)[0].rpartition("/")[2]).strip("_")
-        usable = re.fullmatch(r"[^\W\d]\w*", bare) and len(bare) <= 30 and bare.casefold() not in _RESERVED_NAMES
-        name = bare if usable else role
-        taken, count = set(names.values()), 1
-        while name in taken:
-            count += 1
-            name = f"{bare if usable else role}_{count}"
-        names[column] = name
-    return names
-
-
-#: Names with a meaning in equation texts.
-_RESERVED_NAMES = frozenset(("d", "sign", "sat", "dead", "delay", "alpha", "a0", "b0", "c", CSV_TIME))
-
 
 _MAX_LISTED_COLUMNS = 40
 #: Names of time columns that imply seconds.
@@ -424,50 +301,32 @@ class _FilePreview:
         self, every: list[Column], clock: Column | None
     ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
         """Return role and signal by column, assumptions, and the problem if roles are unknown."""
-        wanted, header, guessed = self.wanted, self.table.header, False
+        wanted, header = self.wanted, self.table.header
+        said = tuple[Assumption, ...]()
         if header is not None and not wanted.inputs and not wanted.outputs:
             wanted.inputs, wanted.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
-        elif not wanted.inputs and not wanted.outputs:
-            free = [c for c in every if c is not clock and _has_numbers(c) and c.name and c.name.isprintable()]
-            own = {c.name_with_unit: c.name for c in free}
-            drives, follows = guess_roles(list(own))
-            names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
-            wanted.inputs, wanted.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
-            guessed = bool(drives)
+        else:
+            said = assume_roles(wanted, [c for c in every if c is not clock])
         roles: dict[str, tuple[str, str]] = {} if clock is None else {clock.name: ("time", "")}
         for role, asked in (("input", wanted.inputs), ("output", wanted.outputs)):
             for name, spec in asked.items():
-                column = self.pool.find(spec, f"signal {name!r}")
-                roles[column.name] = (role, name)
-                unit = known_unit(column.file_unit, column.name_with_unit)
-                if unit and name not in wanted.units and header is None:
-                    wanted.units[name] = unit
-        said = []
-        if guessed:
-            inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
-            words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
-            said.append(
-                Assumption(
-                    "inputs",
-                    inputs,
-                    words,
-                    f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}",
-                )
-            )
+                roles[self.pool.find(spec, f"signal {name!r}").name] = (role, name)
+        if header is None:
+            add_file_units(wanted, self.pool)
         left = ""
         if not wanted.outputs:
-            choice = join_names((c.name for c in every if c is not clock and _has_numbers(c)), 20)
+            choice = join_names((c.name for c in every if c is not clock and has_numbers(c)), 20)
             left = (
                 "which columns are inputs and which are outputs, their names do not say; name them with "
                 f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
                 f"{choice or 'none'}"
             )
-            wordy = (c for c in every if c is not clock and not _has_numbers(c) and c.timestamps is None)
+            wordy = (c for c in every if c is not clock and not has_numbers(c) and c.timestamps is None)
             others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in wordy]
             if others:
                 more = f" and {len(others) - _MAX_LISTED_COLUMNS} more" * (len(others) > _MAX_LISTED_COLUMNS)
                 left += f"; no column of numbers is {', '.join(others[:_MAX_LISTED_COLUMNS])}{more}"
-        return roles, tuple(said), left
+        return roles, said, left
 
     def _time_assumptions(self, clock: Column) -> tuple[Assumption, ...]:
         """Return the assumptions about unit or date order of the time column."""
@@ -510,11 +369,6 @@ class _FilePreview:
         return options | ({"layout": layout} if layout != Layout() else {})
 
 
-def _has_numbers(column: Column) -> bool:
-    """Whether a column has numbers, possibly with gaps."""
-    return column.problem is None or column.blank
-
-
 def _first_bad_cell(column: Column) -> str:
     """Return the first cell that is not a number, with its line."""
     found = _IN_LINE.search(str(column.problem))
@@ -526,7 +380,7 @@ def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> F
     unit, values = column.file_unit, column.values
     if column.timestamps is not None:
         return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.timestamps.first}")
-    if values is None or not values.size or not _has_numbers(column):
+    if values is None or not values.size or not has_numbers(column):
         why = _first_bad_cell(column)
         words = "no numbers" if not why else f"no numbers ({why})"
         return FileColumn(column.name, role, signal, unit, None, None, None, words)

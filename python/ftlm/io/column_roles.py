@@ -1,0 +1,201 @@
+"""Roles of columns by their names: inputs, outputs and signal names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+
+from ftlm.data.units import parse_unit
+from ftlm.io.cell_parsing import split_unit
+from ftlm.io.dialect import Assumption, Layout
+from ftlm.io.table import Column, Pool
+from ftlm.utils.parameters import NAMED_COLUMNS, parameter
+from ftlm.utils.validation import CSV_TIME, join_names
+
+
+@dataclass
+class ColumnSelection:
+    """Selection of columns and layout, from the arguments, the columns file and the ftlm header."""
+
+    time: Hashable | None
+    step: float | None
+    inputs: dict[str, Hashable]
+    outputs: dict[str, Hashable]
+    units: dict[str, str]
+    intersample: dict[str, str]
+    layout: Layout
+
+
+_INPUT_WORDS = frozenset(
+    (
+        "u",
+        "in",
+        "inp",
+        "input",
+        "eingang",
+        "cmd",
+        "command",
+        "current",
+        "strom",
+        "torque",
+        "drehmoment",
+        "pwm",
+        "duty",
+        "drive",
+        "force",
+        "kraft",
+        "power",
+        "leistung",
+        "heater",
+        "heating",
+        "excitation",
+        "anregung",
+        "actuator",
+        "i",
+        "im",
+        "valve",
+        "ventil",
+        "throttle",
+    )
+)
+_OUTPUT_WORDS = frozenset(
+    (
+        "y",
+        "out",
+        "output",
+        "ausgang",
+        "angle",
+        "winkel",
+        "position",
+        "pos",
+        "weg",
+        "displacement",
+        "deflection",
+        "auslenkung",
+        "theta",
+        "th",
+        "temp",
+        "temperature",
+        "temperatur",
+        "speed",
+        "velocity",
+        "drehzahl",
+        "geschwindigkeit",
+        "acceleration",
+        "accel",
+        "beschleunigung",
+        "level",
+        "pressure",
+        "druck",
+        "response",
+        "antwort",
+        "strain",
+        "dehnung",
+        "tip",
+    )
+)
+#: Voltage is an input of motors and an output of cells.
+_AMBIGUOUS_WORDS = frozenset(["voltage", "volt", "volts", "spannung", "v"])
+#: Words of temperature columns, whose degrees are no angles.
+_TEMPERATURE_WORDS = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
+
+
+def words_of(column: str) -> set[str]:
+    """Case-folded words of a column name, without unit and digits."""
+    bare = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])", " ", split_unit(column)[0])
+    return set(re.split(r"[\W\d_]+", bare.casefold())) - {""}
+
+
+def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Guess inputs and outputs from column names; both are empty if the names are ambiguous."""
+    told = {column: words_of(column) for column in columns}
+    drives = [c for c, words in told.items() if words & _INPUT_WORDS and not words & _OUTPUT_WORDS]
+    follows = [c for c, words in told.items() if words & _OUTPUT_WORDS and not words & _INPUT_WORDS]
+    either = [c for c, words in told.items() if words & _AMBIGUOUS_WORDS and c not in drives and c not in follows]
+    if either and not drives:
+        drives, either = either, []
+    rest = [c for c in columns if c not in drives and c not in follows]
+    if len(rest) == 1 and rest != either:
+        if drives and not follows:
+            follows, rest = rest, []
+        elif follows and not drives:
+            drives, rest = rest, []
+    return (drives, follows) if drives and follows else ([], [])
+
+
+def known_unit(stated: str, column: str = "") -> str:
+    """Return the ftlm unit of a unit in a file; "" if unknown, or if degrees may mean a temperature."""
+    unit = parse_unit(stated) or ""
+    return "" if unit in ("deg", "°") and words_of(column) & _TEMPERATURE_WORDS else unit
+
+
+def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
+    """Return valid, unique signal names by column; fallback names are "u" for inputs and "y" for outputs."""
+    names: dict[str, str] = {}
+    for column, role in columns.items():
+        bare = re.sub(r"\W+", "_", split_unit(column)[0].rpartition("/")[2]).strip("_")
+        usable = re.fullmatch(r"[^\W\d]\w*", bare) and len(bare) <= 30 and bare.casefold() not in _RESERVED_NAMES
+        name = bare if usable else role
+        taken, count = set(names.values()), 1
+        while name in taken:
+            count += 1
+            name = f"{bare if usable else role}_{count}"
+        names[column] = name
+    return names
+
+
+#: Names with a meaning in equation texts.
+_RESERVED_NAMES = frozenset(("d", "sign", "sat", "dead", "delay", "alpha", "a0", "b0", "c", CSV_TIME))
+
+
+def has_numbers(column: Column) -> bool:
+    """Whether a column has numbers, possibly with gaps."""
+    return column.problem is None or column.blank
+
+
+def assume_roles(
+    wanted: ColumnSelection, columns: Sequence[Column], signals: tuple[Sequence[str], Sequence[str]] | None = None
+) -> tuple[Assumption, ...]:
+    """Choose inputs and outputs among columns if none are named, and return what was assumed.
+
+    Parameters
+    ----------
+    wanted
+        Column selection to complete.
+    columns
+        Columns of the file without its time.
+    signals
+        Inputs and outputs of an equation. If the file has all of them, they are chosen, and nothing is assumed.
+        Otherwise, and without an equation, the words in the column names decide.
+    """
+    if wanted.inputs or wanted.outputs:
+        return ()
+    free = [c for c in columns if has_numbers(c) and c.name and c.name.isprintable()]
+    own = {c.name_with_unit: c.name for c in free}
+    if signals is not None:
+        known = {name: own[c] for c, name in signal_names(dict.fromkeys(own, "c")).items()} | {
+            c.name: c.name for c in free
+        }
+        if all(name in known for side in signals for name in side):
+            wanted.inputs = {name: known[name] for name in signals[0]}
+            wanted.outputs = {name: known[name] for name in signals[1]}
+            return ()
+    drives, follows = guess_roles(list(own))
+    names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
+    wanted.inputs, wanted.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
+    if not drives:
+        return ()
+    inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
+    words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
+    remedy = f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}"
+    return (Assumption("inputs", inputs, words, remedy),)
+
+
+def add_file_units(wanted: ColumnSelection, pool: Pool) -> None:
+    """Take the units that a file states for the selected columns, unless others are given."""
+    for name, spec in (wanted.inputs | wanted.outputs).items():
+        column = pool.find(spec, f"signal {name!r}")
+        unit = known_unit(column.file_unit, column.name_with_unit)
+        if unit and name not in wanted.units:
+            wanted.units[name] = unit
