@@ -9,6 +9,7 @@ import typing as _typing
 if _typing.TYPE_CHECKING:
     from ftlm import rig as rig
     from ftlm._core import __version__ as __version__
+    from ftlm.analysis.model_algebra import transfer_function as transfer_function
     from ftlm.arm.energy_balance import energies as energies
     from ftlm.arm.flexible_link import PARAMETER_SETS as PARAMETER_SETS
     from ftlm.arm.flexible_link import LinkParameters as LinkParameters
@@ -108,6 +109,7 @@ _MODULE_BY_NAME = {
     name: module
     for module, names in {
         "_core": "__version__",
+        "analysis.model_algebra": "transfer_function",
         "arm.energy_balance": "energies",
         "arm.flexible_link": "PARAMETER_SETS LinkParameters flexible_link link_model order_law",
         "data.frequency_data": "FrequencyData",

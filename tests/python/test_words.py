@@ -370,7 +370,9 @@ def test_a_refused_command_names_its_own_options(words, said, saved, tmp_path):
 def test_commands_speak_of_their_options(saved, tmp_path):
     path = tmp_path / "bare.csv"
     path.write_text("t,u,y\n0,1,2\n1,2,3\n2,1,nan\n3,1,1\n", encoding="utf-8")
-    done = run_command("inspect", path)
+    other = tmp_path / "other.csv"
+    other.write_text("t,foo,bar\n0,1,2\n1,2,3\n2,1,4\n3,1,1\n", encoding="utf-8")
+    done = run_command("inspect", other)
     assert done.exit_code == 3
     assert "-u NAME=COLUMN and -y NAME=COLUMN" in done.stderr
     assert "inputs=" not in done.stderr

@@ -51,16 +51,18 @@ def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
     return tuple(dict.fromkeys(s for s in model.structure.signals if s in read))
 
 
-def _add(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
+def add_polynomial(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
+    """Add a multiple of a polynomial to another one in place; nearly equal powers are one."""
     for power, value in other.items():
         at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
         into[at] = into.get(at, 0.0) + factor * value
 
 
-def _multiply(a: Polynomial, b: Polynomial) -> Polynomial:
+def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:
+    """Return the product of two polynomials."""
     out: Polynomial = {}
     for (p, x), (q, y) in itertools.product(a.items(), b.items()):
-        _add(out, {round(p + q, 9): x * y})
+        add_polynomial(out, {round(p + q, 9): x * y})
     return out
 
 
@@ -73,9 +75,9 @@ def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Pol
     for term in item.terms:
         value = {term.order.constant: float(term.fixed or 0.0)}
         if term.signal in names:
-            _add(left[names.index(term.signal)], value, -1.0)
+            add_polynomial(left[names.index(term.signal)], value, -1.0)
         else:
-            _add(right.setdefault(term.signal, {}), value)
+            add_polynomial(right.setdefault(term.signal, {}), value)
     return left, right
 
 
@@ -90,9 +92,9 @@ def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
             sign = -sign if order[i] > order[j] else sign
         product: Polynomial = {0.0: 1.0}
         for i, j in enumerate(order):
-            product = _multiply(product, matrix[i][j])
-        _add(out, product, sign)
-        _add(size, {p: abs(v) for p, v in product.items()})
+            product = multiply_polynomials(product, matrix[i][j])
+        add_polynomial(out, product, sign)
+        add_polynomial(size, {p: abs(v) for p, v in product.items()})
     return {p: v for p, v in sorted(out.items()) if abs(v) > CANCELLATION_TOLERANCE * size[p]}
 
 

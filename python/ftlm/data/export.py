@@ -257,7 +257,9 @@ def _parse_fields(told: Any) -> Header:
 def header_of_line(path: Path, line: bytes) -> Header | None:
     """Return the header in the first line of a text file; None if ftlm did not write it."""
     text = line.removeprefix(UTF8_BOM).decode("utf-8", errors="replace")
-    return Header.read(path, "line 1", text.removeprefix(CSV_MARK)) if f"{text.rstrip()} ".startswith(CSV_MARK) else None
+    return (
+        Header.read(path, "line 1", text.removeprefix(CSV_MARK)) if f"{text.rstrip()} ".startswith(CSV_MARK) else None
+    )
 
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:

@@ -346,6 +346,69 @@ class Model:
 
         return to_control(self, band=band, order=order)
 
+    @check_arguments
+    def series(self, following: Model) -> Model:
+        """Return the model of `following` driven by the output of this one, exactly.
+
+        Both have one output and one input. Delays add up; common factors are not cancelled.
+
+        Raises
+        ------
+        ModelError
+            More than one output or input, friction, a saturation, a dead zone, a sensor filter; an order above 10.
+        """
+        from ftlm.analysis.model_algebra import series
+
+        return series(self, following)
+
+    @check_arguments
+    def parallel(self, other: Model) -> Model:
+        """Return the model whose output is the sum of both outputs from one input, exactly.
+
+        Both have one output and one input; common factors are not cancelled.
+
+        Raises
+        ------
+        ModelError
+            Different delays, and everything that :meth:`series` refuses.
+        """
+        from ftlm.analysis.model_algebra import parallel
+
+        return parallel(self, other)
+
+    @check_arguments
+    def feedback(self, back: Model | float = 1.0, *, sign: int = -1) -> Model:
+        """Return the closed loop G / (1 - sign G H) of this model G, exactly.
+
+        Parameters
+        ----------
+        back
+            Model H in the feedback path, or a gain.
+        sign
+            -1 for negative feedback, 1 for positive.
+
+        Raises
+        ------
+        ModelError
+            A delay in the loop, and everything that :meth:`series` refuses.
+        """
+        from ftlm.analysis.model_algebra import feedback
+
+        return feedback(self, back, sign)
+
+    def inverse(self) -> Model:
+        """Return the model from the output to the input, exactly.
+
+        Raises
+        ------
+        ModelError
+            A delay; a numerator of lower order than the denominator, whose inverse would drive its output to infinity;
+            and everything that :meth:`series` refuses.
+        """
+        from ftlm.analysis.model_algebra import inverse
+
+        return inverse(self)
+
     def to_tf(self) -> Any:
         """Convert a model of integer orders to python-control, exactly; see :func:`ftlm.analysis.to_tf`."""
         from ftlm.analysis.conversion import to_tf

@@ -1,0 +1,184 @@
+"""Transfer functions as models, and their connections: series, parallel, feedback, inverse; exact in every power."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Real
+
+from ftlm.analysis.frequency_response import (
+    Polynomial,
+    add_polynomial,
+    check_no_input_nonlinearity,
+    multiply_polynomials,
+    transfer_functions,
+)
+from ftlm.errors import ModelError
+from ftlm.model.model import Model
+from ftlm.structure.order import MAX_ORDER
+from ftlm.structure.parser import equation
+from ftlm.utils.arguments import check_arguments
+from ftlm.utils.parameters import parameter
+
+#: Coefficient and power of a term.
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Ratio:
+    """Numerator and denominator in powers of s, and a delay [s]."""
+
+    top: Polynomial
+    bottom: Polynomial
+    delay: float
+
+    def model(self, output: str, signal: str) -> Model:
+        """Return the equation of this transfer function."""
+        bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
+        if not bottom or not top:
+            raise ModelError(f"the {'denominator' if top else 'numerator'} is 0; there is no such model")
+        # Integrals of a signal are powers below 0, and an equation is written without them.
+        shift = -min(0.0, *bottom, *top)
+        highest = max(bottom)
+        order, gain = highest + shift, bottom[highest]
+        if max(top) > highest:
+            raise ModelError(
+                f"the numerator is of order {max(top) + shift:g} and the denominator of order {order:g}, so a step "
+                "would drive the output to infinity; add a pole far out, or identify it from frequency responses with "
+                "identify_frequency"
+            )
+        if not 0 < order <= MAX_ORDER:
+            raise ModelError(f"the denominator is of order {order:g}; an equation has an order from 0 to {MAX_ORDER:g}")
+        terms = [(-c / gain, output, p + shift) for p, c in bottom.items() if p != highest]
+        terms += [(c / gain, signal, p + shift) for p, c in top.items()]
+        words = " + ".join(f"{c!r} D^{p!r} {name}" for c, name, p in terms).replace("+ -", "- ")
+        delay = {signal: self.delay} if self.delay else None
+        return Model(equation(f"D^{order!r} {output} = {words}", delay=delay))
+
+
+@check_arguments
+def transfer_function(
+    num: Sequence[float] | Sequence[Pair],
+    den: Sequence[float] | Sequence[Pair],
+    delay: float = 0.0,
+    *,
+    output: str = "y",
+    input: str = "u",
+) -> Model:
+    """Return a model from the numerator and denominator of a transfer function.
+
+    Parameters
+    ----------
+    num, den
+        Coefficients of s^n, …, s, 1 as in python-control and MATLAB; or pairs (coefficient, power) for fractional
+        powers: the vectors a, na of FOMCON's ``fotf`` are ``zip(a, na)``.
+    delay
+        Delay of the input [s], ≥ 0.
+    output, input
+        Names of the signals.
+
+    Returns
+    -------
+    Model
+        ``output = num / den exp(-s delay) input`` as an equation, divided by the coefficient of its highest power.
+
+    Raises
+    ------
+    ModelError
+        The numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
+        a list is empty or of another form, or a number is not finite.
+
+    Examples
+    --------
+    >>> print(ftlm.transfer_function([1], [(2, 1.5), (1, 0)], 0.1).equations[0])
+    D^1.5 y = -0.5 y + 0.5 u
+    """
+    return _Ratio(_polynomial("num", num), _polynomial("den", den), delay).model(output, input)
+
+
+def _polynomial(name: str, given: Sequence[float] | Sequence[Pair]) -> Polynomial:
+    """Return a polynomial from coefficients of descending powers or from pairs (coefficient, power)."""
+    values = list(given)
+    pairs = [v if isinstance(v, (tuple, list)) else (v, len(values) - 1.0 - k) for k, v in enumerate(values)]
+    out: Polynomial = {}
+    for k, pair in enumerate(pairs):
+        if len(pair) != 2 or not all(isinstance(v, Real) and math.isfinite(v) for v in pair):
+            raise ModelError(
+                f"{name}[{k}] is {values[k]!r}; give finite coefficients of s^n, …, s, 1, or pairs (coefficient, power)"
+            )
+        add_polynomial(out, {float(pair[1]): float(pair[0])})
+    if not any(out.values()):
+        raise ModelError(f"{name} has no coefficient other than 0; give at least one")
+    return out
+
+
+def _ratio(model: Model, what: str) -> tuple[_Ratio, str, str]:
+    """Return the transfer function of a linear model of one output and one input, and their names."""
+    check_no_input_nonlinearity(model, what)
+    if model.structure.has_friction or model.structure.sensor_filter is not None:
+        raise ModelError(
+            f"{what} is of linear models without friction and sensor filter; leave them out of the equation"
+        )
+    transfer = transfer_functions(model)
+    if len(transfer.outputs) != 1 or len(transfer.inputs) != 1:
+        raise ModelError(
+            f"{what} is of models with one output and one input; this one has {', '.join(transfer.outputs)} from "
+            f"{', '.join(transfer.inputs) or 'no input'}"
+        )
+    (output,), (signal,) = transfer.outputs, transfer.inputs
+    top = {p: c for c, p in transfer.numerators[output, signal]}
+    bottom = {p: c for c, p in transfer.denominator[output]}
+    return _Ratio(top, bottom, transfer.delay[signal]), output, signal
+
+
+def series(first: Model, second: Model) -> Model:
+    """Return the model whose output is that of `second` driven by the output of `first`; delays add up."""
+    (a, _, signal), (b, output, _) = _ratio(first, "a series"), _ratio(second, "a series")
+    top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
+    return _Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
+
+
+def parallel(first: Model, second: Model) -> Model:
+    """Return the model whose output is the sum of both outputs from one input; both must have the same delay."""
+    (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
+    if a.delay != b.delay:
+        raise ModelError(
+            f"the delays are {a.delay:g} s and {b.delay:g} s, and the sum of both is no equation with one delay of its "
+            "input; add the simulated outputs"
+        )
+    top = multiply_polynomials(a.top, b.bottom)
+    add_polynomial(top, multiply_polynomials(b.top, a.bottom))
+    return _Ratio(top, multiply_polynomials(a.bottom, b.bottom), a.delay).model(output, signal)
+
+
+def feedback(forward: Model, back: Model | float, sign: int) -> Model:
+    """Return the closed loop; see :meth:`ftlm.Model.feedback`."""
+    if sign not in (-1, 1):
+        raise ModelError(f"{parameter('sign', sign)}; give -1 for negative feedback or 1")
+    a, output, signal = _ratio(forward, "feedback")
+    if isinstance(back, Model):
+        b, _, _ = _ratio(back, "feedback")
+    else:
+        b = _Ratio({0.0: float(back)}, {0.0: 1.0}, 0.0)
+    if a.delay or b.delay:
+        raise ModelError(
+            f"the loop has a delay of {a.delay + b.delay:g} s, and a closed loop with a delay is no equation; use "
+            "frequency_response of both, or ftlm.control"
+        )
+    bottom = multiply_polynomials(a.bottom, b.bottom)
+    add_polynomial(bottom, multiply_polynomials(a.top, b.top), -float(sign))
+    return _Ratio(multiply_polynomials(a.top, b.bottom), bottom, 0.0).model(output, signal)
+
+
+def inverse(model: Model) -> Model:
+    """Return the model with output and input exchanged; see :meth:`ftlm.Model.inverse`."""
+    own, output, signal = _ratio(model, "an inverse")
+    if own.delay:
+        raise ModelError(f"the inverse would know the input {own.delay:g} s before it acts; leave the delay out")
+    return _Ratio(own.bottom, own.top, 0.0).model(signal, output)
+
+
+def _distinct_name(output: str, signal: str) -> str:
+    """Return the name of an output that is not that of the input."""
+    return output if output != signal else f"{output}_out"
