@@ -207,6 +207,7 @@ def test_a_slider_reads_out_measured_and_simulated(browser, folder, width):
     with Opened(browser, folder / "fit.html", viewport={"width": width, "height": 900}) as opened:
         page = opened.page
         kept = np.load(folder / "fit.npz")
+        page.get_by_role("heading", name="on the runs that were fitted").click()
         slide = page.locator(".slide").filter(has=page.get_by_label(re.compile("estimation: run"))).first
         every = page.locator(".slide")
         assert every.count() == 2
@@ -259,10 +260,16 @@ def test_a_click_on_a_chart_moves_its_slider(browser, folder):
 
 @pytest.mark.parametrize("name", ALL)
 def test_without_scripts_everything_but_zoom_and_sliders_is_there(browser, at, name):
+    def open_details(page):
+        for summary in page.locator("details.part > summary").all():
+            summary.click()
+
     with Opened(browser, at(name)) as opened:
         opened.page.evaluate("document.querySelectorAll('.zoom, .slide').forEach((z) => z.remove())")
+        open_details(opened.page)
         with_scripts = opened.page.locator("main").inner_text()
     with Opened(browser, at(name), java_script_enabled=False) as opened:
+        open_details(opened.page)
         assert opened.page.locator("main").inner_text() == with_scripts
         assert opened.page.locator(".zoom, .slide").count() == 0
         boxes = [c.bounding_box() for c in opened.page.locator("svg.chart.wide").all()]
@@ -331,11 +338,15 @@ def test_the_paper_s_page_names_what_holds_first(browser, at):
         assert opened.said == []
 
 
-def test_warnings_come_first(browser, folder):
+def test_the_fit_comes_first_and_details_open(browser, folder):
     with Opened(browser, folder / "search.html") as opened:
         heads = opened.page.locator("h2").all_inner_texts()
-        assert heads[0] == "Warnings"
-        assert {"Equations", "Errors", "Measured and simulated", "Residuals", "Frequency response"} <= set(heads)
+        assert heads[0].startswith("Measured and simulated")
+        assert {"Equations", "Warnings", "Errors", "Residuals", "Frequency response"} <= set(heads)
+        residuals = opened.page.locator("details", has=opened.page.get_by_role("heading", name="Residuals"))
+        assert not residuals.locator("svg:visible").count()
+        residuals.locator("summary").click()
+        assert residuals.locator("svg:visible").count()
         assert {"Convergence of the recursion", "Order search", "Settings"} <= set(heads)
 
 

@@ -27,7 +27,12 @@ def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
 
 @check_arguments
 def comparison_charts(
-    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
+    comparison: Comparison,
+    *,
+    units: Mapping[str, str] | None = None,
+    label: str = "",
+    points: int = MAX_LINE_POINTS,
+    bands: Mapping[str, tuple[Floats, Floats]] | None = None,
 ) -> list[Figure]:
     """Chart measured and simulated output, for every output of every run.
 
@@ -41,7 +46,10 @@ def comparison_charts(
         Role of the data, such as "estimation".
     points
         Most points of a line.
+    bands
+        Lower and upper end of a 95 % band of the simulated output of the only run, by output.
     """
+    known = bands or {}
     return [
         line_chart(
             pulse_times(comparison, k),
@@ -51,11 +59,19 @@ def comparison_charts(
             y_label=with_unit(symbol(name), units, name),
             points=points,
             slider=True,
-            caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}.",
+            bands=_behind_measured(known[name]) if name in known else (),
+            caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
+            + (" Shade: 95 % band of the simulation, from the covariance of the fit." if name in known else ""),
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)
         for name, figures in output_error.items()
     ]
+
+
+def _behind_measured(band: tuple[Floats, Floats]) -> list[tuple[Floats, Floats]]:
+    """Return the bands of a chart of the measured and the simulated output; the measured one has none."""
+    none = np.full(band[0].size, np.nan)
+    return [(none, none), band]
 
 
 @check_arguments

@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -37,6 +38,7 @@ from ftlm.order_search.result import SearchResult, search_summary, search_top
 from ftlm.order_search.search import landscape
 from ftlm.plot.comparison_charts import comparison_charts, input_charts, residual_charts, residual_series
 from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencies
+from ftlm.report.prediction_bands import Band, prediction_bands
 from ftlm.report.text_summary import describe_order, settings_rows
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
@@ -229,16 +231,18 @@ def identification_page(
     judged = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
-    sections = first_sections(model, findings, compared, bool(others), result.fit, runs)
-    sections.append(residual_section(tests, result.information, compared, model.units))
-    sections += correlation_sections(result.fit)
+    bands = [prediction_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
+    sections = first_sections(model, findings, compared, bool(others), result.fit, runs, bands)
+    details = [residual_section(tests, result.information, compared, model.units)]
+    details += correlation_sections(result.fit)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
-    sections.append(frequency_section(model, steps))
-    sections += _search_sections(result)
+    details.append(frequency_section(model, steps))
+    details += _search_sections(result)
     titled = ((f"Initial terms of the free runs, {label}", c) for label, c in compared)
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.fit)] if result.fit is not None and result.fit.starts else []
-    sections.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
+    details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
+    sections += [replace(section, collapsed=True) for section in details]
     return write_page(
         path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
     )
@@ -251,8 +255,12 @@ def first_sections(
     validated: bool,
     joint: JointFit | None,
     runs: Sequence[Run] = (),
+    bands: Sequence[Mapping[str, Band]] = (),
 ) -> list[Section]:
-    """Return the sections on warnings, equations, modes and errors, with output and input charts."""
+    """Return the first sections of a page: the fit on unseen runs, equations, warnings; then collapsed details.
+
+    Without validation runs the fit is that on the estimation runs. `bands` are those of the validation runs.
+    """
     units = model.units
     words = [
         "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
@@ -266,42 +274,60 @@ def first_sections(
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
-    drawn = _with_inputs(model, compared, runs, points)
     own = compared[0][1] if compared and compared[0][0] == "estimation" else None
     equations = [
         *equations_html(model, None if own is None else own.offsets),
         FRICTION_STABILITY_NOTE if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
     ]
-    sections = [
-        Section("Warnings", words[1:] if warned else words, shown, more=left),
+    unseen = [(label, c) for label, c in compared if label == "validation"]
+    fitted = [(label, c) for label, c in compared if label != "validation"]
+    left_runs = list(runs)
+    known = _with_inputs(model, fitted, left_runs, points)
+    new = _with_inputs(model, unseen, left_runs, points, bands)
+    first = new or known
+    sections = []
+    if first:
+        left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table of errors has every run."
+        heading = "Measured and simulated, on runs that were not fitted" if new else "Measured and simulated"
+        sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
+    sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint)]),
+        Section("Warnings", words[1:] if warned else words, shown, more=left),
     ]
     if figures := behavior_figures(model):
-        sections.append(Section("Gain, modes and steps", tables=behavior_tables(model), figures=figures, small=True))
+        tables = behavior_tables(model)
+        sections.append(Section("Gain, modes and steps", tables=tables, figures=figures, small=True, collapsed=True))
     if compared:
-        left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
-        sections += [
-            Section("Errors", tables=[errors_table(compared, units=units)]),
-            Section(
-                "Measured and simulated", left_out if charts > PAGE_CHARTS else (), figures=drawn[: max(PAGE_CHARTS, 1)]
-            ),
-        ]
+        sections.append(Section("Errors", tables=[errors_table(compared, units=units)], collapsed=True))
+    if new and known:
+        figures = known[: max(PAGE_CHARTS - len(new), 0)]
+        sections.append(
+            Section("Measured and simulated, on the runs that were fitted", figures=figures, collapsed=True)
+        )
     return sections
 
 
 def _with_inputs(
-    model: Model, compared: Sequence[tuple[str, Comparison]], runs: Sequence[Run], points: int
+    model: Model,
+    compared: Sequence[tuple[str, Comparison]],
+    runs: list[Run],
+    points: int,
+    bands: Sequence[Mapping[str, Band]] = (),
 ) -> list[Figure]:
-    """Return charts of measured and simulated outputs of each run, followed by its inputs if available."""
+    """Return charts of measured and simulated outputs of each run, followed by its inputs if available.
+
+    Takes the runs of the comparisons from the front of `runs`.
+    """
     inputs = [s for s in model.structure.signals if s not in model.outputs]
-    left, drawn = list(runs), []
-    for label, comparison in compared:
-        figures = comparison_charts(comparison, units=model.units, label=label, points=points)
+    drawn: list[Figure] = []
+    for place, (label, comparison) in enumerate(compared):
+        band = bands[place] if place < len(bands) else {}
+        figures = comparison_charts(comparison, units=model.units, label=label, points=points, bands=band)
         for k, (name, _, _) in enumerate(comparison.per_run):
             here = len(comparison.output_error)
             drawn += figures[k * here : (k + 1) * here]
-            if left and left[0].name == name:
-                drawn += input_charts([left.pop(0)], inputs, points=max(points // 2, 4))
+            if runs and runs[0].name == name:
+                drawn += input_charts([runs.pop(0)], inputs, points=max(points // 2, 4))
     return drawn
 
 
@@ -320,7 +346,7 @@ def correlation_sections(joint: JointFit | None) -> list[Section]:
     )
     values = np.clip(joint.correlation, -1.0, 1.0)
     figure = correlation_map(joint.names, values, title="Correlations of the estimates")
-    return [Section("How the numbers go together", words, figures=[figure], small=True)]
+    return [Section("Correlations of the estimates", words, figures=[figure], small=True)]
 
 
 def residual_section(
@@ -563,17 +589,20 @@ def model_page(
             there += [make_finding("run_of_its_own", run=run.name)] * (run.name in known.runs)
         findings += _on_validation(there, run)
     compared = [("validation", comparison) for comparison in validated]
-    sections = first_sections(model, findings, compared, bool(others), None, others)
+    bands = [prediction_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
+    sections = first_sections(model, findings, compared, bool(others), None, others, bands)
+    details = []
     if tests := tests_on(model, others):
-        sections.append(residual_section(tests, None, compared, model.units))
-    sections.append(frequency_section(model, [(r.step, r.duration) for r in others]))
+        details.append(residual_section(tests, None, compared, model.units))
+    details.append(frequency_section(model, [(r.step, r.duration) for r in others]))
     about: list[list[Cell]] = [["structure", model.structure.name], ["coupling in free runs", model.structure.coupling]]
     if known is not None:
         about += [["estimator", known.method], ["identified from", ", ".join(known.runs)]]
         about += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in known.fit.items()]
         about += [[n.upper().replace("AICC", "AICc"), v] for n, v in known.information.items()]
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
-    sections.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
+    details.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
+    sections += [replace(section, collapsed=True) for section in details]
     judged = saved_verdict(model, validated)
     return write_page(
         path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)

@@ -156,6 +156,8 @@ class Section:
         Title of the collapsed part; it is open in print.
     folded_paragraphs, folded_tables
         Text and tables of the collapsed part.
+    collapsed
+        Whether only the heading is shown until it is clicked; the section is open in print.
     """
 
     heading: str
@@ -168,6 +170,7 @@ class Section:
     fold: str = "Numbers"
     folded_paragraphs: Sequence[str] = ()
     folded_tables: Sequence[Table] = ()
+    collapsed: bool = False
 
     def __post_init__(self) -> None:
         # A str is a sequence of characters; treat it as one paragraph.
