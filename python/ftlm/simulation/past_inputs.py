@@ -70,6 +70,8 @@ def fit_history(
     past = _past_responses(model, run, times, max_m)
 
     def respond(name: tuple[int, float] | None) -> Floats:
+        if name is not None and name[1] == LEVEL_EXPONENT:
+            return np.asarray(driven + np.eye(count)[name[0]][:, None])
         own: list[list[tuple[float, float]]] = [[(name[1], 1.0)] if name and name[0] == i else [] for i in range(count)]
         return core.refine((False, own, False), RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, stop_flag())[0][0]
 

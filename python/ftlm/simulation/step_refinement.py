@@ -12,6 +12,7 @@ from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
 from ftlm.simulation.initial_conditions import deviations, resolve_initial_conditions, resolve_start, start_score
 from ftlm.simulation.output_samples import (
     FRICTION_REFINEMENT,
+    LEVEL_EXPONENT,
     OutputSamples,
     Terms,
     add_levels,
@@ -94,5 +95,11 @@ def _simulate_refined(
     core, terms = output_simulation(model, run, initial, times, FRICTION_REFINEMENT)
     if initial is None and isinstance(resolve_initial_conditions(run, model.structure), History):
         terms = fit_history(core, model, run, terms, run.time if times is None else times, max_m) or terms
-    (outputs, found), refinement, change = core.refine(terms, tolerance, max_m, LONG_RECORD_INTERVALS, stop_flag())
-    return OutputSamples(outputs, named_terms(model, found), refinement, change)
+    # Given to the core, initial terms are powers of time alone.
+    levels = {o: dict(own).get(LEVEL_EXPONENT, 0.0) for o, own in zip(model.outputs, terms[1], strict=True)}
+    powers = (terms[0], [[term for term in own if term[0] != LEVEL_EXPONENT] for own in terms[1]], terms[2])
+    (outputs, found), refinement, change = core.refine(powers, tolerance, max_m, LONG_RECORD_INTERVALS, stop_flag())
+    if not any(levels.values()):
+        return OutputSamples(outputs, named_terms(model, found), refinement, change)
+    fitted = {o: {**own, LEVEL_EXPONENT: 0.0} for o, own in named_terms(model, found).items()}
+    return OutputSamples(*add_levels(model, levels, outputs, fitted), refinement, change)
