@@ -556,6 +556,17 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "record some rows before the step, or a second step",
         prefix="{run}: ",
     ),
+    "start_not_told": FindingKind(
+        "history",
+        LEVEL_WITH_CARE,
+        "what the run did before its first row cannot be told|: {taken}, the gain of {output} from {input} is "
+        "{gain:.4g} ± {error:.2g}, {other}, it is {other_gain:.4g} ± {other_error:.2g}, with {ratio:.3g} times the "
+        "squares",
+        "what the run did before its first row cannot be told: the gain of {output} from {input} is {gain:.4g} if it "
+        "was {taken}, and {other_gain:.4g} if {other}",
+        "record some rows before an input moves, or give {ask[initial]} and {ask[offset]}",
+        prefix="{run}: ",
+    ),
     "moves_before_input": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,

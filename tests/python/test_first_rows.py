@@ -350,6 +350,27 @@ def panel_table(seeds):
     return wrong, covered
 
 
+@pytest.mark.parametrize(("name", "start"), [("fractional and a lag", "rest"), ("fractional", "rest")])
+def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
+    # A lag that the structure lacks makes a past of what a run did from rest.
+    record = panel_record(name, "prbs", start, 311)
+    found = ftlm.identify(record, ftlm.equation(FRACTIONAL))
+    said = [f for f in found.findings if f.code == "start_not_told"]
+    if name == "fractional":
+        assert not said
+        return
+    numbers = said[0].numbers
+    assert numbers["gain"] == pytest.approx(panel_gain(found), rel=1e-9)
+    given = ftlm.identify(record, ftlm.equation(FRACTIONAL, initial="caputo", offset="level"))
+    assert numbers["other_gain"] == pytest.approx(panel_gain(given), rel=5e-3)
+    apart = abs(numbers["gain"] - numbers["other_gain"])
+    assert apart > 3 * np.hypot(numbers["error"], numbers["other_error"])
+    assert "1.694 ± 0.064" in said[0].text
+    assert "1.376 ± 0.049" in said[0].text
+    # A start that is given is no question.
+    assert "start_not_told" not in codes(given)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_gains_of_a_panel_of_first_rows():

@@ -15,6 +15,7 @@ from msgspec import UNSET
 from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
+from ftlm.estimation.alternative_starts import start_not_told_findings
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
@@ -79,18 +80,10 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
     The constant is fitted first, because a fit that lacks a needed constant may end anywhere.
     """
     if structure.offset != "auto":
-        fit = estimate(structure)
-        # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
-        if fit.task.structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
+        fit = _fit_with_level_decision(structure, estimate)
+        if structure.initial != "auto" or structure.offset != "none":
             return fit
-        shown = _shows_level(fit)
-        level = _fit_with_level(fit, structure, estimate) if shown else None
-        if level is not None:
-            return level
-        said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
-        moved = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
-        level = _fit_with_level(fit, structure, estimate) if said and moved and not shown else None
-        return level or replace(fit, findings=[*fit.findings, *said])
+        return replace(fit, findings=[*fit.findings, *start_not_told_findings(fit)])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
@@ -108,6 +101,22 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         return _with_offset_decision(fit, test.decision)
     decision = "none: its test has no finite free run" if test is None else test.decision
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
+
+
+def _fit_with_level_decision(structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit:
+    """Fit a structure, with a level of the outputs if the runs prefer one, and with findings on offsets."""
+    fit = estimate(structure)
+    # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
+    if fit.task.structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
+        return fit
+    shown = _shows_level(fit)
+    level = _fit_with_level(fit, structure, estimate) if shown else None
+    if level is not None:
+        return level
+    said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
+    moved = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
+    level = _fit_with_level(fit, structure, estimate) if said and moved and not shown else None
+    return level or replace(fit, findings=[*fit.findings, *said])
 
 
 def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit | None:

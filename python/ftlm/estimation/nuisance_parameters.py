@@ -331,15 +331,15 @@ def _simplify_initial_terms(
 ) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
     try:
-        few = _refit_from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
+        few = refit_from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
     except FtlmError:
         # From here it has no finite free run, so it is not enough.
         return joint
     return joint if _fit_needs_history(few, joint, runs, structure) else few
 
 
-def _refit_from(
-    joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool = False
+def refit_from(
+    joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss = "squares", *, refine: bool = False
 ) -> JointFit:
     """Fit another structure from an earlier optimum; without `refine` on the coarsest grid that it allows."""
     values = dict(zip(joint.names, joint.values.tolist(), strict=True))
@@ -351,9 +351,9 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
     asked = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
-        few = _refit_from(joint, runs, replace(asked, initial="caputo"), loss)
+        few = refit_from(joint, runs, replace(asked, initial="caputo"), loss)
         # On the same kind of grid: what a coarse one leaves is no history.
-        many = _refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
+        many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
         return None
     fewer = few.initial_terms < many.initial_terms

@@ -9,9 +9,10 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
-from ftlm.simulation.initial_conditions import deviations, resolve_start, start_score
+from ftlm.simulation.initial_conditions import deviations, resolve_initial_conditions, resolve_start, start_score
 from ftlm.simulation.output_samples import (
     FRICTION_REFINEMENT,
+    LEVEL_EXPONENT,
     OutputSamples,
     Terms,
     add_levels,
@@ -21,11 +22,10 @@ from ftlm.simulation.output_samples import (
     output_simulation,
     with_initial_conditions,
 )
+from ftlm.simulation.past_inputs import LONG_RECORD_INTERVALS, fit_history
 from ftlm.simulation.state_space import simulate_state_space
+from ftlm.structure.structure import History
 from ftlm.utils.resources import stop_flag
-
-#: Minimum number of intervals of a long record. Below it, refinement of the whole grid costs no more.
-LONG_RECORD_INTERVALS = 1 << 14
 
 
 def simulate_refined(
@@ -93,5 +93,13 @@ def _simulate_refined(
         run.time if on_grid and has_nonuniform_samples(run, model.structure) else nonuniform_sample_times(model, run)
     )
     core, terms = output_simulation(model, run, initial, times, FRICTION_REFINEMENT)
-    (outputs, found), refinement, change = core.refine(terms, tolerance, max_m, LONG_RECORD_INTERVALS, stop_flag())
-    return OutputSamples(outputs, named_terms(model, found), refinement, change)
+    if initial is None and isinstance(resolve_initial_conditions(run, model.structure), History):
+        terms = fit_history(core, model, run, terms, run.time if times is None else times, max_m) or terms
+    # Given to the core, initial terms are powers of time alone.
+    levels = {o: dict(own).get(LEVEL_EXPONENT, 0.0) for o, own in zip(model.outputs, terms[1], strict=True)}
+    powers = (terms[0], [[term for term in own if term[0] != LEVEL_EXPONENT] for own in terms[1]], terms[2])
+    (outputs, found), refinement, change = core.refine(powers, tolerance, max_m, LONG_RECORD_INTERVALS, stop_flag())
+    if not any(levels.values()):
+        return OutputSamples(outputs, named_terms(model, found), refinement, change)
+    fitted = {o: {**own, LEVEL_EXPONENT: 0.0} for o, own in named_terms(model, found).items()}
+    return OutputSamples(*add_levels(model, levels, outputs, fitted), refinement, change)

@@ -260,8 +260,9 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
     """Return equation error and output error of a model on measured runs.
 
     The output error compares each sample y[k] with the simulation (free run: only inputs and initial conditions are
-    used) at the same time, on a grid refined until converged as in :func:`ftlm.simulate`. Initial terms are fitted to
-    the samples of the run. The fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
+    used) at the same time, on a grid refined until converged as in :func:`ftlm.simulate`. Initial values are fitted to
+    the samples of the run, none from rest. A history explains no more than inputs before the run could: its size has a
+    prior in units of the response to the inputs of the run. The fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
 
     Parameters
     ----------
