@@ -8,6 +8,7 @@ from typing import Any
 
 from ftlm.estimation.result import Identification
 from ftlm.findings import Finding, texts
+from ftlm.structure.structure import Structure
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
@@ -62,6 +63,11 @@ class Selection(ReportMixin):
     def winner(self) -> Trial:
         """The chosen candidate."""
         return self.trials[self.chosen]
+
+    @property
+    def structure(self) -> Structure:
+        """The chosen structure with the initial terms of its validation; it identifies ``best``."""
+        return self.winner.structure if self.best.task is None else self.best.task.structure
 
     def _rows(self) -> list[list[Cell]]:
         out: list[list[Cell]] = []
@@ -160,6 +166,10 @@ class Selection(ReportMixin):
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
+        return {**self.ranking_dict(), "identification": self.best.to_dict()}
+
+    def ranking_dict(self) -> dict[str, Any]:
+        """For JSON, without the identification."""
         return {
             "chosen": self.winner.name,
             "reason": self.reason,
@@ -181,12 +191,15 @@ class Selection(ReportMixin):
                 }
                 for t in self.trials
             ],
-            "identification": self.best.to_dict(),
             "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
 
     def __str__(self) -> str:
+        return f"{self.ranking_text()}\n\n{self.best}"
+
+    def ranking_text(self) -> str:
+        """Table of the candidates and the reason of the choice, as text."""
         lines = [f"{len(self.trials)} of {self.fitted} fitted candidates judged: {self.validation}"]
         lines.append(f"{'':2}{'unseen %':>9}{'least %':>9}{'fitted %':>10}{'numbers':>9}  structure")
         for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
@@ -196,8 +209,7 @@ class Selection(ReportMixin):
             lines.append("> " + _row(self.winner))
         if len(self.trials) > MAX_PRINTED_ROWS:
             lines.append(f"  … and {len(self.trials) - MAX_PRINTED_ROWS} more")
-        lines += [self.reason, *(f"warning: {w}" for w in self.warnings), "", str(self.best)]
-        return "\n".join(lines)
+        return "\n".join([*lines, self.reason, *(f"warning: {w}" for w in self.warnings)])
 
 
 def _row(trial: Trial) -> str:
