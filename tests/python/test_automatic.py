@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
+from typer.testing import CliRunner
 
 import ftlm
+from ftlm.cli.main import app
 
 
 def record(
@@ -57,3 +61,43 @@ def test_a_candidate_that_fails_is_a_row_with_its_reason(monkeypatch: pytest.Mon
     assert failed
     assert all(t.failed == "no finite simulation" for t in failed)
     assert found.winner.failed is None
+
+
+def test_a_given_delay_narrows_auto() -> None:
+    run, _ = record([7.0], [1.0, 4.0], seed=1, hold=20, late=6)
+    found = ftlm.select(run, "auto", delay={"u": 0.12}, threads=1)
+    assert all("u(t - 0.12 s)" in trial.name for trial in found.trials)
+    assert found.best.model.coefficients["a0"] == pytest.approx(-4.0, rel=0.05)
+    within = ftlm.select(run, "auto", delay={"u": (0.1, 0.16)}, threads=1)
+    assert all("u(t - 0.1:0.16 s)" in trial.name for trial in within.trials)
+    with pytest.raises(ftlm.ModelError, match="'v'"):
+        ftlm.select(run, "auto", delay={"v": 0.1})
+    with pytest.raises(ftlm.ModelError, match="delay= is used with 'auto'; give the delays"):
+        ftlm.select(run, ftlm.equation("D y = a y + b u"), delay={"u": 0.1})
+
+
+def test_identify_and_select_find_the_same_model_by_auto(tmp_path: Path) -> None:
+    run, _ = record([7.0], [1.0, 4.0], seed=1, hold=20, late=6)
+    run.to_csv(tmp_path / "motor.csv")
+    auto = ["-u", "u", "--structure", "auto", "--delay", "u=0.12", "--threads", "1", "-y", "y"]
+    words = [str(tmp_path / "motor.csv"), *auto]
+    chosen, fitted, instrumental = (
+        CliRunner().invoke(app, [name, *words, *more, "-o", str(tmp_path / f"{number}.json")])
+        for number, (name, *more) in enumerate(
+            [("select",), ("identify",), ("identify", "--method", "instrumental-variables")]
+        )
+    )
+    assert [chosen.exit_code, fitted.exit_code, instrumental.exit_code] == [0, 0, 0], fitted.output
+    assert "Chosen: D^1 y = a0 y + b0 u" in fitted.output
+    first, second, third = (ftlm.load_model(tmp_path / f"{k}.json") for k in range(3))
+    assert first.coefficients == second.coefficients
+    assert third.coefficients["a0"] == pytest.approx(first.coefficients["a0"], rel=0.02)
+    run.with_outputs({"z": run["y"] ** 2}).to_csv(tmp_path / "two.csv")
+    two = [str(tmp_path / "two.csv"), *auto, "-y", "z"]
+    assert "the outputs y, z" in CliRunner().invoke(app, ["identify", *two]).output
+    one = CliRunner().invoke(app, ["identify", *two, "--only", "y"])
+    assert one.exit_code == 0, one.output
+    assert one.output.splitlines()[0] == fitted.output.splitlines()[0]
+    wrong = CliRunner().invoke(app, ["identify", *words, "--orders", "alpha=1"])
+    assert wrong.exit_code == 2
+    assert "--orders: of a structure that is given, not used with --structure auto" in wrong.output

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.signal import butter, cont2discrete, lfilter
 from typer.testing import CliRunner
 
@@ -262,6 +263,76 @@ def test_the_reference_takes_the_bias_out():
             assert loop_codes(found) == (["loop_found"] if how == "measured" else [])
             assert found.fit.converged
     assert abs(np.mean(errors["r"])) < 0.5 * abs(np.mean(errors["measured"]))
+
+
+def test_a_noise_model_gives_the_least_prediction_errors():
+    # The oracle: exact recursions of a lag, prediction errors by differences of lagged residuals, scipy's optimum.
+    step, rows, rng = 0.1, 600, np.random.default_rng(3)
+    u, noise, y = np.zeros(rows), 0.3 * loops.coloured(rng, rows, 0.9), np.zeros(rows)
+    reference = np.repeat(rng.choice([-1.0, 1.0], rows // 20), 20)
+    for k in range(rows - 1):
+        u[k] = 4.0 * (reference[k] - y[k] - noise[k])
+        y[k + 1] = np.exp(-step) * y[k] + 2.0 * (1.0 - np.exp(-step)) * u[k]
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u, "r": reference}, outputs={"y": y + noise})
+    structure = ftlm.equation("D y = -a y + b u", initial="rest")
+
+    def errors(p: np.ndarray) -> np.ndarray:
+        simulated = lfilter([0.0, p[1] / p[0] * (1.0 - np.exp(-p[0] * step))], [1.0, -np.exp(-p[0] * step)], u)
+        v = run["y"] - simulated
+        # The last sample has a pulse on one side only.
+        return (v[1:] - p[2] * v[:-1])[:-1]
+
+    oracle = least_squares(errors, [1.0, 2.0, 0.9], x_scale=[1.0, 2.0, 1.0], xtol=1e-12, ftol=1e-12)
+    spread = np.linalg.inv(oracle.jac.T @ oracle.jac) * 2.0 * oracle.cost / (rows - 2)
+    found = ftlm.identify(run, structure, method=ftlm.OutputError(noise="ar"))
+    (colour,) = found.settings["noise_model"]
+    assert [found.coefficients["a"], found.coefficients["b"], -colour] == pytest.approx(list(oracle.x), rel=0.01)
+    for k, name in enumerate("ab"):
+        assert found.standard_errors[name] == pytest.approx(np.sqrt(spread[k, k]), rel=0.05)
+        assert abs(found.coefficients[name] - (1.0, 2.0)[k]) < 3.0 * found.standard_errors[name]
+    assert loop_codes(found) == []
+    assert "noise: autoregression of order 1" in found.details().replace("\n", " ")
+    with pytest.raises(ftlm.ModelError, match="noise='ar' has no profile"):
+        found.profile("a")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"reference": "r"}, "reference="), ({"intervals": "profile"}, "intervals="), ({"loss": "huber"}, "loss=")],
+)
+def test_a_noise_model_stands_alone(options, words):
+    with pytest.raises(ftlm.ModelError, match=f"noise='ar' is not used with {words}"):
+        ftlm.OutputError(noise="ar", **options)
+
+
+def test_a_noise_model_is_of_one_linear_output():
+    run = loops.loop("closed, coloured", 3, rows=200)
+    method, two = ftlm.OutputError(noise="ar"), run.with_outputs({"z": run["y"]})
+    with pytest.raises(ftlm.ModelError, match="one output, not of y, z"):
+        ftlm.identify(two, ftlm.equation("D y = -a y + b u; D z = -c z + d u"), method=method)
+    with pytest.raises(ftlm.ModelError, match="limits do not commute"):
+        ftlm.identify(run, ftlm.equation("D y = -a y + b u").with_limits(saturation={"u": (0.5, 1.0)}), method=method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["open, coloured", "closed, coloured, biased", "closed, coloured, strong"])
+def test_coverage_of_a_noise_model_beside_output_error_and_a_reference(kind):
+    methods = {
+        "white": ftlm.OutputError(intervals="quadratic"),
+        "ar": ftlm.OutputError(noise="ar"),
+        "reference": ftlm.OutputError(reference="r"),
+    }
+    apart: dict[str, list[list[float]]] = {name: [] for name in methods}
+    for seed in range(20):
+        run = loops.loop(kind, seed)
+        for name, method in methods.items():
+            found = ftlm.identify(run, STRUCTURE, method=method)
+            errors = [found.parameter_values[n] - truth for n, truth in loops.TRUTH.items()]
+            apart[name].append([e / found.standard_errors[n] for e, n in zip(errors, loops.TRUTH, strict=True)])
+    covered = {name: float(np.mean(np.abs(v) < 1.96)) for name, v in apart.items()}
+    print(kind, *(f"{name}: {100 * share:.0f} % within 95 % intervals" for name, share in covered.items()))
+    assert covered["ar"] >= 0.85
+    assert covered["ar"] >= covered["white"]
 
 
 def test_residuals_are_orthogonal_to_what_follows_the_reference():

@@ -23,6 +23,7 @@ BAD_VALUES = {
     "intervals": ("likelihood", "intervals = 'likelihood' is not known"),
     "start": (3.0, "start is float; give an identification, a model, or values by name"),
     "reference": (3, "reference is int, not the name of a signal of the runs"),
+    "noise": ("arma", "noise = 'arma' is not known; use 'white' or 'ar'"),
     "order_grid": ({"alpha": 1}, "is dict, not"),
     "criterion": ("error", "criterion = 'error' is not known"),
     "norm": ("l0", "norm = 'l0' is not known; use 'l1' or 'l2'"),

@@ -7,8 +7,10 @@ import pytest
 from scipy.signal import lsim, lti
 
 import ftlm
+from ftlm.estimation import model_checks
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.model_checks import multistart_findings
+from ftlm.estimation.objective import Objective
 
 RANDLES = "D^(alpha+0.5) U = a D^alpha U + b D^0.5 U + r D^(alpha+0.5) I + c D^alpha I + d D^0.5 I + e I"
 ARC = "D^alpha U = -a U + r D^alpha I + b I"
@@ -113,3 +115,23 @@ def test_one_optimum_is_not_reported_twice():
     for cost in (1.0, 1.2):
         again = replace(joint, survivors=[(1.0, list(joint.values)), (cost, far)])
         assert multistart_findings(again, problem, [run]) == []
+
+
+def test_second_optima_of_a_long_run_are_looked_for_on_its_first_part(monkeypatch):
+    g = np.random.default_rng(9)
+    u = np.repeat(g.choice([-1.0, 1.0], 1400), 10)
+    y = lsim(lti([3.0], [1.0, 2.0, 4.0]), u, 0.05 * np.arange(14000), interp=False)[1]
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y + 0.02 * g.standard_normal(14000)})
+    structure = ftlm.equation("D^2 y = a D y + c y + b u", initial="rest")
+    joint = ftlm.identify(run, structure).fit
+    lengths = []
+
+    class Counted(Objective):
+        def minimize(self, *arguments, **options):
+            lengths.append(self.runs[0].length)
+            return super().minimize(*arguments, **options)
+
+    monkeypatch.setattr(model_checks, "Objective", Counted)
+    again = replace(joint, survivors=[(1.0, list(joint.values)), (1.0, list(joint.values * 1.2))])
+    assert multistart_findings(again, FreeProblem.of(structure), [run]) == []
+    assert lengths == [6000, 6000]

@@ -73,6 +73,7 @@ from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection import select as choice
 from ftlm.structure_selection.automatic import IntegerOrderForm
+from ftlm.structure_selection.result import Selection
 from ftlm.structure_selection.select import automatic_output
 from ftlm.utils.files import COMMAND_MESSAGES, check_free
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
@@ -81,6 +82,57 @@ from ftlm.utils.validation import check_threads
 Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
 Estimator = Literal["instrumental-variables", "multi-innovation", "least-squares"]
 SavedStore = Annotated[str, Argument(metavar="STORE", help="Checkpoint file, written with --store.")]
+
+
+#: Range of a selection's duration relative to one fit per structure: from a list, and stepwise.
+LIST_TIME_FACTORS, STEPWISE_TIME_FACTORS = (1.0, 8.0), (1.5, 20.0)
+
+
+def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure | None:
+    """Return the first structure, None for ``auto``; raise for structures that are invalid whatever the runs are.
+
+    ``auto`` stands alone, with --delay and --only.
+    """
+    if "auto" not in texts:
+        parsed = [shape.structure(text) for text in texts]
+        return parsed[0]
+    if len(texts) > 1:
+        raise ModelError("--structure auto is searched by itself; leave the others out, or give them without it")
+    given = replace(shape, delay=None, only=None).given_options()
+    if given:
+        raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")
+    return None
+
+
+def select_structure(
+    runs: Sequence[Run],
+    candidates: str | Structure | Sequence[Structure],
+    shape: StructureOptions,
+    *,
+    validation: str | Sequence[Run] | None = None,
+    threads: int | None,
+    store: str | None = None,
+    quiet: bool,
+) -> Selection:
+    """Select a structure with a progress bar; ``"auto"`` takes the delays and the output of the options."""
+    automatic, listed = isinstance(candidates, str), isinstance(candidates, list)
+    if automatic and shape.only is not None:
+        runs = [run.select([shape.only, *run.inputs]) for run in runs]
+    tried = [candidates] if isinstance(candidates, Structure) else candidates
+    grown = [IntegerOrderForm(4, 3).structure(runs, automatic_output(runs))] if isinstance(tried, str) else tried
+    seconds = sum(fit_seconds(runs, one, threads) for one in grown)
+    with Progress("fitting candidates", quiet=quiet) as progress:
+        progress.expect("choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if listed else STEPWISE_TIME_FACTORS))
+        return choice.select(
+            runs,
+            candidates,
+            validation=validation,
+            delay=ranges("--delay", shape.delay) if automatic else None,
+            threads=threads,
+            # How many candidates come up turns with what earns its place.
+            progress=progress if listed else progress.so_far,
+            store=store,
+        )
 
 
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
@@ -94,7 +146,13 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
 def identify(
     *,
     files: Files,
-    structure: StructureText,
+    structure: Annotated[
+        str,
+        Option(
+            rich_help_panel=STRUCTURE_PANEL,
+            help="flexible-link:1|2|both, arm:1|2|both, an equation, or auto.",
+        ),
+    ],
     method: Annotated[Method, Option(rich_help_panel=METHOD_PANEL, help="Estimation method.")] = "output-error",
     reading: ReadingOptions,
     shape: StructureOptions,
@@ -116,27 +174,24 @@ def identify(
 ) -> None:
     """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
     check_free(out, report, force=force, words=COMMAND_MESSAGES)
-    equation = shape.structure(structure)
+    equation = check_structures([structure], shape)
     given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
     given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
     given |= {} if fit.start is None else {"start": load_model(fit.start)}
     chosen = method_with_options(method, given)
     runs = reading.runs(files, equation)
-    wanted = shape.structure_for_runs(structure, runs)
     # The window is of the runs that are identified from.
     others = replace(reading, window=None).runs([validation], equation) if validation is not None else []
+    selection = select_structure(runs, "auto", shape, threads=threads, quiet=as_json) if structure == "auto" else None
+    wanted = shape.structure_for_runs(structure, runs) if selection is None else selection.structure
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(ranking.store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
             progress.expect("the fit", *duration_bounds(fit_seconds(runs, wanted, threads)))
-        result = estimation.identify(
-            runs,
-            wanted,
-            method=chosen,
-            m=m,
-            threads=threads,
-            progress=progress,
-        )
+        if selection is not None and chosen == OutputError() and m is None:
+            result = selection.best
+        else:
+            result = estimation.identify(runs, wanted, method=chosen, m=m, threads=threads, progress=progress)
     if out is not None:
         result.model.save(out, force=force)
     if report is not None:
@@ -145,9 +200,15 @@ def identify(
     checked = result.validate(others) if others else None
     if as_json:
         judged = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
-        show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
+        chosen_from = {} if selection is None else {"selection": selection.ranking_dict()}
+        found = {**judged, **result.to_dict(), **chosen_from}
+        show_json({**found, "validation": None if checked is None else checked.to_dict()})
         return
+    if selection is not None:
+        print_text("\n".join([selection.reason, *(f"! {w}" for w in selection.warnings), ""]))
     print_text(result.summary(checked))
+    if verbose and selection is not None:
+        print_text(f"\n{selection.ranking_text()}")
     if verbose:
         print_text(f"\n{result.details()}")
     if verbose and checked is not None:
@@ -453,10 +514,6 @@ def identify_frequency(
         print_text("\n".join(f"warning: {w}" for w in result.warnings))
 
 
-#: Range of a selection's duration relative to one fit per structure: from a list, and stepwise.
-LIST_TIME_FACTORS, STEPWISE_TIME_FACTORS = (1.0, 8.0), (1.5, 20.0)
-
-
 @command
 def select(
     *,
@@ -481,31 +538,17 @@ def select(
 ) -> None:
     """Select terms and orders that improve the score on validation data."""
     check_free(out, report, force=force, words=COMMAND_MESSAGES)
-    if "auto" in structures and len(structures) > 1:
-        raise ModelError("--structure auto is searched by itself; leave the others out, or give them without it")
-    if structures == ["auto"]:
-        given = shape.given_options()
-        if given:
-            raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")
-        candidates: str | Structure | list[Structure] = "auto"
-    parsed = [] if structures == ["auto"] else [shape.structure(text) for text in structures]
-    equation = parsed[0] if parsed else None
+    equation = check_structures(structures, shape)
     runs = reading.runs(files, equation)
-    if structures != ["auto"]:
-        made = [shape.structure_for_runs(text, runs) for text in structures]
-        candidates = made[0] if len(made) == 1 else made
+    made = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
+    candidates = "auto" if not made else made[0] if len(made) == 1 else made
     # The window is of the runs that are fitted to.
     of_its_own = validation not in (None, "runs", "blocks")
     judges = replace(reading, window=None).runs([str(validation)], equation) if of_its_own else validation
-    with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
-        tried = [candidates] if isinstance(candidates, Structure) else candidates
-        grown = [IntegerOrderForm(4, 3).structure(runs, automatic_output(runs))] if isinstance(tried, str) else tried
-        seconds = sum(fit_seconds(runs, one, threads) for one in grown)
-        listed = isinstance(candidates, list)
-        progress.expect("choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if listed else STEPWISE_TIME_FACTORS))
-        # How many candidates come up turns with what earns its place.
-        told = progress if listed else progress.so_far
-        found = choice.select(runs, candidates, validation=judges, threads=threads, progress=told, store=store)
+    with resumable(store, "the same command"):
+        found = select_structure(
+            runs, candidates, shape, validation=judges, threads=threads, store=store, quiet=as_json
+        )
     if out is not None:
         found.best.model.save(out, force=force)
     if report is not None:

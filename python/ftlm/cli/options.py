@@ -342,7 +342,7 @@ class OutputErrorOptions:
     """Options of the output-error method; None for an option that is not given."""
 
     panel: ClassVar[str] = METHOD_PANEL
-    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference")
+    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference", "noise")
 
     loss: Loss = None
     intervals: Annotated[
@@ -352,6 +352,9 @@ class OutputErrorOptions:
     start: Annotated[Text, Option(metavar="MODEL", help="Saved model as an additional initial guess.")] = None
     reference: Annotated[
         Text, Option(metavar="SIGNAL", help="Reference signal of a closed loop; also name it with -u.")
+    ] = None
+    noise: Annotated[
+        Literal["white", "ar"] | None, Option(help="Noise of the output; ar: an autoregression; default white.")
     ] = None
 
 

@@ -199,6 +199,8 @@ def result_profiles(
             f"a fit with {parameter('reference')} is where residuals are orthogonal to instruments, and no minimum "
             "of a cost: it has no profile; use its standard errors"
         )
+    if "noise_model" in result.settings:
+        raise ModelError(f"a fit with {parameter('noise', 'ar')} has no profile; use its standard errors")
     if result.fit is None or result.task is None:
         raise ModelError(
             f"method {result.method!r} has no likelihood to profile; identify by {parameter('method', 'output-error')}"

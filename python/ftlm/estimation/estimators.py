@@ -219,13 +219,9 @@ def estimate_output_error(
         # The first value alone would tell a comparison otherwise.
         structure = asked = replace(structure, initial="history")
         findings.append(make_finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
-    orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
+    coefficients = problem.coefficients_by_name(list(joint.coefficients.values()))
     # On another run the start is resolved anew.
-    identified = asked.with_orders(joint.orders).with_coefficients(problem.coefficients_by_name(coefficients))
-    moved = problem.number_jacobian(orders, coefficients)
-    with np.errstate(invalid="ignore", over="ignore"):
-        # Of directions that the runs do not see covariances are no numbers, or beyond them; then none is given.
-        spread = moved @ joint.covariance @ moved.T
+    identified = asked.with_orders(joint.orders).with_coefficients(coefficients)
     return Fit(
         Task(task.runs, structure),
         "output-error",
@@ -244,8 +240,17 @@ def estimate_output_error(
         },
         findings,
         joint=joint,
-        covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
+        covariance=number_covariance(joint, problem),
     )
+
+
+def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
+    """Return the covariance of the numbers of a model; None where a direction is not identifiable."""
+    moved = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
+    with np.errstate(invalid="ignore", over="ignore"):
+        # Of directions that the runs do not see covariances are no numbers, or beyond them.
+        spread = moved @ joint.covariance @ moved.T
+    return tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None
 
 
 def estimate_order_search(

@@ -41,7 +41,7 @@ from ftlm.estimation.nuisance_parameters import (
 from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import WHOLE_RUN_CODES, unstable_plant_findings
-from ftlm.estimation.verdict import is_buried, result_findings
+from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
 from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
@@ -386,7 +386,7 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
     }
     runs = fit.task.runs
     plain = not fit.task.structure.has_friction and all(run.sample_times is None for run in runs)
-    if fit.joint is None or not fed or "reference" in fit.settings or not plain:
+    if fit.joint is None or not fed or has_loop_noise_model(fit.settings) or not plain:
         return tests
     answers = [
         run_with_inputs(run, {n: run[n] - np.pad(v[k], 1) for n, v in fed.items()}) for k, run in enumerate(runs)
@@ -404,8 +404,8 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
 
 def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     """Return findings of failed residual tests; a joint fit already reports colored residuals."""
-    if "reference" in fit.settings:
-        # The loop is known, and its noise is no part of what the model was estimated from.
+    if has_loop_noise_model(fit.settings):
+        # The loop is known, or its noise is; it is no part of what the model was estimated from.
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return residual_findings(tests)

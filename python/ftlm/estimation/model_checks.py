@@ -64,6 +64,9 @@ SAME_MODEL_POWER = 1e-2
 MAX_SECOND_COST_RATIO = 1.05
 #: Largest number of evaluations from a candidate to its optimum.
 MAX_SECOND_EVALUATIONS = 60
+#: Samples of the first parts of all runs, on which second optima of longer records are looked for first, and fewest of
+#: one run.
+MAX_SECOND_SAMPLES, MIN_SECOND_RUN_SAMPLES = 6000, 1000
 #: Largest relative deviation of two coefficients from the coefficient law.
 MAX_LAW_DEVIATION = 0.05
 
@@ -150,24 +153,41 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
     if not far or joint.robust is not None or problem.structure.has_friction:
         return []
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
-    grid = Objective(problem, runs, weights, every=joint.refinement)
+    first = max(MAX_SECOND_SAMPLES // len(runs), MIN_SECOND_RUN_SAMPLES)
+    parts = [run.window(0.0, first * run.step) if run.length > 2 * first else run for run in runs]
+    optima = [(values, 0.0) for values in far]
+    # An optimum that is another one on all samples is one on the first part, too, where it costs less to find.
+    for some in [parts, runs] if any(part is not run for part, run in zip(parts, runs, strict=True)) else [runs]:
+        grid = Objective(problem, some, weights, every=joint.refinement)
+        optima = _other_optima(grid, joint.values, [values for values, _ in optima]) if optima else []
+    own = joint.standard_errors
+    return second_optimum_findings(joint.names, joint.values, own, [(values, fall, own) for values, fall in optima])
+
+
+def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
+    """Return the optima from some starts that are models of their own and almost as likely as that from the best one.
+
+    Each comes with the fall of the log likelihood.
+    """
 
     def fit(values: Floats) -> tuple[Floats, float, Floats]:
-        orders, coefficients, inputs = problem.split(values.tolist())
-        end = grid.minimize(Iterate(orders, coefficients, "second optimum", {}, inputs), MAX_SECOND_EVALUATIONS)
+        orders, coefficients, inputs = grid.problem.split(values.tolist())
+        start = Iterate(orders, coefficients, "second optimum", {}, inputs)
+        end = grid.minimize(start, MAX_SECOND_EVALUATIONS, plain=True)
         return end.values, float(end.outcome["cost"]), np.asarray(end.outcome["residuals"])
 
     optima = []
     try:
-        _, cost, residuals = fit(joint.values)
-        for values in far:
-            other, there, left = fit(values)
-            if float(np.sum((left - residuals) ** 2)) > SAME_MODEL_POWER:
-                optima.append((other, there - cost, joint.standard_errors))
+        _, cost, residuals = fit(best)
+        for start in starts:
+            values, there, left = fit(start)
+            is_other = float(np.sum((left - residuals) ** 2)) > SAME_MODEL_POWER
+            if is_other and there - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
+                optima.append((values, there - cost))
     except FtlmError:
         # No finite simulation on the way.
         return []
-    return second_optimum_findings(joint.names, joint.values, joint.standard_errors, optima)
+    return optima
 
 
 def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:

@@ -32,6 +32,7 @@ from ftlm.utils.statistics import NORMAL_95, estimate_noise
 from ftlm.utils.validation import Floats
 
 Loss = Literal["squares", "huber"]
+Noise = Literal["white", "ar"]
 
 
 @dataclass(frozen=True)

@@ -356,7 +356,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
         if not any(f.code == "plant_unstable_in_pieces" for f in result.findings):
             yield make_finding("too_short_for_tests")
         return
-    looped = "reference" in result.settings
+    looped = has_loop_noise_model(result.settings)
     judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
     # A model that is wrong leaves what a periodic input repeats, which looks like a loop: first what it lacks.
     coupled = [f for f in result.findings if f.code == "coupling_missing" and f.output in judged]
@@ -374,6 +374,11 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]
     yield from (make_finding("residuals_not_white", output=o) for o in coloured)
+
+
+def has_loop_noise_model(settings: Mapping[str, Any]) -> bool:
+    """Whether a fit is consistent in a closed loop: by a reference signal, or by a noise model."""
+    return "reference" in settings or "noise_model" in settings
 
 
 def _is_uncertain(result: Identification, name: str) -> bool:

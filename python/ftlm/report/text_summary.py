@@ -213,6 +213,7 @@ def settings_text(settings: Mapping[str, Any]) -> str:
     words += f", initial terms: {settings['initial']}"
     words += f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
     words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
+    words += f", noise: autoregression of order {len(settings['noise_model'])}" if "noise_model" in settings else ""
     return words + (
         f", instrument: what of the inputs follows {settings['reference']}" if "reference" in settings else ""
     )
@@ -248,6 +249,8 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         rows.append(["offset of each equation", f"{settings['offset']}, estimated for each run"])
     if "offset_test" in settings:
         rows.append(["offset found by test", settings["offset_test"]])
+    if "noise_model" in settings:
+        rows.append(["noise", f"autoregression of order {len(settings['noise_model'])}, estimated with the model"])
     if "reference" in settings:
         rows.append(["reference", f"{settings['reference']}; instrument: what of the inputs follows it"])
     if searched:

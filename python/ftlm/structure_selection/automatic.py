@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import TypeAlias
 
 from ftlm.data.run import Run
 from ftlm.estimation.output_error import JointFit
@@ -31,6 +33,10 @@ FRACTIONAL_DAMPING_ORDER = 2
 #: Orders at which fractional forms start.
 INITIAL_FRACTIONAL_ORDERS = (0.5, 0.8, 1.2, 1.7)
 
+#: Delay of inputs by name [s]: a number, or (lower, upper) of one to estimate.
+Delays: TypeAlias = Mapping[str, float | tuple[float, float]]
+NO_DELAYS: Delays = MappingProxyType({})
+
 
 @dataclass(frozen=True)
 class IntegerOrderForm:
@@ -56,8 +62,8 @@ class IntegerOrderForm:
     integrator: bool = False
     offset: str = "none"
 
-    def structure(self, runs: Sequence[Run], output: str) -> Structure:
-        """Return the structure of the form for one output of runs."""
+    def structure(self, runs: Sequence[Run], output: str, delays: Delays = NO_DELAYS) -> Structure:
+        """Return the structure of the form for one output of runs, with given delays as :func:`delays_of_inputs`."""
         names = list(runs[0].inputs)
         powers = range(self.order - 1, int(self.integrator) - 1, -1)
         own = [f"a{k} {_derivative(k, output)}" for k in powers]
@@ -65,7 +71,7 @@ class IntegerOrderForm:
             f"b{_number(names, name)}{k} {_derivative(k, name)}" for name in names for k in range(self.zeros, -1, -1)
         ]
         text = f"{_derivative(self.order, output)} = {' + '.join([*own, *driving])}"
-        return equation(text, delay=delay_intervals(runs) if self.delayed else None, offset=self.offset)
+        return equation(text, delay=delays_of_inputs(runs, delays, delayed=self.delayed), offset=self.offset)
 
 
 def _derivative(order: int, name: str) -> str:
@@ -77,10 +83,16 @@ def _number(names: Sequence[str], name: str) -> str:
     return f"{names.index(name) + 1}_" if len(names) > 1 else ""
 
 
-def delay_intervals(runs: Sequence[Run]) -> dict[str, tuple[float, float]]:
-    """Return intervals [s] of the delays of all inputs."""
+def delays_of_inputs(runs: Sequence[Run], given: Delays, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
+    """Return the delays [s] of inputs: a number, or an interval of one to estimate.
+
+    Given delays precede those of all inputs of a delayed form. A form that is not delayed has the given ones that 0
+    is none of.
+    """
+    if not delayed:
+        return {n: d for n, d in given.items() if (d[0] if isinstance(d, tuple) else d) > 0.0}
     longest = min(min(MAX_DELAY_SAMPLES, run.length * MAX_DELAY_SHARE) * run.step for run in runs)
-    return dict.fromkeys(runs[0].inputs, (0.0, longest))
+    return {**dict.fromkeys(runs[0].inputs, (0.0, longest)), **given}
 
 
 @dataclass(frozen=True)
@@ -105,11 +117,14 @@ class AutomaticSelection:
         The output.
     evaluator
         Evaluator of the candidates.
+    delays
+        Given delays.
     """
 
     runs: Sequence[Run]
     output: str
     evaluator: CandidateEvaluator
+    delays: Delays = field(default_factory=dict)
 
     def run(self) -> list[Trial]:
         """Fit the candidates and validate the best; return all trials in order."""
@@ -122,7 +137,9 @@ class AutomaticSelection:
 
     def _fit(self, forms: Sequence[IntegerOrderForm]) -> list[FittedForm]:
         """Fit forms, best first; a form that cannot be fitted becomes a failed trial."""
-        return self._fit_structures([(f.structure(self.runs, self.output), f, []) for f in dict.fromkeys(forms)])
+        return self._fit_structures(
+            [(f.structure(self.runs, self.output, self.delays), f, []) for f in dict.fromkeys(forms)]
+        )
 
     def _fit_structures(
         self, items: Sequence[tuple[Structure, IntegerOrderForm | None, list[dict[str, float]]]]
@@ -176,10 +193,13 @@ class AutomaticSelection:
 
     def _is_delayed(self, fits: Sequence[FittedForm], offset: str) -> bool:
         """Whether a delay lowers the criterion of a low order without or with a zero."""
+        plain, late = (delays_of_inputs(self.runs, self.delays, delayed=d) for d in (False, True))
+        if plain == late:
+            return False
         probes = self._fit([IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])
         for probe in probes:
-            plain = [f.bic for f in fits if probe.form is not None and f.form == replace(probe.form, delayed=False)]
-            if probe.bic < min(plain, default=math.inf) - MIN_BIC_DECREASE:
+            known = [f.bic for f in fits if probe.form is not None and f.form == replace(probe.form, delayed=False)]
+            if probe.bic < min(known, default=math.inf) - MIN_BIC_DECREASE:
                 return True
         return False
 
@@ -213,22 +233,26 @@ class AutomaticSelection:
         if form.order == FRACTIONAL_DAMPING_ORDER:
             texts[f"D^2 {y} = a1 D^mu {y} + a0 {y} + {driving}"] = (2.0,)
 
-        def start(text: str, alpha: float, delays: Mapping[str, float]) -> dict[str, float]:
-            structure = equation(text, offset=form.offset)
+        def structure(text: str, *, delayed: bool = False) -> Structure:
+            delays = delays_of_inputs(self.runs, self.delays, delayed=delayed)
+            return equation(text, delay=delays, offset=form.offset)
+
+        late = {} if best is None else {n: v for n, v in values_of(best.joint).items() if n.startswith("delay_")}
+
+        def start(of: Structure, alpha: float) -> dict[str, float]:
             known = {"a0": -(frequency**alpha), "a1": -0.3 * frequency ** (alpha - 0.5), "alpha": alpha, "mu": 0.5}
             # The coefficients of the inputs are eliminated at every iterate.
-            gains = dict.fromkeys(structure.coefficient_names, frequency**alpha)
-            names = (*structure.order_names, *structure.coefficient_names)
-            return {n: v for n, v in {**gains, **known}.items() if n in names} | dict(delays)
+            gains = dict.fromkeys(of.coefficient_names, frequency**alpha)
+            delays = {i.name: late.get(i.name, i.bounds[0]) for i in of.free_inputs}
+            names = (*of.order_names, *of.coefficient_names)
+            return {n: v for n, v in {**gains, **known}.items() if n in names} | delays
 
-        found = self._fit_structures(
-            [(equation(t, offset=form.offset), None, [start(t, a, {}) for a in orders]) for t, orders in texts.items()]
-        )
-        if form.delayed and found and best is not None:
-            text = next(t for t in texts if equation(t, offset=form.offset) == found[0].structure)
-            delays = {n: v for n, v in values_of(best.joint).items() if n.startswith("delay_")}
-            begin = [{**values_of(found[0].joint), **delays}, *(start(text, a, delays) for a in texts[text])]
-            delayed = equation(text, delay=delay_intervals(self.runs), offset=form.offset)
+        items = [(structure(t), orders) for t, orders in texts.items()]
+        found = self._fit_structures([(s, None, [start(s, a) for a in orders]) for s, orders in items])
+        if form.delayed and found:
+            text = next(t for t in texts if structure(t) == found[0].structure)
+            delayed = structure(text, delayed=True)
+            begin = [{**late, **values_of(found[0].joint)}, *(start(delayed, a) for a in texts[text])]
             found += self._fit_structures([(delayed, None, begin)])
         return sorted(found, key=lambda f: f.bic)
 

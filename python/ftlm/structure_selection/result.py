@@ -13,6 +13,7 @@ from ftlm.estimation.verdict import Validation, Verdict
 from ftlm.findings import Finding, texts
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter
+from ftlm.structure.structure import Structure
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
@@ -49,6 +50,8 @@ class Selection(ReportMixin):
         Total number of fitted candidates. Only the most promising ones of each step are validated.
     findings
         Findings against the choice.
+    validated
+        Comparison of the identification with separate validation runs; None if runs or blocks were left out in turn.
     """
 
     trials: tuple[Trial, ...]
@@ -58,6 +61,7 @@ class Selection(ReportMixin):
     reason: str
     fitted: int
     findings: tuple[Finding, ...] = field(default=())
+    validated: Validation | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -81,8 +85,8 @@ class Selection(ReportMixin):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on the model; :meth:`validate` returns the one that includes other runs."""
-        return self.best.verdict
+        """Verdict on the model, with separate validation runs if there were any; see also :meth:`validate`."""
+        return self.best.verdict if self.validated is None else self.validated.verdict
 
     @property
     def fit_percent(self) -> dict[str, float]:
@@ -101,6 +105,11 @@ class Selection(ReportMixin):
     def winner(self) -> Trial:
         """The chosen candidate."""
         return self.trials[self.chosen]
+
+    @property
+    def structure(self) -> Structure:
+        """The chosen structure with the initial terms of its validation; it identifies ``best``."""
+        return self.winner.structure if self.best.task is None else self.best.task.structure
 
     def _rows(self) -> list[list[Cell]]:
         out: list[list[Cell]] = []
@@ -174,7 +183,7 @@ class Selection(ReportMixin):
                 figures=[self.figure()],
             ),
             Section("Candidates", tables=[self.table()]),
-            Section("The chosen structure on all runs", paragraphs=str(self.best).splitlines()),
+            Section("The chosen structure on all runs", paragraphs=self.best.summary(self.validated).splitlines()),
         ]
         return Page("Selection of a structure", sections, self.winner.name)
 
@@ -199,6 +208,10 @@ class Selection(ReportMixin):
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
+        return {**self.ranking_dict(), "identification": self.best.to_dict()}
+
+    def ranking_dict(self) -> dict[str, Any]:
+        """For JSON, without the identification."""
         return {
             "chosen": self.winner.name,
             "reason": self.reason,
@@ -220,12 +233,15 @@ class Selection(ReportMixin):
                 }
                 for t in self.trials
             ],
-            "identification": self.best.to_dict(),
             "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
 
     def __str__(self) -> str:
+        return f"{self.ranking_text()}\n\n{self.best}"
+
+    def ranking_text(self) -> str:
+        """Table of the candidates and the reason of the choice, as text."""
         lines = [f"{len(self.trials)} of {self.fitted} fitted candidates judged: {self.validation}"]
         lines.append(f"{'':2}{'unseen %':>9}{'least %':>9}{'fitted %':>10}{'numbers':>9}  structure")
         for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
@@ -235,8 +251,7 @@ class Selection(ReportMixin):
             lines.append("> " + _row(self.winner))
         if len(self.trials) > MAX_PRINTED_ROWS:
             lines.append(f"  … and {len(self.trials) - MAX_PRINTED_ROWS} more")
-        lines += [self.reason, *(f"warning: {w}" for w in self.warnings), "", str(self.best)]
-        return "\n".join(lines)
+        return "\n".join([*lines, self.reason, *(f"warning: {w}" for w in self.warnings)])
 
 
 def _row(trial: Trial) -> str:

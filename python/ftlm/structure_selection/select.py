@@ -19,7 +19,7 @@ from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degene
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.structure import Structure
-from ftlm.structure_selection.automatic import AutomaticSelection, IntegerOrderForm, is_fractional
+from ftlm.structure_selection.automatic import AutomaticSelection, Delays, IntegerOrderForm, is_fractional
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
 from ftlm.structure_selection.cross_validation import Folds, Trial, scatter_factor, schwarz_criterion
@@ -84,6 +84,7 @@ def select(
     candidates: str | Structure | Sequence[Structure] | Mapping[str, Structure],
     *,
     validation: str | Run | Sequence[Run] | None = None,
+    delay: Delays | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     store: str | os.PathLike[str] | None = None,
@@ -115,6 +116,9 @@ def select(
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
         quarter of every run by a fit on the rest, the default for one run. Or separate validation runs.
+    delay
+        With ``"auto"``: the delay of inputs by name [s], a number or (lower, upper) bounds of one to estimate. By
+        default no delay and delays of up to 60 samples are compared.
     threads
         Number of candidates fitted concurrently, by default all cores; the result does not depend on it.
     progress
@@ -173,7 +177,10 @@ def select(
         raise ModelError(
             f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
         )
-    automatic = [] if output is None else [IntegerOrderForm(2, 1).structure(folds.runs, output)]
+    if delay and output is None:
+        raise ModelError(f"{parameter('delay')} is used with 'auto'; give the delays to ftlm.equation instead")
+    delays = dict(delay or {})
+    automatic = [] if output is None else [IntegerOrderForm(2, 1, bool(delay)).structure(folds.runs, output, delays)]
     for structure in (*searched, *every.values(), *automatic):
         # Refused here, once, and not as a failure of every candidate.
         prepare(
@@ -184,19 +191,23 @@ def select(
             gaps=True,
         )
     if store is None:
-        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, output)
+        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, output, delays)
     judges = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
     asked = Request.of(folds.runs, [searched, every, *automatic], judges, folds.description)
     with Store(store, asked) as kept:
-        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every, output)
+        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every, output, delays)
 
 
 def _run_selection(
-    work: CandidateEvaluator, searched: Sequence[Structure], every: Mapping[str, Structure], output: str | None
+    work: CandidateEvaluator,
+    searched: Sequence[Structure],
+    every: Mapping[str, Structure],
+    output: str | None,
+    delays: Delays,
 ) -> Selection:
     """Evaluate nested and listed structures, or automatic ones of an output, and choose."""
     if output is not None:
-        AutomaticSelection(work.folds.runs, output, work).run()
+        AutomaticSelection(work.folds.runs, output, work, delays).run()
     for structure in searched:
         select_stepwise(NestedStructures(structure), work)
     if every:
@@ -246,6 +257,7 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
     if worse:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
     findings += _fractional_order_findings(winner, ranked, found)
+    unseen = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
     return Selection(
         tuple(ranked),
         ranked.index(winner),
@@ -254,6 +266,7 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
         _reason(winner, best, ranked) + words,
         work.done_count,
         tuple(findings),
+        None if not unseen else found.validate(unseen),
     )
 
 
@@ -409,7 +422,7 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
         more = best.parameters - winner.parameters
         lead += (
             f", which leaves {100 * (math.exp(winner.score - best.score) - 1):.2g} % more than the best prediction"
-            + (f" with {more} numbers fewer" if more > 0 else "")
+            + (f" with {more} number{'s' * (more > 1)} fewer" if more > 0 else "")
             + " and has the least Schwarz criterion of those that predict alike"
         )
     for word, others in (
