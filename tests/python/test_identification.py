@@ -330,10 +330,24 @@ def test_a_prior_that_pulls_is_named(small_run, structure):
     assert weakest.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
 
 
+def test_a_prior_that_decides_the_ranking_is_named(small_run):
+    free = ftlm.equation("D^alpha y = a0 y + b u", initial="rest")
+    grid = ftlm.order_grid(increment=0.2)
+    strong = ftlm.identify(small_run, free, method=ftlm.MultiInnovation(prior_covariance=1e-4, order_grid=grid), m=256)
+    (finding,) = (f for f in strong.findings if f.code == "prior_ranks")
+    assert finding.text.startswith(
+        "y: the prior decides which orders lead: with K0 = 0.0001 the best candidate leaves "
+    )
+    for usual in (None, 1e8):
+        method = ftlm.MultiInnovation(prior_covariance=usual, order_grid=grid)
+        found = ftlm.identify(small_run, free, method=method, m=256)
+        assert not [f for f in found.findings if f.code in ("prior_ranks", "prior_pulls")]
+
+
 def test_the_papers_prior_on_plant_a_is_named(clean_a, plants):
     # K0 = 1 in SI units: a1 = 1.25 for 629. The paper's columns show the same pull.
     structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
-    found = ftlm.identify(clean_a, structure, method="multi-innovation")
+    found = ftlm.identify(clean_a, structure, method=ftlm.MultiInnovation(prior_covariance=1.0))
     assert found.settings["m"] == 2048
     assert found.coefficients["a1"] == pytest.approx(1.25, abs=0.01)
     for output in ("theta11", "theta12"):
