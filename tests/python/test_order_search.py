@@ -778,7 +778,7 @@ def test_settings_state_what_matters_and_nothing_else():
         "norm": "l1",
         "coefficients": "multi-innovation",
         "innovation_length": 7,
-        "prior_covariance": 1.0,
+        "prior_covariance": None,
         "row_basis": "haar",
     }
     plain = replace(made, coefficients="least-squares")
