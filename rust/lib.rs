@@ -17,25 +17,29 @@
 //!    [`signal::statistics`]: residual analysis.
 //!
 //! ```
-//! use ftlm::equation::{Equation, Initial, Structure, Term};
-//! use ftlm::estimation::least_squares;
-//! use ftlm::regressors::Record;
-//! use ftlm::simulate;
+//! use ftlm::prelude::*;
 //!
-//! # fn main() -> ftlm::error::Result<()> {
-//! // D^1.5 y = −4 D^0.5 y + 2 u, driven by a square wave.
-//! let terms = vec![Term { signal: 0, order: 0.5 }, Term { signal: 1, order: 0.0 }];
-//! let plant = Equation::new(Structure { output: 0, order: 1.5, terms }, vec![-4.0, 2.0])?;
-//! let input: Vec<f64> = (0..400).map(|k| if k % 100 < 50 { 1.0 } else { -1.0 }).collect();
-//! let driven = Record::new(0.01, vec![vec![0.0; 400], input.clone()], None)?;
-//! let output = simulate::respond(std::slice::from_ref(&plant), &driven, &[])?.remove(0);
-//!
-//! let run = Record::new(0.01, vec![output, input], None)?;
-//! let found = least_squares::fit(&[run], &plant.structure, &[None, None], &Initial::Rest)?;
-//! assert!((found.coefficients[0] + 4.0).abs() < 1e-9);
+//! # fn main() -> Result<()> {
+//! # let (step, mut y) = (0.05, vec![0.0]);
+//! # let u: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
+//! # let fall = f64::exp(-2.0 * step);
+//! # u.iter().for_each(|u| y.push(fall * y[y.len() - 1] + 1.5 * (1.0 - fall) * u));
+//! # y.pop();
+//! // Samples y and u of D y = −2 y + 3 u, fitted by D^alpha y = a y + b u.
+//! let y = Channel::new("y", y, Role::Output);
+//! let u = Channel::new("u", u, Role::Input(Intersample::Hold));
+//! let run = Recording::from_channels(step, vec![y, u])?;
+//! let equation = Equation::new(0, Order::free("alpha"))
+//!     .with_term("a", Order::number(0.0), 0)
+//!     .with_term("b", Order::number(0.0), 1);
+//! let found = fit_equations(vec![run], vec![equation])?;
+//! assert!((found.values["alpha"] - 1.0).abs() < 1e-2 && (found.values["a"] + 2.0).abs() < 1e-2);
 //! # Ok(())
 //! # }
 //! ```
+//!
+//! A [`recording::Recording`] holds samples, a [`regressors::Record`] holds means over pulses. Samples in place of means
+//! would bias every estimate.
 //!
 //! # Features
 //!
@@ -74,6 +78,15 @@ pub mod recording;
 
 #[cfg(feature = "rig")]
 pub mod rig;
+
+/// Types for a fit of measured columns.
+pub mod prelude {
+    pub use crate::error::{Error, Result};
+    pub use crate::estimation::joint_fit::structure::{Equation, Order};
+    pub use crate::estimation::joint_fit::{fit_equations, EquationFit};
+    pub use crate::recording::{Channel, Recording, Role};
+    pub use crate::signal::block_pulse::Intersample;
+}
 
 #[cfg(feature = "python")]
 mod python;

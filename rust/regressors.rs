@@ -12,6 +12,7 @@ use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::fractional::kernels::{kernel, power_means, power_pulses};
 use crate::parallel::{self, Stop};
 use crate::series::{self, Buffers, Kernel};
+use crate::signal::block_pulse::{pulse_means, Intersample};
 
 /// Memory limit of a single bank, and default limit of a search, in bytes.
 pub const BANK_LIMIT: u64 = 2 << 30;
@@ -62,6 +63,26 @@ impl Record {
             deviations: Vec::new(),
             impulse_responses: Vec::new(),
         })
+    }
+
+    /// Record of the pulse means of sampled signals, one pulse a sampling interval.
+    ///
+    /// # Errors
+    /// As [`Record::new`] and [`pulse_means`].
+    ///
+    /// ```
+    /// # use ftlm::regressors::Record;
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// let (y, u) = ([0.0, 1.0, 3.0], [2.0, 4.0, 0.0]);
+    /// let record = Record::from_samples(0.1, &[(&y, Intersample::Linear), (&u, Intersample::Hold)])?;
+    /// assert_eq!((record.signal(0), record.signal(1)), (&[0.5, 2.0][..], &[2.0, 4.0][..]));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn from_samples(step: f64, signals: &[(&[f64], Intersample)]) -> Result<Self> {
+        let means = |(samples, between): &(&[f64], Intersample)| {
+            pulse_means(samples, samples.len().saturating_sub(1), *between)
+        };
+        Self::new(step, signals.iter().map(means).collect::<Result<_>>()?, None)
     }
 
     /// Add a low-noise substitute of every signal, for instrumental variables.

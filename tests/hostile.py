@@ -105,9 +105,6 @@ class Sound:
 
     # ------------------------------------------------------------------------------------------ kernels and transforms
 
-    def block_pulse_kernel(self):
-        return self.order(), self.m(), self.step(), {"derivative": self.one(True, False)}
-
     def block_pulse_kernels(self):
         return np.array([self.order(), self.order()]), self.m(), self.step(), {"derivative": self.one(True, False)}
 
@@ -163,10 +160,6 @@ class Sound:
 
     # ---------------------------------------------------------------------------------------------- samples to records
 
-    def pulse_means(self):
-        m = self.m()
-        return self.samples(m * self.one(1, 2, 3) + 1), m, self.one(True, False)
-
     def pulse_mean_rows(self):
         m = self.m()
         return self.normal((self.one(1, 2), m * self.one(1, 2) + 1)), m, self.one(True, False)
@@ -218,7 +211,7 @@ class Sound:
     def terms(self):
         return self.one((True, []), (False, []), (False, [0.0]), (True, [], 1), (False, [0.0, 1.0], 2))
 
-    def multi_innovation_estimate(self):
+    def multi_innovation_rows(self):
         count, problems, width = self.one(8, 16), self.one(1, 2), self.one(1, 3)
         q, m = self.normal((count * problems, width)), self.normal(count * problems)
         return q, m, count, self.one(1, 3, 7), [self.number(0.1, 9.0) for _ in range(width)], self.one(True, False)
@@ -563,7 +556,16 @@ class Sound:
 
     def streaming_new(self):
         structure = (0, 1.6, [(0, 0.0), (2, 0.0)])
-        return 0.01, 64, list(self.INPUTS), [(structure, self.fixed(structure))], self.one(1, 3), 1e3
+        return (
+            0.01,
+            64,
+            list(self.INPUTS),
+            [(structure, self.fixed(structure))],
+            self.one(1, 3),
+            self.one(None, 1e3),
+            0.99,
+            (True, []),
+        )
 
     def streaming_push(self):
         stream = self.one_of("Streaming")
@@ -877,7 +879,6 @@ def of_arm():
 
 #: Entries whose last arguments are given by name.
 NAMED = {
-    "block_pulse_kernel",
     "block_pulse_kernels",
     "certify",
     "cost_surface",

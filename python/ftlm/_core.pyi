@@ -26,7 +26,6 @@ __all__ = [
     "VirtualArm",
     "__version__",
     "autocovariances",
-    "block_pulse_kernel",
     "block_pulse_kernels",
     "block_pulse_matrix",
     "certify",
@@ -63,7 +62,7 @@ __all__ = [
     "metrics",
     "minimize",
     "multi_innovation",
-    "multi_innovation_estimate",
+    "multi_innovation_rows",
     "nonuniform_means",
     "nyquist_margin",
     "operational_matrix",
@@ -75,7 +74,6 @@ __all__ = [
     "profile_intervals",
     "projected_errors",
     "pulse_mean_rows",
-    "pulse_means",
     "refine_candidates",
     "respond",
     "respond_with_initial",
@@ -117,7 +115,7 @@ class _Options(TypedDict):
     norm: str
     #: 0 for least squares
     innovation_length: int
-    prior_covariance: float
+    prior_covariance: float | None
     haar_rows: bool
     top: int
     threads: int
@@ -290,7 +288,6 @@ SIMD: Final[str]
 
 # ---------------------------------------------------------------------------------------------- kernels and transforms
 
-def block_pulse_kernel(order: float, m: int, step: float, *, derivative: bool = False) -> _Vector: ...
 def block_pulse_kernels(orders: _Floats, m: int, step: float, *, derivative: bool = False) -> _Matrix: ...
 def toeplitz_apply(first_columns: _Floats, x: _Floats, groups: Sequence[int]) -> _Matrix: ...
 def toeplitz_solve(first_columns: _Floats, b: _Floats, groups: Sequence[int]) -> _Matrix: ...
@@ -307,7 +304,6 @@ def fractional_derivative(x: _Floats, order: float, step: float, definition: str
 
 # -------------------------------------------------------------------------------------------------- samples to records
 
-def pulse_means(samples: _Floats, m: int, hold: bool) -> _Vector: ...
 def pulse_mean_rows(samples: _Floats, m: int, hold: bool) -> _Matrix: ...
 def point_samples(means: _Floats) -> _Vector: ...
 def nonuniform_means(times: _Floats, samples: _Floats, m: int, step: float, hold: bool) -> _Vector: ...
@@ -356,11 +352,11 @@ def multi_innovation(
     fixed: Sequence[float | None],
     terms: _Initial,
     length: int,
-    prior_covariance: float,
+    prior_covariance: float | None,
     haar: bool,
     recursion: bool,
 ) -> tuple[_Estimate, _Matrix | None]: ...
-def multi_innovation_estimate(
+def multi_innovation_rows(
     q: _Floats, m: _Floats, count: int, length: int, prior_covariance: Sequence[float], path: bool
 ) -> _Matrix: ...
 def instrumental_variables(
@@ -805,9 +801,11 @@ class Streaming:
         inputs: Sequence[bool],
         equations: Sequence[tuple[_Structure, Sequence[float | None]]],
         length: int,
-        prior_covariance: float,
+        prior_covariance: float | None,
+        forgetting: float,
+        terms: _Initial,
     ) -> Streaming: ...
-    def push(self, samples: _Floats) -> None: ...
+    def push(self, samples: _Floats) -> _Matrix: ...
     @property
     def coefficients(self) -> list[list[float]]: ...
     @property

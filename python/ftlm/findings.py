@@ -379,6 +379,12 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "data alone say; p = {length} only weighs the data against it. Raise prior_covariance or use "
         "{ask[method is least-squares]}",
     ),
+    "prior_ranks": FindingKind(
+        "prior",
+        LEVEL_WITH_CARE,
+        "{output}: the prior decides which orders lead|: with K0 = {prior:g} the best candidate leaves {share:.2g} of "
+        "the error of a model that does not move. Raise prior_covariance, or leave it out",
+    ),
     "no_standard_errors": _rule(
         "errors",
         LEVEL_WITH_CARE,

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm import _core
-from ftlm.errors import ModelError
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import setting
 from ftlm.utils.validation import apply_along_axis, as_floats, check_pulses, real_number
 
 
@@ -170,15 +167,6 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     return apply_along_axis("x", x, axis, _core.haar_inverse)
 
 
-def _step(m: int, duration: float) -> float:
-    length = real_number("duration", duration)
-    if not (math.isfinite(length) and length > 0):
-        raise ModelError(
-            f"{setting('duration')} {duration!r} s is not positive; give the length of the record in seconds"
-        )
-    return length / m
-
-
 @check_arguments
 def haar_matrix(m: int) -> NDArray[np.float64]:
     """Orthogonal Haar matrix (paper (27), (29)).
@@ -202,7 +190,7 @@ def haar_matrix(m: int) -> NDArray[np.float64]:
 
 
 @check_arguments
-def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.float64]:
+def block_pulse_matrix(order: float, m: int, *, step: float) -> NDArray[np.float64]:
     """Fractional integration matrix of block pulses (paper (32)), upper triangular.
 
     A row vector of pulse means times this matrix is the row vector of the means of its integral.
@@ -213,8 +201,8 @@ def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
         Order of the integral, in [0, 10].
     m
         Number of pulses, at most 16 384.
-    duration
-        Length of the record [s].
+    step
+        Pulse width [s].
 
     Returns
     -------
@@ -224,14 +212,14 @@ def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
     Raises
     ------
     ModelError
-        An order, m or duration out of range.
+        An order, m or step out of range.
     """
     m = check_pulses(m)
-    return _core.block_pulse_matrix(real_number("order", order), m, _step(m, duration))
+    return _core.block_pulse_matrix(real_number("order", order), m, real_number("step", step))
 
 
 @check_arguments
-def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.float64]:
+def operational_matrix(order: float, m: int, *, step: float) -> NDArray[np.float64]:
     """Fractional integration matrix of Haar wavelets (paper (37)), by the two-sided fast Haar transform, O(m^2).
 
     Parameters
@@ -240,8 +228,8 @@ def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
         Order of the integral, in [0, 10].
     m
         Number of wavelets, a power of two, at most 16 384.
-    duration
-        Length of the record [s].
+    step
+        Pulse width [s].
 
     Returns
     -------
@@ -251,7 +239,7 @@ def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
     Raises
     ------
     ModelError
-        An order, m or duration out of range.
+        An order, m or step out of range.
     """
     m = check_pulses(m)
-    return _core.operational_matrix(real_number("order", order), m, _step(m, duration))
+    return _core.operational_matrix(real_number("order", order), m, real_number("step", step))

@@ -1,6 +1,6 @@
 """Operators of the core on arrays: pulse means, fractional integrals, Toeplitz systems, Haar transform, estimator (44).
 
-:class:`Candidates` scores order tuples of one equation.
+:class:`Candidates` scores order tuples of one equation, :class:`Recursion` estimates its coefficients sample by sample.
 
 Time is the last axis, and leading axes broadcast as in NumPy's universal functions. Arrays are real numbers of any type
 and strides. They are never changed, and results are new float64 arrays. Other threads run meanwhile.
@@ -34,6 +34,7 @@ from ftlm.utils.validation import (
 
 __all__ = [
     "Candidates",
+    "Recursion",
     "block_pulse_kernel",
     "errors",
     "haar",
@@ -274,7 +275,7 @@ def multi_innovation(
     if prior.ndim > 1 or (prior.ndim and prior.size != width):
         raise DataError(f"prior_covariance has shape {prior.shape}; give a number, or one for each of {width} columns")
     lead = _broadcast({"Q": regressors.shape[:-2], "m": outputs.shape[:-1]})
-    found = _core.multi_innovation_estimate(
+    found = _core.multi_innovation_rows(
         np.broadcast_to(regressors, (*lead, count, width)).reshape(-1, width),
         np.broadcast_to(outputs, (*lead, count)).ravel(),
         count,
@@ -361,13 +362,8 @@ class Candidates:
         table = _finite("signals", signals)
         if table.ndim != 2 or not table.size:
             raise DataError(f"signals has shape {table.shape}; give pulse means of shape (signals, M)")
-        if not len(terms):
-            raise ModelError(f"{parameter('terms')} is empty; give the row of the signal of each term")
-        for name, row in [("output", output), *(("terms", term) for term in terms)]:
-            index = whole_number(row)
-            if index is None or not 0 <= index < len(table):
-                raise ModelError(f"{setting(name)} {short_repr(row)} is no row of {len(table)} signals; count from 0")
-        self._signals, self._terms, self._output = table, np.array([int(t) for t in terms]), int(output)
+        self._signals, self._terms = table, np.array(_signal_rows(terms, output, len(table)))
+        self._output = int(output)
         self._step = real_number("step", step)
         self._columns = dict[tuple[int, float], int]()
         self._bank: dict[str, NDArray[np.float64]] = {}
@@ -585,6 +581,149 @@ class Candidates:
                 bank = np.sqrt(weights) * (haar(bank) if rows == "haar" else bank)
             self._bank[key] = bank @ bank.T
         return self._bank[key]
+
+
+class Recursion:
+    """Multi-innovation recursion (44) of one equation D^alpha y = sum of c_j D^order_j x_j, sample by sample.
+
+    Parameters
+    ----------
+    orders
+        Shape (1 + k,): alpha, then the order of each of k terms; alpha minus an order is at most 2.
+    terms
+        Row of the signal of each term.
+    output
+        Row of the output y.
+    step
+        Sampling interval [s].
+    hold
+        Whether each of s signals holds its samples until the next one, as commands do. Otherwise it is linear in
+        between.
+    p
+        Innovation length: number of rows of a step.
+    prior_covariance
+        Initial covariance of the coefficients; by default 1e10 over the sum of squares of a regressor so far.
+    forgetting
+        Factor in (0, 1] by which earlier rows count less with every row; 1 forgets nothing.
+    initial
+        Exponents above -1 of powers of t that a start in motion adds to the terms, or ``"caputo"`` for those of the
+        initial values of Caputo derivatives.
+    longest
+        Largest number of pulses.
+    fixed
+        Coefficient of each term, None for a free one; by default all are free.
+
+    Raises
+    ------
+    DataError
+        Orders that are not finite, or of another shape.
+    ModelError
+        A row that the signals do not have, no term, or an option out of range.
+
+    Notes
+    -----
+    A sample costs about 1 us, whatever came before: the past is a sum of some hundred decaying exponentials a signal,
+    exact to rounding. After every sample the coefficients are those of :func:`multi_innovation` with all rows so far.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ftlm import kernels
+    >>> u = np.repeat([1.0, -1.0, 1.0, -1.0], 16)
+    >>> y = np.append(0.0, np.cumsum(2.0 * 0.1 * u[:-1]))
+    >>> stream = kernels.Recursion([1.0, 0.0], [1], step=0.1, hold=[False, True])
+    >>> path = stream.push(np.column_stack([y, u]))
+    >>> path.shape, stream.coefficients.round(6).tolist()
+    ((64, 1), [2.0])
+    """
+
+    @check_arguments
+    def __init__(
+        self,
+        orders: ArrayLike,
+        terms: Sequence[int],
+        *,
+        output: int = 0,
+        step: float,
+        hold: Sequence[bool],
+        p: int = 7,
+        prior_covariance: float | None = None,
+        forgetting: float = 1.0,
+        initial: Sequence[float] | Literal["caputo"] = (),
+        longest: int = 1_000_000,
+        fixed: Sequence[float | None] | None = None,
+    ) -> None:
+        rows = _signal_rows(terms, output, len(hold))
+        numbers = _finite("orders", orders)
+        if numbers.shape != (1 + len(rows),):
+            raise DataError(f"orders has shape {numbers.shape}; give ({1 + len(rows)},): alpha, then one order a term")
+        length = whole_number(p)
+        if length is None or not 1 <= length < 1 << 31:
+            raise ModelError(f"{setting('p')} {short_repr(p)} is no whole number from 1")
+        if isinstance(initial, str):
+            check_choice("initial", initial, ("caputo",))
+        exponents = [] if isinstance(initial, str) else [real_number("initial", e) for e in initial]
+        equation = (int(output), float(numbers[0]), list(zip(rows, numbers[1:].tolist(), strict=True)))
+        self._count = len(hold)
+        self._core = _core.Streaming(
+            real_number("step", step),
+            max(2, check_pulses(longest)),
+            [bool(h) for h in hold],
+            [(equation, [None] * len(rows) if fixed is None else list(fixed))],
+            length,
+            None if prior_covariance is None else real_number("prior_covariance", prior_covariance),
+            real_number("forgetting", forgetting),
+            (isinstance(initial, str), exponents),
+        )
+
+    @check_arguments
+    def push(self, samples: ArrayLike) -> NDArray[np.float64]:
+        """Process samples of all signals; return the coefficients after each.
+
+        Parameters
+        ----------
+        samples
+            Shape (n, s).
+
+        Returns
+        -------
+        numpy.ndarray
+            Shape (n, k + number of initial terms): the coefficients of the terms, then those of the initial terms.
+
+        Raises
+        ------
+        DataError
+            Values that are not finite (with the first index and the count), or another number of signals.
+        ModelError
+            More pulses than ``longest``.
+        ConvergenceError
+            A covariance that is no longer positive by rounding.
+        """
+        table = _finite("samples", samples)
+        if table.ndim != 2 or table.shape[1] != self._count:
+            raise DataError(f"samples has shape {table.shape}; give (n, {self._count}), one column a signal")
+        return self._core.push(table)
+
+    @property
+    def coefficients(self) -> NDArray[np.float64]:
+        """Coefficients of the terms, then those of the initial terms, after the newest sample."""
+        return np.array(self._core.coefficients[0])
+
+    @property
+    def pulses(self) -> int:
+        """Number of rows of (44) so far: samples minus one."""
+        return self._core.pulses
+
+
+def _signal_rows(terms: Sequence[int], output: int, count: int) -> list[int]:
+    """Return the rows of the signals of terms, checked together with that of the output."""
+    if not len(terms):
+        raise ModelError(f"{parameter('terms')} is empty; give the row of the signal of each term")
+    for name, row in [("output", output), *(("terms", term) for term in terms)]:
+        index = whole_number(row)
+        if index is None or not 0 <= index < count:
+            raise ModelError(f"{setting(name)} {short_repr(row)} is no row of {count} signals; count from 0")
+    return [int(term) for term in terms]
 
 
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:

@@ -22,13 +22,54 @@ pub enum RowBasis {
     Time,
 }
 
+/// Prior covariance K₀ of the coefficients, a diagonal matrix.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Prior {
+    /// Covariance of every coefficient.
+    Absolute(f64),
+    /// Covariance of a coefficient times the sum of squares of its column. It does not depend on units.
+    Relative(f64),
+}
+
+impl Prior {
+    /// Prior that changes coefficients only where the data hardly determine them.
+    pub const WEAK: Self = Self::Relative(1e10);
+
+    /// Inverse covariance of the coefficient of a column with this sum of squares.
+    #[must_use]
+    pub fn precision(self, squares: f64) -> f64 {
+        match self {
+            Self::Absolute(covariance) => 1.0 / covariance,
+            Self::Relative(covariance) => squares / covariance,
+        }
+    }
+
+    /// Inverse covariances of the coefficients of these columns.
+    fn precisions(self, columns: &[Vec<f64>]) -> Vec<f64> {
+        columns.iter().map(|column| self.precision(column.iter().map(|v| v * v).sum())).collect()
+    }
+
+    pub(crate) fn check(self) -> Result<()> {
+        let (Self::Absolute(value) | Self::Relative(value)) = self;
+        if value > 0.0 && value.is_finite() {
+            return Ok(());
+        }
+        Err(Error::OutOfRange {
+            name: "prior covariance K0".into(),
+            value,
+            range: "(0, ∞)".into(),
+            remedy: "use a large number for a weak prior".into(),
+        })
+    }
+}
+
 /// Settings of the recursion (44).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Innovation {
     /// Innovation length p ≥ 1.
     pub length: usize,
-    /// Initial covariance K₀ (times the unit matrix) > 0.
-    pub prior_covariance: f64,
+    /// Initial covariance K₀ > 0.
+    pub prior: Prior,
     /// Basis of the rows.
     pub row_basis: RowBasis,
 }
@@ -47,15 +88,7 @@ impl Innovation {
                 remedy: "use p = 1 for ordinary recursive least squares".into(),
             });
         }
-        if !(self.prior_covariance > 0.0 && self.prior_covariance.is_finite()) {
-            return Err(Error::OutOfRange {
-                name: "prior covariance K0".into(),
-                value: self.prior_covariance,
-                range: "(0, ∞)".into(),
-                remedy: "use a large number for a weak prior".into(),
-            });
-        }
-        Ok(())
+        self.prior.check()
     }
 
     /// Weight of row i of m (from 0): the number of steps that use it.
@@ -73,14 +106,14 @@ impl Innovation {
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::{Initial, Structure, Term};
-/// use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, RowBasis};
+/// use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, Prior, RowBasis};
 /// use ftlm::regressors::Record;
 /// let input: Vec<f64> = (0..64).map(|k| f64::from(k % 7)).collect();
 /// let driven = Record::new(0.1, vec![vec![0.0; 64], input.clone()], None)?;
 /// let output = driven.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
 /// let run = [Record::new(0.1, vec![output, input], None)?];
 /// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// let innovation = Innovation { length: 4, prior_covariance: 1e6, row_basis: RowBasis::Time };
+/// let innovation = Innovation { length: 4, prior: Prior::WEAK, row_basis: RowBasis::Time };
 /// let end = closed_form(&run, &structure, &[None], &Initial::Rest, &innovation)?;
 /// let (last, trace) = recursion(&run, &structure, &[None], &Initial::Rest, &innovation)?;
 /// assert_eq!(trace.len(), 64);
@@ -97,13 +130,14 @@ pub fn closed_form(
 ) -> Result<Estimate> {
     let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let Regression { columns, target, starts, .. } = &regression;
-    let prior = vec![innovation.prior_covariance; columns.len()];
+    let prior = innovation.prior.precisions(columns);
     let (solution, dropped) =
         weighted_solution((columns, target, starts), innovation.length, &prior, regression.free_count())?;
     regression.estimate(&solution, &dropped)
 }
 
-/// Solution of the weighted rows with those of the prior, and the dependent columns. The first `needed` must not be.
+/// Solution of the weighted rows with those of the prior, of these inverse covariances, and the dependent columns. The
+/// first `needed` must not be.
 fn weighted_solution(
     (columns, target, starts): (&[Vec<f64>], &[f64], &[usize]),
     length: usize,
@@ -111,7 +145,7 @@ fn weighted_solution(
     needed: usize,
 ) -> Result<(Vec<f64>, Vec<usize>)> {
     let (columns, target) = weighted_rows(columns.to_vec(), target.to_vec(), starts, length, prior);
-    // With a prior no column is linearly dependent in exact arithmetic.
+    // With a prior no column but a zero one under a relative prior is linearly dependent in exact arithmetic.
     let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
     match dropped.iter().find(|&&column| column < needed) {
         Some(&index) => Err(Error::Singular { index, count: columns.len() }),
@@ -138,9 +172,9 @@ fn weighted_rows(
         }
     }
     let (k, end) = (columns.len(), target.len());
-    for (j, (column, covariance)) in columns.iter_mut().zip(prior).enumerate() {
+    for (j, (column, precision)) in columns.iter_mut().zip(prior).enumerate() {
         column.resize(end + k, 0.0);
-        column[end + j] = 1.0 / covariance.sqrt();
+        column[end + j] = precision.sqrt();
     }
     target.resize(end + k, 0.0);
     (columns, target)
@@ -163,9 +197,9 @@ fn weighted_rows(
 /// # }
 /// ```
 pub fn estimate(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<Vec<f64>> {
-    check_problem(columns, target, length, prior_covariance)?;
+    let prior = check_problem(columns, target, length, prior_covariance)?;
     let starts = [0, target.len()];
-    Ok(weighted_solution((columns, target, &starts), length, prior_covariance, columns.len())?.0)
+    Ok(weighted_solution((columns, target, &starts), length, &prior, columns.len())?.0)
 }
 
 /// Coefficients after every step of the recursion (44) on m = Q X, as in [`estimate`]. O(M k³).
@@ -179,18 +213,18 @@ pub fn path(
     prior_covariance: &[f64],
     stop: &Stop,
 ) -> Result<Vec<Vec<f64>>> {
-    check_problem(columns, target, length, prior_covariance)?;
-    run_recursion((columns, target, &[0, target.len()]), length, prior_covariance, stop)
+    let prior = check_problem(columns, target, length, prior_covariance)?;
+    run_recursion((columns, target, &[0, target.len()]), length, &prior, stop)
 }
 
 /// Coefficients after every step of the recursion through records that begin at `starts`.
 fn run_recursion(
     (columns, target, starts): (&[Vec<f64>], &[f64], &[usize]),
     length: usize,
-    prior_covariance: &[f64],
+    prior: &[f64],
     stop: &Stop,
 ) -> Result<Vec<Vec<f64>>> {
-    let mut state = Recursion::with_prior(&vec![0.0; columns.len()], prior_covariance)?;
+    let mut state = Recursion::new(prior)?;
     let rows: Vec<Vec<f64>> = (0..target.len()).map(|i| columns.iter().map(|c| c[i]).collect()).collect();
     let mut trace = Vec::with_capacity(target.len());
     for pair in starts.windows(2) {
@@ -206,16 +240,18 @@ fn run_recursion(
     Ok(trace)
 }
 
-fn check_problem(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<()> {
+/// Inverse prior covariances of a checked problem.
+fn check_problem(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<Vec<f64>> {
     check_length("prior covariances", columns.len(), prior_covariance.len())?;
-    for &prior_covariance in prior_covariance {
-        Innovation { length, prior_covariance, row_basis: RowBasis::Time }.check()?;
+    for &covariance in prior_covariance {
+        Innovation { length, prior: Prior::Absolute(covariance), row_basis: RowBasis::Time }.check()?;
     }
     check_finite("m", target)?;
     columns.iter().try_for_each(|column| {
         check_length("column of Q", target.len(), column.len())?;
         check_finite("Q", column)
-    })
+    })?;
+    Ok(prior_covariance.iter().map(|covariance| 1.0 / covariance).collect())
 }
 
 /// Run the recursion (44) from X₀ = 0; return the last estimate and the coefficients after every step.
@@ -233,7 +269,7 @@ pub fn recursion(
 ) -> Result<(Estimate, Vec<Vec<f64>>)> {
     let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let Regression { columns, target, starts, .. } = &regression;
-    let prior = vec![innovation.prior_covariance; columns.len()];
+    let prior = innovation.prior.precisions(columns);
     let steps = run_recursion((columns, target, starts), innovation.length, &prior, &Stop::default())?;
     let zeros = vec![0.0; columns.len()];
     let last = regression.estimate(steps.last().unwrap_or(&zeros), &[])?;

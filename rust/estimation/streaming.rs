@@ -3,14 +3,16 @@
 //! A new row needs the fractional integrals of every signal at the newest pulse, which depend on the whole past. The
 //! newest two pulses enter by the exact kernel (32). Older pulses enter through a sum of exponentials,
 //! exact to rounding. An order above 1 is a running integral of the order minus one. A row costs
-//! O((signals + terms)·rates + p k² + k³), independent of the length of the run.
+//! O((signals + terms)·rates + p k² + k³), independent of the length of the run. Earlier rows may be forgotten
+//! exponentially, and a stream that begins in motion has powers of t as more terms.
 
-use crate::equation::Structure;
+use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::estimation::multi_innovation::{Innovation, RowBasis};
+use crate::estimation::multi_innovation::{Innovation, Prior, RowBasis};
 use crate::fractional::exponential_sum::{decay, Rates};
-use crate::fractional::kernels::block_pulse_kernel;
+use crate::fractional::kernels::{block_pulse_kernel, PowerMeans};
 use crate::linalg::small::Recursion;
+use crate::simd::dot;
 
 /// Relative accuracy of the sum of exponentials, at the rounding level of the batch form.
 const MEMORY_TOLERANCE: f64 = 2e-15;
@@ -71,7 +73,7 @@ impl RunningIntegral {
 
     /// Mean over the newest pulse.
     fn next(&mut self, newest: f64, past: &SignalHistory) -> f64 {
-        let older: f64 = self.history_weights.iter().zip(&past.states).map(|(w, z)| w * z).sum();
+        let older = dot(&self.history_weights, &past.states);
         let local = self.recent_weights[0] * newest + self.recent_weights[1] * past.last + older;
         match &mut self.inner {
             None => local,
@@ -85,6 +87,13 @@ impl RunningIntegral {
     }
 }
 
+/// Initial term t^e, integrated as often as the equation.
+#[derive(Debug, Clone)]
+struct InitialColumn {
+    means: PowerMeans,
+    scale: f64,
+}
+
 /// Recursion of one equation in a stream.
 #[derive(Debug, Clone)]
 struct EquationRecursion {
@@ -92,11 +101,47 @@ struct EquationRecursion {
     /// Integral of the output: of order 0 unless a term is differentiated more often than the output.
     target: RunningIntegral,
     integrals: Vec<RunningIntegral>,
+    initial: Vec<InitialColumn>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
     /// Ring buffer of the p newest rows, each with its target.
     rows: Vec<(Vec<f64>, f64)>,
     at: usize,
+}
+
+/// Options of a stream.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StreamingOptions {
+    /// Innovation length p ≥ 1.
+    pub length: usize,
+    /// Prior covariance. A relative one is that of the rows so far.
+    pub prior: Prior,
+    /// Factor in (0, 1] of all earlier information at every row.
+    pub forgetting: f64,
+    /// Initial terms of a stream that begins in motion, with powers of t above −1.
+    pub initial: Initial,
+}
+
+impl Default for StreamingOptions {
+    fn default() -> Self {
+        Self { length: 7, prior: Prior::WEAK, forgetting: 1.0, initial: Initial::Rest }
+    }
+}
+
+impl StreamingOptions {
+    fn check(&self) -> Result<()> {
+        Innovation { length: self.length, prior: self.prior, row_basis: RowBasis::Time }.check()?;
+        self.initial.check()?;
+        if self.forgetting > 0.0 && self.forgetting <= 1.0 {
+            return Ok(());
+        }
+        Err(Error::OutOfRange {
+            name: "forgetting factor".into(),
+            value: self.forgetting,
+            range: "(0, 1]".into(),
+            remedy: "1 forgets nothing".into(),
+        })
+    }
 }
 
 /// Multi-innovation recursion (44) of several equations on one stream of samples.
@@ -109,7 +154,7 @@ pub struct Streaming {
     fits: Vec<EquationRecursion>,
     sample: Option<Vec<f64>>,
     means: Vec<f64>,
-    length: usize,
+    options: StreamingOptions,
     pulses: usize,
     longest: usize,
 }
@@ -120,16 +165,16 @@ impl Streaming {
     /// `inputs` marks the zero-order-hold inputs; the other signals are outputs.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for an invalid step, length, prior or integration order; [`Error::Length`] if `fixed` does
+    /// [`Error::OutOfRange`] for an invalid step, option or integration order; [`Error::Length`] if `fixed` does
     /// not match the terms; [`Error::Structure`] for an unknown signal.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
     /// use ftlm::equation::{Structure, Term};
-    /// use ftlm::estimation::streaming::Streaming;
+    /// use ftlm::estimation::streaming::{Streaming, StreamingOptions};
     /// // y = c I^1 u, sampled every 0.1 s.
     /// let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 1, order: 0.0 }] };
-    /// let mut stream = Streaming::new(0.1, 50, &[false, true], &[(structure, vec![None])], 1, 1e6)?;
+    /// let mut stream = Streaming::new(0.1, 50, &[false, true], &[(structure, vec![None])], StreamingOptions::default())?;
     /// (0..50).try_for_each(|k| stream.push(&[0.3 * f64::from(k), 1.0]))?;
     /// assert!((stream.coefficients()[0][0] - 3.0).abs() < 1e-3);
     /// # Ok(())
@@ -140,11 +185,10 @@ impl Streaming {
         longest: usize,
         inputs: &[bool],
         equations: &[(Structure, Vec<Option<f64>>)],
-        length: usize,
-        prior: f64,
+        options: StreamingOptions,
     ) -> Result<Self> {
         check_step(step)?;
-        Innovation { length, prior_covariance: prior, row_basis: RowBasis::Time }.check()?;
+        options.check()?;
         #[allow(clippy::cast_precision_loss)]
         let rates = Rates::new(step, step * (longest.max(2) as f64), MEMORY_TOLERANCE)?;
         let mut fits = Vec::with_capacity(equations.len());
@@ -162,13 +206,19 @@ impl Streaming {
                 .zip(&orders)
                 .map(|(term, order)| RunningIntegral::new(term.signal, order + excess, step, &rates))
                 .collect::<Result<Vec<_>>>()?;
-            let free = fixed.iter().filter(|f| f.is_none()).count();
+            let initial = structure
+                .initial_exponents(&options.initial)
+                .into_iter()
+                .map(|e| InitialColumn::new(e, excess, step))
+                .collect::<Result<Vec<_>>>()?;
+            let free = fixed.iter().filter(|f| f.is_none()).count() + initial.len();
             fits.push(EquationRecursion {
                 output: structure.output,
                 target: RunningIntegral::new(structure.output, excess, step, &rates)?,
                 integrals,
+                initial,
                 fixed: fixed.clone(),
-                recursion: Recursion::new(&vec![0.0; free], prior)?,
+                recursion: Recursion::new(&vec![options.prior.precision(0.0); free])?,
                 rows: Vec::new(),
                 at: 0,
             });
@@ -183,7 +233,7 @@ impl Streaming {
             fits,
             sample: None,
             means: vec![0.0; inputs.len()],
-            length,
+            options,
             pulses: 0,
             longest,
         })
@@ -211,7 +261,7 @@ impl Streaming {
             *mean = if self.inputs[s] { before[s] } else { 0.5 * (before[s] + sample[s]) };
         }
         for fit in &mut self.fits {
-            fit.step(&self.means, &self.pasts, self.length, self.pulses)?;
+            fit.step(&self.means, &self.pasts, &self.options, self.pulses)?;
         }
         for (past, mean) in self.pasts.iter_mut().zip(&self.means) {
             for ((z, keep), share) in past.states.iter_mut().zip(&self.keep).zip(&self.share) {
@@ -223,10 +273,22 @@ impl Streaming {
         Ok(())
     }
 
-    /// Coefficients of the terms of every equation after the newest sample, fixed ones as given.
+    /// Coefficients of the terms of every equation after the newest sample, fixed ones as given, then those of its
+    /// initial terms.
     #[must_use]
     pub fn coefficients(&self) -> Vec<Vec<f64>> {
-        self.fits.iter().map(EquationRecursion::coefficients).collect()
+        self.fits.iter().map(|fit| fit.coefficients().collect()).collect()
+    }
+
+    /// Number of the coefficients of all equations.
+    #[must_use]
+    pub fn coefficient_count(&self) -> usize {
+        self.fits.iter().map(|fit| fit.fixed.len() + fit.initial.len()).sum()
+    }
+
+    /// Append the coefficients of all equations after the newest sample.
+    pub fn append_coefficients(&self, out: &mut Vec<f64>) {
+        self.fits.iter().for_each(|fit| out.extend(fit.coefficients()));
     }
 
     /// Number of pulses so far.
@@ -236,10 +298,33 @@ impl Streaming {
     }
 }
 
+impl InitialColumn {
+    /// I^q t^e = Γ(e + 1)/Γ(e + 1 + q) t^(e + q).
+    fn new(exponent: f64, excess: f64, step: f64) -> Result<Self> {
+        if exponent <= -1.0 {
+            return Err(Error::OutOfRange {
+                name: "exponent of an initial term in a stream".into(),
+                value: exponent,
+                range: "(-1, ∞)".into(),
+                remedy: "identify such an equation from the recorded run".into(),
+            });
+        }
+        let scale = libm::tgamma(exponent + 1.0) / libm::tgamma(exponent + excess + 1.0);
+        Ok(Self { means: PowerMeans::new(exponent + excess, step), scale })
+    }
+}
+
 impl EquationRecursion {
-    fn step(&mut self, means: &[f64], pasts: &[SignalHistory], length: usize, pulse: usize) -> Result<()> {
+    fn step(&mut self, means: &[f64], pasts: &[SignalHistory], options: &StreamingOptions, pulse: usize) -> Result<()> {
         let mut target = self.target.next(means[self.output], &pasts[self.output]);
-        let mut row = Vec::with_capacity(self.integrals.len());
+        if self.rows.len() < options.length {
+            self.at = self.rows.len();
+            self.rows.push((Vec::with_capacity(self.integrals.len() + self.initial.len()), 0.0));
+        } else {
+            self.at = (self.at + 1) % options.length;
+        }
+        let row = &mut self.rows[self.at].0;
+        row.clear();
         for (integral, fixed) in self.integrals.iter_mut().zip(&self.fixed) {
             let value = integral.next(means[integral.signal], &pasts[integral.signal]);
             match fixed {
@@ -247,19 +332,21 @@ impl EquationRecursion {
                 Some(coefficient) => target -= coefficient * value,
             }
         }
-        if self.rows.len() < length {
-            self.rows.push((row, target));
-        } else {
-            self.rows[self.at] = (row, target);
-            self.at = (self.at + 1) % length;
+        row.extend(self.initial.iter().map(|column| column.scale * column.means.mean(pulse)));
+        self.recursion.forget(options.forgetting);
+        if let Prior::Relative(_) = options.prior {
+            self.recursion.add_prior(row.iter().map(|value| options.prior.precision(value * value)));
         }
+        self.rows[self.at].1 = target;
         self.recursion
             .step(self.rows.iter().map(|(row, target)| (row.as_slice(), *target)))
             .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: pulse })
     }
 
-    fn coefficients(&self) -> Vec<f64> {
+    /// Coefficients of the terms, then of the initial terms.
+    fn coefficients(&self) -> impl Iterator<Item = f64> + '_ {
         let mut free = self.recursion.coefficients().iter();
-        self.fixed.iter().map(|f| f.unwrap_or_else(|| free.next().copied().unwrap_or(0.0))).collect()
+        let fixed = self.fixed.iter().copied().chain(self.initial.iter().map(|_| None));
+        fixed.map(move |f| f.unwrap_or_else(|| free.next().copied().unwrap_or(0.0)))
     }
 }

@@ -305,7 +305,8 @@ fn near_pulses(m: usize) -> usize {
 }
 
 /// Means of t^e over pulses of length h.
-struct PowerMeans {
+#[derive(Debug, Clone)]
+pub(crate) struct PowerMeans {
     /// e + 1.
     a: f64,
     scale: f64,
@@ -318,7 +319,7 @@ struct PowerMeans {
 
 impl PowerMeans {
     #[allow(clippy::cast_precision_loss)]
-    fn new(exponent: f64, step: f64) -> Self {
+    pub(crate) fn new(exponent: f64, step: f64) -> Self {
         let (a, scale) = (exponent + 1.0, libm::pow(step, exponent));
         let (mut sums, mut slopes) = ([0.0; MIDPOINT_SERIES_TERMS], [0.0; MIDPOINT_SERIES_TERMS]);
         let (mut c, mut dc) = (1.0, 0.0);
@@ -330,6 +331,15 @@ impl PowerMeans {
             c *= factor / divisor;
         }
         Self { a, scale, half: scale * libm::exp2(-exponent), ln_step: libm::log(step), sums, slopes }
+    }
+
+    /// Mean over pulse k + 1, as one of [`power_means`].
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn mean(&self, k: usize) -> f64 {
+        if k < ENDPOINT_PULSES {
+            return self.endpoint_mean((k + 1) as f64);
+        }
+        self.midpoint_mean(k, libm::pow((2 * k + 1) as f64, self.a - 1.0))
     }
 
     /// Mean over pulse k, k^a − (k−1)^a, without cancellation.

@@ -319,68 +319,108 @@ pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
     x
 }
 
+/// Replace a packed lower triangle by its Cholesky factor. A row without any information gets the pivot 1.
+fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
+    for i in 0..k {
+        for j in 0..=i {
+            let known: f64 = (0..j).map(|l| packed[packed_index(i, l)] * packed[packed_index(j, l)]).sum();
+            let left = packed[packed_index(i, j)] - known;
+            packed[packed_index(i, j)] = if i > j {
+                left / packed[packed_index(j, j)]
+            } else if packed[packed_index(i, i)] == 0.0 {
+                1.0
+            } else if left > 0.0 && left < f64::INFINITY {
+                left.sqrt()
+            } else {
+                return None;
+            };
+        }
+    }
+    Some(())
+}
+
 /// State of recursion (44): coefficients and inverse covariance.
 #[derive(Debug, Clone)]
 pub struct Recursion {
-    coefficients: DVector<f64>,
-    information: DMatrix<f64>,
+    coefficients: Vec<f64>,
+    /// Inverse covariance, packed rows of the lower triangle.
+    information: Vec<f64>,
+    /// Right-hand side of the next step: products of new prior precisions and coefficients.
+    gain: Vec<f64>,
+    /// Cholesky factor of the information, packed.
+    factor: Vec<f64>,
 }
 
 impl Recursion {
-    /// Recursion from coefficients `start` with covariance `prior`·I.
+    /// Recursion from coefficients 0 with an inverse prior covariance of each; 0 for none so far.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a prior that is not positive and finite.
-    pub fn new(start: &[f64], prior: f64) -> Result<Self> {
-        Self::with_prior(start, &vec![prior; start.len()])
-    }
-
-    /// Recursion from coefficients `start` with a prior covariance of each.
-    ///
-    /// # Errors
-    /// [`Error::OutOfRange`] for a prior that is not positive and finite, [`Error::Length`].
-    pub fn with_prior(start: &[f64], prior: &[f64]) -> Result<Self> {
-        check_length("prior covariances", start.len(), prior.len())?;
-        if let Some(&value) = prior.iter().find(|&&p| !(p > 0.0 && p.is_finite())) {
+    /// [`Error::OutOfRange`] for a precision that is negative or not finite.
+    pub fn new(precision: &[f64]) -> Result<Self> {
+        if let Some(&value) = precision.iter().find(|&&p| !(p >= 0.0 && p.is_finite())) {
             return Err(Error::OutOfRange {
-                name: "prior covariance K0".into(),
+                name: "inverse prior covariance".into(),
                 value,
-                range: "(0, ∞)".into(),
-                remedy: "use a large number for a weak prior".into(),
+                range: "[0, ∞)".into(),
+                remedy: "use a small number for a weak prior".into(),
             });
         }
-        let precision: Vec<f64> = prior.iter().map(|p| 1.0 / p).collect();
-        Ok(Self {
-            coefficients: DVector::from_column_slice(start),
-            information: DMatrix::from_diagonal(&DVector::from_column_slice(&precision)),
-        })
+        let k = precision.len();
+        let mut information = vec![0.0; packed_index(k, 0)];
+        precision.iter().enumerate().for_each(|(j, p)| information[packed_index(j, j)] = *p);
+        Ok(Self { coefficients: vec![0.0; k], factor: information.clone(), information, gain: vec![0.0; k] })
+    }
+
+    /// Multiply all information so far by a factor in (0, 1].
+    pub fn forget(&mut self, factor: f64) {
+        self.information.iter_mut().for_each(|v| *v *= factor);
+    }
+
+    /// Add inverse prior covariances of coefficients that are 0 by the prior; the next step accounts for them.
+    pub fn add_prior(&mut self, precision: impl Iterator<Item = f64>) {
+        for (j, more) in precision.take(self.coefficients.len()).enumerate() {
+            self.information[packed_index(j, j)] += more;
+            self.gain[j] -= more * self.coefficients[j];
+        }
     }
 
     /// One update of (44) with the innovation of these rows, in any order.
     ///
+    /// A coefficient without any information stays as it is.
+    ///
     /// # Errors
     /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for a row of another length.
-    pub fn step<'a>(&mut self, rows: impl Iterator<Item = (&'a [f64], f64)> + Clone) -> Result<()> {
+    pub fn step<'a>(&mut self, rows: impl Iterator<Item = (&'a [f64], f64)>) -> Result<()> {
         let k = self.coefficients.len();
-        let mut gain = DVector::zeros(k);
-        for (row, output) in rows.clone() {
+        for (row, output) in rows {
             check_length("row", k, row.len())?;
-            let q = DVector::from_column_slice(row);
-            gain += &q * (output - q.dot(&self.coefficients));
-            self.information.ger(1.0, &q, &q, 1.0);
+            let innovation = output - row.iter().zip(&self.coefficients).map(|(q, x)| q * x).sum::<f64>();
+            for (i, q) in row.iter().enumerate() {
+                self.gain[i] += q * innovation;
+                let triangle = &mut self.information[packed_index(i, 0)..=packed_index(i, i)];
+                triangle.iter_mut().zip(row).for_each(|(v, other)| *v += q * other);
+            }
         }
-        let factor = self
-            .information
-            .clone()
-            .cholesky()
+        self.factor.copy_from_slice(&self.information);
+        cholesky(&mut self.factor, k)
             .ok_or_else(|| Error::Diverged { what: "covariance of the recursion".into(), index: 0 })?;
-        self.coefficients += factor.solve(&gain);
+        // L Lᵀ x = gain, and the solution replaces the gain.
+        let (factor, x) = (&self.factor, &mut self.gain);
+        for i in 0..k {
+            let known: f64 = (0..i).map(|j| factor[packed_index(i, j)] * x[j]).sum();
+            x[i] = (x[i] - known) / factor[packed_index(i, i)];
+        }
+        for i in (0..k).rev() {
+            let known: f64 = (i + 1..k).map(|j| factor[packed_index(j, i)] * x[j]).sum();
+            x[i] = (x[i] - known) / factor[packed_index(i, i)];
+        }
+        self.coefficients.iter_mut().zip(&mut self.gain).for_each(|(c, x)| *c += std::mem::take(x));
         Ok(())
     }
 
     /// Coefficients after the last step.
     #[must_use]
     pub fn coefficients(&self) -> &[f64] {
-        self.coefficients.as_slice()
+        &self.coefficients
     }
 }

@@ -157,12 +157,10 @@ impl Options {
         }
     }
 
-    /// Whether candidates are ranked by simulation with zero initial conditions and least-squares coefficients.
+    /// Whether candidates are ranked by simulation with zero initial conditions and coefficients from the normal
+    /// equations.
     pub(crate) fn ranks_by_simulation(&self) -> bool {
-        self.pruning
-            && self.estimator == Estimator::LeastSquares
-            && self.criterion == Criterion::OutputError
-            && self.initial == Initial::Rest
+        self.pruning && !self.refines() && self.criterion == Criterion::OutputError && self.initial == Initial::Rest
     }
 
     /// Whether a candidate's score follows from the Gram matrix alone. This is the squared equation error with zero

@@ -10,6 +10,7 @@ use pyo3::types::{PyDict, PyList, PyString, PyTuple};
 
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_finite, check_points, Error};
+use crate::estimation::multi_innovation::Prior;
 use crate::regressors::Record;
 
 /// Most values of a two-dimensional array: eight gigabytes.
@@ -114,6 +115,11 @@ pub fn equations(arguments: List<EquationArg>, signals: usize, inputs: &[bool]) 
             Ok(Equation::new(structure, coefficients.into())?)
         })
         .collect()
+}
+
+/// Prior covariance of multi-innovation least squares; None for a weak prior.
+pub fn prior(covariance: Option<f64>) -> Prior {
+    covariance.map_or(Prior::WEAK, Prior::Absolute)
 }
 
 pub fn initial(argument: InitialArg) -> PyResult<Initial> {

@@ -1,11 +1,11 @@
 //! Bindings of least squares, multi-innovation least squares, instrumental variables and the joint output-error fit.
 
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::convert::{
-    initial, record, records, rows, stack_rows, structure, to_vectors, vector, InitialArg, List, RecordArg,
+    initial, prior, record, records, rows, stack_rows, structure, to_vectors, vector, InitialArg, List, RecordArg,
     StructureArg,
 };
 use super::errors::{run_attached, run_detached};
@@ -17,7 +17,7 @@ use crate::estimation::least_squares::{self as batch, Estimate};
 use crate::estimation::multi_innovation::{self as stepwise, Innovation, RowBasis};
 use crate::estimation::output_error as joint;
 use crate::estimation::resonance_scan;
-use crate::estimation::streaming::Streaming as StreamingFit;
+use crate::estimation::streaming::{Streaming as StreamingFit, StreamingOptions};
 use crate::python::order_search::watch::{run_interruptible, Stop};
 use crate::regressors::Record;
 use crate::signal::block_pulse::{Jumps, SampleInterpolation};
@@ -92,7 +92,7 @@ pub fn multi_innovation<'py>(
     fixed: List<Option<f64>>,
     terms: InitialArg,
     length: usize,
-    prior_covariance: f64,
+    prior_covariance: Option<f64>,
     haar: bool,
     recursion: bool,
 ) -> PyResult<(EstimateTuple, Option<Bound<'py, PyArray2<f64>>>)> {
@@ -100,8 +100,8 @@ pub fn multi_innovation<'py>(
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
     let points = pulses(&records);
-    let innovation =
-        Innovation { length, prior_covariance, row_basis: if haar { RowBasis::Haar } else { RowBasis::Time } };
+    let row_basis = if haar { RowBasis::Haar } else { RowBasis::Time };
+    let innovation = Innovation { length, prior: prior(prior_covariance), row_basis };
     if recursion {
         let (estimate, trace) = run_interruptible(py, points, None, move |_| {
             stepwise::recursion(&records, &structure, &fixed, &initial, &innovation)
@@ -382,23 +382,37 @@ impl Streaming {
         inputs: List<bool>,
         equations: List<(StructureArg, List<Option<f64>>)>,
         length: usize,
-        prior_covariance: f64,
+        prior_covariance: Option<f64>,
+        forgetting: f64,
+        terms: InitialArg,
     ) -> PyResult<Self> {
         let equations = equations
             .into_iter()
             .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed.into())))
             .collect::<PyResult<Vec<_>>>()?;
-        let inner =
-            run_detached(py, || StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance))?;
+        let options = StreamingOptions { length, prior: prior(prior_covariance), forgetting, initial: initial(terms)? };
+        let inner = run_detached(py, || StreamingFit::new(step, longest, &inputs, &equations, options))?;
         Ok(Self { inner })
     }
 
-    /// Append samples, shape (n, signals).
+    /// Append samples, shape (n, signals). Return the coefficients of all equations after each.
     #[allow(clippy::needless_pass_by_value)]
-    fn push(&mut self, py: Python<'_>, samples: PyReadonlyArray2<'_, f64>) -> PyResult<()> {
-        let samples = rows(&samples)?;
+    fn push<'py>(
+        &mut self,
+        py: Python<'py>,
+        samples: PyReadonlyArray2<'py, f64>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let (samples, count) = (rows(&samples)?, self.inner.coefficient_count());
         let inner = &mut self.inner;
-        run_detached(py, || samples.iter().try_for_each(|sample| inner.push(sample)))
+        let found = run_detached(py, || {
+            let mut found = Vec::with_capacity(samples.len() * count);
+            for sample in &samples {
+                inner.push(sample)?;
+                inner.append_coefficients(&mut found);
+            }
+            Ok(found)
+        })?;
+        PyArray1::from_vec(py, found).reshape([samples.len(), count])
     }
 
     #[getter]

@@ -171,6 +171,7 @@ pub fn pulse_mean_rows<'py>(
 ) -> PyResult<Matrix<'py>> {
     let batch = Batch::new("samples", &samples)?;
     let count = batch.count();
+    check_points("m", m)?;
     check_points("values of all rows", m.saturating_mul(count))?;
     let between = if hold { Intersample::Hold } else { Intersample::Linear };
     let values = run_interruptible(py, batch.values.len(), None, move |stop| {
@@ -189,7 +190,7 @@ pub fn pulse_mean_rows<'py>(
 /// One row a problem, or with `path` the coefficients after every row.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
-pub fn multi_innovation_estimate<'py>(
+pub fn multi_innovation_rows<'py>(
     py: Python<'py>,
     q: PyReadonlyArray2<'py, f64>,
     m: PyReadonlyArray1<'py, f64>,

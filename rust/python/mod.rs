@@ -24,9 +24,9 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::operators::{
-        block_pulse_kernel, block_pulse_matrix, delay_samples, filter_series, fractional_derivative,
-        fractional_integral, grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix,
-        point_samples, pulse_means, series_divide, series_multiply,
+        block_pulse_matrix, delay_samples, filter_series, fractional_derivative, fractional_integral,
+        grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix, point_samples,
+        series_divide, series_multiply,
     };
 
     #[pymodule_export]
@@ -34,7 +34,7 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::kernels::{
-        block_pulse_kernels, multi_innovation_estimate, pulse_mean_rows, toeplitz_apply, toeplitz_solve,
+        block_pulse_kernels, multi_innovation_rows, pulse_mean_rows, toeplitz_apply, toeplitz_solve,
     };
 
     #[pymodule_export]

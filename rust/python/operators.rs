@@ -6,36 +6,20 @@ use pyo3::prelude::*;
 use super::convert::{check_size, columns, copy_vector, matrix, rows, stack_rows, vector, List};
 use super::errors::run_detached;
 use crate::equation::Filter;
-use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
+use crate::error::{check_dense, check_finite, check_length, check_points, Error};
 use crate::fractional::integral::{self, Derivative, IntegralRule};
 use crate::fractional::kernels;
 use crate::fractional::operational_matrices;
 use crate::linalg::dense;
 use crate::python::order_search::watch::run_interruptible;
 use crate::series;
-use crate::signal::block_pulse::{self, Intersample};
+use crate::signal::block_pulse;
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 type Matrix<'py> = Bound<'py, PyArray2<f64>>;
 
 fn choice(name: &str, given: &str, known: &str) -> Error {
     Error::Structure { what: format!("{name} '{given}' is not known"), remedy: format!("use one of {known}") }
-}
-
-#[pyfunction]
-#[pyo3(signature = (order, m, step, *, derivative = false))]
-pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, derivative: bool) -> PyResult<Array<'_>> {
-    let kernel = run_interruptible(py, m, None, move |_| {
-        check_points("m", m)?;
-        kernels::check_order("order", order)?;
-        check_step(step)?;
-        Ok(if derivative {
-            kernels::block_pulse_kernel_derivative(order, m, step)
-        } else {
-            kernels::block_pulse_kernel(order, m, step)
-        })
-    })?;
-    Ok(PyArray1::from_vec(py, kernel))
 }
 
 #[pyfunction]
@@ -207,18 +191,6 @@ pub fn fractional_derivative<'py>(
 fn join_rows(py: Python<'_>, all: Vec<Vec<f64>>, width: usize) -> PyResult<Matrix<'_>> {
     use numpy::PyArrayMethods;
     PyArray1::from_vec(py, all.concat()).reshape([all.len(), width])
-}
-
-#[pyfunction]
-pub fn pulse_means<'py>(
-    py: Python<'py>,
-    samples: PyReadonlyArray1<'py, f64>,
-    m: usize,
-    hold: bool,
-) -> PyResult<Array<'py>> {
-    let samples = vector("samples", &samples)?;
-    let between = if hold { Intersample::Hold } else { Intersample::Linear };
-    Ok(PyArray1::from_vec(py, run_detached(py, || block_pulse::pulse_means(&samples, m, between))?))
 }
 
 #[pyfunction]

@@ -193,6 +193,15 @@ impl Recording {
         })
     }
 
+    /// Recording of uniform samples whose outputs are the channels of that role, in their sequence.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn from_channels(step: f64, channels: Vec<Channel>) -> Result<Self> {
+        let outputs = (0..channels.len()).filter(|&signal| channels[signal].role == Role::Output).collect();
+        Self::new("run", step, None, channels, outputs)
+    }
+
     /// Signals of the recording.
     #[must_use]
     pub fn channels(&self) -> &[Channel] {

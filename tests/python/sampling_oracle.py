@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ftlm import _core
+from ftlm import _core, kernels
 from ftlm.simulation.discretization import apply_input_nonlinearity, compared_times, compared_values, sensor_series
 from ftlm.simulation.discretization import has_nonuniform_samples as is_nonuniform
 from ftlm.simulation.initial_conditions import resolve_initial_conditions
@@ -187,7 +187,7 @@ def means_of(run, structure, name, m, at_rest):
     """Pulse means of one signal of a run that already acts."""
     if name not in run:
         rate = np.sign(np.diff(run[name.removeprefix("coulomb_")]))
-        return _core.pulse_means(np.append(rate, rate[-1]), m, True)
+        return kernels.pulse_means(np.append(rate, rate[-1]), m, hold=True)
     samples, delay, step = gapless(run[name]), structure.delay.get(name, 0.0), run.duration / m
     held, before = run.intersample.get(name) == "zoh", 0.0 if at_rest else float(run[name][0])
     if run.sample_times is not None and name not in run.missing_samples:
@@ -197,7 +197,7 @@ def means_of(run, structure, name, m, at_rest):
         every = m // intervals if held and m % intervals == 0 else 1
         samples = np.repeat(samples, every)[: intervals * every + 1]
         samples = _core.delay_samples(samples, delay / run.step * every, before)
-    return _core.pulse_means(samples, m, held)
+    return kernels.pulse_means(samples, m, hold=held)
 
 
 def pulses(run, structure, m, filtered):

@@ -12,10 +12,10 @@ from test_store import EQUATION, bytes_of
 BOXED = 1 << 25
 
 
-def search(run, *, alpha=(1.05, 2.0), threads=2, **options):
+def search(run, *, alpha=(1.05, 2.0), threads=2, coefficients="least-squares", **options):
     equation = ftlm.equation(EQUATION, initial="rest")
     lattice = ftlm.order_grid(increment=0.015, alpha=alpha)
-    return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=64, threads=threads, **options)
+    return ftlm.search_orders(run, equation, lattice, coefficients=coefficients, m=64, threads=threads, **options)
 
 
 def rows_of(found):
@@ -92,9 +92,42 @@ def unruly():
     return ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y}, name="unruly")
 
 
-def closely(run, path=None, highest=2.0, **options):
+def closely(run, path=None, highest=2.0, coefficients="least-squares", **options):
     equation, lattice = ftlm.equation(EQUATION, initial="rest"), ftlm.order_grid(increment=0.05, alpha=(1.15, highest))
-    return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=32, store=path, **options)
+    return ftlm.search_orders(run, equation, lattice, coefficients=coefficients, m=32, store=path, **options)
+
+
+@pytest.mark.parametrize(("p", "prior"), [(1, None), (7, 1e-3), (7, 1.0), (7, 1e6)])
+def test_close_proofs_keep_the_table_of_multi_innovation(unruly, p, prior):
+    options = {"coefficients": "multi-innovation", "innovation_length": p, "prior_covariance": prior, "threads": 2}
+    quick, slow = closely(unruly, **options), closely(unruly, pruning=False, **options)
+    assert rows_of(quick) == rows_of(slow)
+    assert sum(quick.exclusion_counts.values()) + len(quick.table) == quick.candidates
+    if prior is None:
+        # As many as for least squares, whose coefficients these are to rounding.
+        expected = closely(unruly, threads=2).exclusion_counts["bound"]
+        assert quick.exclusion_counts["bound"] == pytest.approx(expected, rel=0.01)
+
+
+def test_boxes_keep_the_table_of_squared_equation_errors_of_multi_innovation(run):
+    options = {"criterion": "equation-error", "norm": "l2", "coefficients": "multi-innovation"}
+    for prior in (None, 1.0):
+        whole = search(run, prior_covariance=prior, **options)
+        check_one_by_one(run, whole, prior_covariance=prior, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("p", [1, 7])
+@pytest.mark.parametrize("prior", [1.0, 1e6])
+def test_one_slab_of_the_paper_keeps_the_rows_of_brute_force(clean_a, p, prior):
+    equation = ftlm.flexible_link(form="published", stage=1).equation("theta12")
+    options = {"coefficients": "multi-innovation", "innovation_length": p, "prior_covariance": prior, "threads": 2}
+    grid = ftlm.order_grid(increment=0.02, alpha=(1.91, 1.91))
+    quick = ftlm.search_orders(clean_a, equation, grid, **options)
+    slow = ftlm.search_orders(clean_a, equation, grid, pruning=False, **options)
+    assert quick.candidates > 1 << 18
+    assert len(quick.table) == 20
+    assert rows_of(quick) == rows_of(slow)
 
 
 def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tmp_path):

@@ -166,3 +166,18 @@ def test_the_command_line_proves_it_for_each_equation(csv, proved):
         refused = CliRunner().invoke(app, [*words, *options])
         assert refused.exit_code == 2, options
         assert said in refused.stderr
+
+
+def test_given_tuples_are_scored_and_told_apart(run, equation, proved):
+    worse = {name: low for name, (low, _) in proved.intervals.items()} | {"alpha": proved.intervals["alpha"][1]}
+    found = ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128, start=[proved.orders, worse])
+    assert found.lower_bound == proved.lower_bound
+    assert found.start_errors[0] == pytest.approx(proved.best, rel=1e-6)
+    assert found.start_errors[1] > found.start_errors[0]
+    assert found.beatable == (False, True)
+    assert "start 1: " in str(found)
+    assert "may still be beaten" in str(found)
+    assert found.to_dict()["beatable"] == [False, True]
+    for bad in ({"alpha": 1.0}, {**proved.orders, "alpha": 5.0}):
+        with pytest.raises(ftlm.ModelError, match=r"start 1 of 2 is .*; give alpha from "):
+            ftlm.certify_orders(run, equation, LATTICE, m=128, start=[proved.orders, bad])

@@ -259,7 +259,7 @@ BAD = {
     "order of an operator NaN": (
         MODEL,
         "order = NaN is outside [0, 10]",
-        lambda: ftlm.block_pulse_matrix(math.nan, 4, 1.0),
+        lambda: ftlm.block_pulse_matrix(math.nan, 4, step=1.0),
     ),
     "order of an operator in words": (
         MODEL,
@@ -269,20 +269,24 @@ BAD = {
     "step of 0": (MODEL, "step = 0 is outside (0, ∞)", lambda: ftlm.fractional_integral(Y, 0.5, step=0)),
     "step NaN": (MODEL, "step = NaN is outside (0, ∞)", lambda: ftlm.fractional_derivative(Y, 0.5, step=math.nan)),
     "step in words": (MODEL, "step = None is not a number", lambda: ftlm.fractional_derivative(Y, 0.5, step=None)),
-    "duration of 0": (MODEL, "duration = 0 s is not positive", lambda: ftlm.block_pulse_matrix(0.5, 4, 0)),
-    "duration infinite": (MODEL, "duration = inf s is not positive", lambda: ftlm.operational_matrix(0.5, 4, math.inf)),
+    "step of a matrix": (MODEL, "step = 0 is outside", lambda: ftlm.block_pulse_matrix(0.5, 4, step=0)),
+    "step infinite": (MODEL, "step = inf is outside", lambda: ftlm.operational_matrix(0.5, 4, step=math.inf)),
     "matrix of 0 pulses": (MODEL, "m = 0 is no number of pulses", lambda: ftlm.haar_matrix(0)),
-    "matrix of half a pulse": (MODEL, "m = 2.5 is no number of pulses", lambda: ftlm.block_pulse_matrix(0.5, 2.5, 1)),
+    "matrix of half a pulse": (
+        MODEL,
+        "m = 2.5 is no number of pulses",
+        lambda: ftlm.block_pulse_matrix(0.5, 2.5, step=1),
+    ),
     "matrix beyond memory": (MODEL, "m = 32768 is outside [1, 16384]", lambda: ftlm.haar_matrix(1 << 15)),
     "matrix beyond all machines": (
         MODEL,
         "m = 1e+300 is no number of pulses",
-        lambda: ftlm.block_pulse_matrix(0.5, 1e300, 1),
+        lambda: ftlm.block_pulse_matrix(0.5, 1e300, step=1),
     ),
     "Haar matrix of three": (
         MODEL,
         "a power of two, not 3; take m = 2 or 4",
-        lambda: ftlm.operational_matrix(0.5, 3, 1.0),
+        lambda: ftlm.operational_matrix(0.5, 3, step=1.0),
     ),
     # Equations and models
     "negative delay": (MODEL, "delay of u = -0.1 s", lambda: ftlm.equation("D y = a y + b u", delay={"u": -0.1})),
@@ -539,12 +543,12 @@ def hostile_calls(order, alpha, step, signal, output, values, coefficient, expon
         lambda: _core.filter_series([(coefficient, order)], [(1.0, alpha)], 8, step),
         lambda: _core.fractional_integral(means, order, step, "trapezoidal"),
         lambda: _core.fractional_derivative(means, order, step, "caputo", means),
-        lambda: _core.pulse_means(means[0], 7, True),
+        lambda: _core.pulse_mean_rows(means, 7, True),
         lambda: _core.delay_samples(means[0], order, coefficient),
         lambda: _core.series_divide(means[0], means[1]),
         lambda: _core.metrics(means[0], means[1]),
         lambda: _core.nyquist_margin([(coefficient, order)], step),
-        lambda: _core.block_pulse_kernel(order, 9, step, derivative=True),
+        lambda: _core.block_pulse_kernels(np.array([order]), 9, step, derivative=True),
     )
     for k, call in enumerate(calls):
         try:
@@ -585,4 +589,4 @@ def test_a_panic_is_an_internal_error(where, capfd):
 def test_arrays_of_another_kind_are_a_type_error():
     for bad in (np.ones(4, np.float32), np.ones(4, int), [1.0, 2.0], np.ones((2, 2))):
         with pytest.raises(TypeError):
-            _core.pulse_means(bad, 4, True)
+            _core.point_samples(bad)

@@ -55,7 +55,7 @@ def work(i):
     if i:
         for power in range(10, 24):
             going.wait()
-            _core.block_pulse_kernel(0.5, 1 << power, 0.1)
+            _core.block_pulse_kernels(np.array([0.5]), 1 << power, 0.1)
     x = np.zeros(1 << 17)
     while True:
         for length in range(1 << 16, 1 << 17, 1 << 10):

@@ -8,8 +8,8 @@ import pytest
 from scipy.signal import lsim
 
 import ftlm
-from ftlm import _core
 from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.kernels import block_pulse_kernel
 from ftlm.simulation import step_refinement
 from ftlm.structure.structure import Structure
 
@@ -52,8 +52,8 @@ def exact(modes: list[tuple[float, float]], u: np.ndarray, step: float, *, linea
 
 @pytest.mark.parametrize("eta", [3.5, 5.0, 7.3, 10.0])
 def test_kernels_are_exact(eta: float) -> None:
-    kernel = _core.block_pulse_kernel(eta, 1 << 17, 1.0)
-    slope = _core.block_pulse_kernel(eta, 1 << 17, 1.0, derivative=True)
+    kernel = block_pulse_kernel(eta, 1 << 17, step=1.0)
+    slope = block_pulse_kernel(eta, 1 << 17, step=1.0, derivative=True)
     with mpmath.workdps(60):
         for n in LENGTHS:
 

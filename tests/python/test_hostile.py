@@ -280,7 +280,7 @@ SIZES = {
     "duration of a loop": lambda n: rig.control(lambda *_: (0.0, 0.0), (0.0, 0.0), duration=n),
     "step of a resampling": lambda n: run_of().resample(1.0 / n),
     "size of a Haar matrix": lambda n: ftlm.haar_matrix(1 << int(n).bit_length()),
-    "size of an operational matrix": lambda n: ftlm.operational_matrix(0.5, 1 << int(n).bit_length(), 1.0),
+    "size of an operational matrix": lambda n: ftlm.operational_matrix(0.5, 1 << int(n).bit_length(), step=1.0),
     "block pulses": lambda n: ftlm.identify(run_of(), FREE, method="least-squares", m=int(n)),
     "increment of a grid": lambda n: ftlm.search_orders(run_of(), FREE, ftlm.order_grid(1.0 / n), m=64),
     "lags": lambda n: ftlm.resid(LINK, run_of(), lags=int(n)),
@@ -355,7 +355,7 @@ def interrupted(name, *a, **k):
         raise KeyboardInterrupt
     return real(name, *a, **k)
 builtins.__import__ = interrupted
-print(_core.pulse_means(numpy.ones(4), 3, True))
+print(_core.pulse_mean_rows(numpy.ones((1, 4)), 3, True)[0])
 """
 
 
@@ -395,7 +395,7 @@ def test_more_points_than_memory_holds_are_refused():
         with pytest.raises(ftlm.ModelError, match="m = "):
             _core.series_multiply(np.ones(3), np.ones(3), m)
         with pytest.raises(ftlm.ModelError, match="m = "):
-            _core.pulse_means(np.ones(3), m, False)
+            _core.pulse_mean_rows(np.ones((1, 3)), m, False)
         with pytest.raises(ftlm.ModelError, match="m = "):
             _core.filter_series([(1.0, 0.0)], [(1.0, 0.0), (1.0, 1.0)], m, 0.1)
 

@@ -74,8 +74,19 @@ def test_multi_innovation_is_the_oracles(small_run, structure, p, k0):
         assert found.settings[name] == value
 
 
+def test_the_default_prior_is_relative_to_the_regressors(small_run, structure):
+    found = ftlm.identify(small_run, structure, method="multi-innovation", m=256)
+    ((q, y),) = regression([small_run], 256)
+    expected = oracles.multi_innovation_closed_form(q, y, 7, np.diag(1e10 / np.sum(q**2, axis=0)))
+    assert [found.coefficients[n] for n in "acb"] == pytest.approx(list(expected), rel=1e-9)
+    trace = ftlm.multi_innovation_trace(small_run, structure, m=256)
+    assert [trace.coefficients[n][-1] for n in "acb"] == pytest.approx(list(expected), rel=1e-6)
+    assert "p = 7, weak prior, haar rows" in found.details()
+
+
 def test_multi_innovation_in_the_order_of_time_takes_any_number_of_pulses(small_run, structure):
-    found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(row_basis="time"), m=300)
+    method = ftlm.MultiInnovation(row_basis="time", prior_covariance=1.0)
+    found = ftlm.identify(small_run, structure, method=method, m=300)
     y, u = (oracles.pulse_means(small_run[n], 300, how) for n, how in (("y", "foh"), ("u", "zoh")))
     q = oracles.regressors([y, y, u], [0.6, 0.0, 0.0], 1.6, small_run.duration, haar=False)
     expected = oracles.multi_innovation_closed_form(q, y, 7, 1.0)
@@ -104,7 +115,8 @@ def test_several_runs_are_one_fit(small_run, second, structure, method, with_noi
         expected = oracles.least_squares(np.vstack([q for q, _ in parts]), np.concatenate([y for _, y in parts]))
     else:
         weights = np.array([min(7, 256 - k) for k in range(256)])
-        normal = sum(q.T @ (weights[:, None] * q) for q, _ in parts) + np.eye(3)
+        prior = np.diag(sum(np.sum(q**2, axis=0) for q, _ in parts)) / 1e10
+        normal = sum(q.T @ (weights[:, None] * q) for q, _ in parts) + prior
         expected = np.linalg.solve(normal, sum(q.T @ (weights * y) for q, y in parts))
     assert [found.coefficients[n] for n in "acb"] == pytest.approx(list(expected), rel=1e-8)
     assert [name for name, _, _ in found.comparison.per_run] == [run.name for run in runs]
@@ -330,10 +342,24 @@ def test_a_prior_that_pulls_is_named(small_run, structure):
     assert weakest.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
 
 
+def test_a_prior_that_decides_the_ranking_is_named(small_run):
+    free = ftlm.equation("D^alpha y = a0 y + b u", initial="rest")
+    grid = ftlm.order_grid(increment=0.2)
+    strong = ftlm.identify(small_run, free, method=ftlm.MultiInnovation(prior_covariance=1e-4, order_grid=grid), m=256)
+    (finding,) = (f for f in strong.findings if f.code == "prior_ranks")
+    assert finding.text.startswith(
+        "y: the prior decides which orders lead: with K0 = 0.0001 the best candidate leaves "
+    )
+    for usual in (None, 1e8):
+        method = ftlm.MultiInnovation(prior_covariance=usual, order_grid=grid)
+        found = ftlm.identify(small_run, free, method=method, m=256)
+        assert not [f for f in found.findings if f.code in ("prior_ranks", "prior_pulls")]
+
+
 def test_the_papers_prior_on_plant_a_is_named(clean_a, plants):
     # K0 = 1 in SI units: a1 = 1.25 for 629. The paper's columns show the same pull.
     structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
-    found = ftlm.identify(clean_a, structure, method="multi-innovation")
+    found = ftlm.identify(clean_a, structure, method=ftlm.MultiInnovation(prior_covariance=1.0))
     assert found.settings["m"] == 2048
     assert found.coefficients["a1"] == pytest.approx(1.25, abs=0.01)
     for output in ("theta11", "theta12"):
@@ -410,7 +436,7 @@ def test_the_last_row_of_a_trace_is_the_closed_form(small_run, structure, p, row
 
 
 def test_a_trace_is_the_recursion_of_the_oracle(small_run, structure):
-    trace = ftlm.multi_innovation_trace(small_run, structure, innovation_length=3, m=128)
+    trace = ftlm.multi_innovation_trace(small_run, structure, innovation_length=3, prior_covariance=1.0, m=128)
     ((q, y),) = regression([small_run], 128)
     path = oracles.multi_innovation_recursion(q, y, 3, 1.0)
     for k, name in enumerate("acb"):

@@ -31,7 +31,7 @@ def test_integrals_are_products_with_dense_matrices(m):
     found = kernels.integrate(x[:, None], ORDERS, step=STEP)
     assert found.shape == (3, 4, m)
     for order, integrals in zip(ORDERS, found.swapaxes(0, 1), strict=True):
-        expected = x @ ftlm.block_pulse_matrix(order, m, m * STEP)
+        expected = x @ ftlm.block_pulse_matrix(order, m, step=STEP)
         np.testing.assert_allclose(integrals, expected, rtol=1e-10, atol=1e-12 * np.abs(expected).max())
 
 
@@ -256,3 +256,65 @@ def test_candidates_without_an_estimate_are_marked():
 def test_wrong_arguments_are_refused_in_words(call, words):
     with pytest.raises(ftlm.FtlmError, match=words):
         call()
+
+
+def test_a_recursion_ends_at_the_rows_so_far():
+    y, u = np.cumsum(noise(2, 60), axis=1)
+    stream = kernels.Recursion([1.3, 0.4, 0.0], [0, 1], step=STEP, hold=[False, True], p=3, prior_covariance=1e4)
+    path = stream.push(np.stack([y, u], axis=1)[:50])
+    assert path.shape == (50, 2)
+    np.testing.assert_array_equal(path[-1], stream.coefficients)
+    means = np.stack([kernels.pulse_means(y, hold=False), kernels.pulse_means(u, hold=True)])
+    q = kernels.integrate(means, [0.9, 1.3], step=STEP).T
+    for rows in (5, 49):
+        expected = kernels.multi_innovation(q[:rows], means[0, :rows], 3, prior_covariance=1e4)
+        np.testing.assert_allclose(path[rows], expected, rtol=1e-8)
+    more = stream.push(np.stack([y, u], axis=1)[50:])
+    expected = kernels.multi_innovation(q, means[0], 3, prior_covariance=1e4)
+    np.testing.assert_allclose(more[-1], expected, rtol=1e-8)
+    assert stream.pulses == 59
+
+
+def test_a_recursion_forgets_by_powers_of_its_factor():
+    y, u = np.cumsum(noise(2, 80), axis=1)
+    stream = kernels.Recursion([1.0, 0.0], [1], step=STEP, hold=[False, True], p=1, forgetting=0.9)
+    (found,) = stream.push(np.stack([y, u], axis=1))[-1]
+    target, means = kernels.pulse_means(y), kernels.pulse_means(u, hold=True)
+    q = kernels.integrate(means, 1.0, step=STEP)
+    weights = 0.9 ** np.arange(78, -1, -1)
+    assert found == pytest.approx((weights * q) @ target / ((1 + 1e-10) * (weights * q) @ q), rel=1e-9)
+
+
+def test_a_start_in_motion_is_a_term_of_a_recursion():
+    u = np.repeat([1.0, -1.0, 0.5, 2.0], 25)
+    t = np.arange(100) * STEP
+    y = 3.0 + 0.7 * t  # its input has the coefficient 0
+    for initial in ([0.0, 1.0], "caputo"):
+        stream = kernels.Recursion([2.0, 0.0], [1], step=STEP, hold=[False, True], initial=initial)
+        stream.push(np.stack([y, u], axis=1))
+        np.testing.assert_allclose(stream.coefficients, [0.0, 3.0, 0.7], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: kernels.Recursion([1.0, 0.0], [2], step=STEP, hold=[False, True]), "terms = 2 is no row of 2 signals"),
+        (lambda: kernels.Recursion([1.0], [1], step=STEP, hold=[False, True]), r"orders has shape \(1,\); give \(2,\)"),
+        (lambda: kernels.Recursion([2.5, 0.0], [1], step=STEP, hold=[False, True]), r"outside \[0, 2\]"),
+        (
+            lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], forgetting=0.0),
+            "forgetting factor = 0",
+        ),
+        (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], initial=[-1.0]), r"exponent"),
+        (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], initial="rest"), "initial = 'rest'"),
+        (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], p=0), "p = 0 is no whole number from 1"),
+        (lambda: STREAM.push(np.ones(3)), r"samples has shape \(3,\); give \(n, 2\)"),
+        (lambda: STREAM.push([[0.0, np.nan]]), r"samples is not finite at index \[0, 1\]"),
+    ],
+)
+def test_what_a_recursion_cannot_do_is_refused(call, words):
+    with pytest.raises(ftlm.FtlmError, match=words):
+        call()
+
+
+STREAM = kernels.Recursion([1.0, 0.0], [1], step=STEP, hold=[False, True])

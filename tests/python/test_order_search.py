@@ -70,7 +70,7 @@ class Record:
         return np.stack(means, axis=1) if means else np.zeros((self.m, 0))
 
 
-def evaluate(records, o, criterion, norm, coefficients, row_basis, exponents=(), p=7, k0=1.0):
+def evaluate(records, o, criterion, norm, coefficients, row_basis, exponents=(), p=7, k0=None):
     """Score and coefficients of one candidate."""
     blocks, targets, weights = [], [], []
     for i, r in enumerate(records):
@@ -85,7 +85,8 @@ def evaluate(records, o, criterion, norm, coefficients, row_basis, exponents=(),
     if coefficients == "least-squares":
         x = oracles.least_squares(q, y)
     else:
-        x = np.linalg.solve(q.T @ (w[:, None] * q) + np.eye(q.shape[1]) / k0, q.T @ (w * y))
+        prior = np.sum(q**2, axis=0) / 1e10 if k0 is None else np.full(q.shape[1], 1 / k0)
+        x = np.linalg.solve(q.T @ (w[:, None] * q) + np.diag(prior), q.T @ (w * y))
     raw, points = 0.0, 0
     for i, r in enumerate(records):
         initial = r.powers(exponents) @ x[3 + i * len(exponents) : 3 + (i + 1) * len(exponents)]
@@ -143,6 +144,19 @@ def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
     assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, row_basis="haar", **options))
     assert found.settings["innovation_length"] == p
     assert found.settings["prior_covariance"] == k0
+
+
+@pytest.mark.parametrize(("of_y", "of_u"), [(1e3, 1.0), (1e-3, 1.0), (1.0, 1e3), (180 / np.pi, 1e-3)])
+def test_units_of_signals_change_no_order_under_the_default_prior(run, of_y, of_u):
+    scaled = ftlm.Run.from_arrays(
+        step=run.step, inputs={"u": of_u * run["u"]}, outputs={"y": of_y * run["y"]}, name=run.name
+    )
+    found, expected = search(scaled), search(run)
+    for row, other in zip(found.table, expected.table, strict=True):
+        assert row.orders == other.orders
+        assert row.score == pytest.approx(of_y * other.score, rel=1e-9)
+        for name, value in other.coefficients.items():
+            assert row.coefficients[name] == pytest.approx(value * (of_y / of_u if name == "b" else 1.0), rel=1e-6)
 
 
 @pytest.mark.parametrize("norm", ["l1", "l2"])
@@ -764,7 +778,7 @@ def test_settings_state_what_matters_and_nothing_else():
         "norm": "l1",
         "coefficients": "multi-innovation",
         "innovation_length": 7,
-        "prior_covariance": 1.0,
+        "prior_covariance": None,
         "row_basis": "haar",
     }
     plain = replace(made, coefficients="least-squares")

@@ -8,6 +8,7 @@ from scipy.linalg import solve_triangular, toeplitz
 
 from ftlm import _core
 from ftlm.errors import FtlmError
+from ftlm.kernels import block_pulse_kernel
 
 STEP = 0.02
 SIGNALS, INPUTS = 3, [False, True, True]
@@ -15,7 +16,7 @@ SIGNALS, INPUTS = 3, [False, True, True]
 
 def integral(eta: float, m: int) -> np.ndarray:
     """Lower triangular matrix of I^eta."""
-    return np.tril(toeplitz(_core.block_pulse_kernel(eta, m, STEP)))
+    return np.tril(toeplitz(block_pulse_kernel(eta, m, step=STEP)))
 
 
 def records(*, filtered: bool) -> list[tuple[float, np.ndarray, np.ndarray | None]]:

@@ -40,15 +40,24 @@ def test_a_stream_ends_at_the_batch_closed_form(run, stage, p, k0, allowed):
         assert value == pytest.approx(truth[name], rel=allowed), name
 
 
+@pytest.mark.parametrize("p", [1, 7])
+def test_the_default_prior_of_a_stream_is_that_of_the_batch(run, stage, p):
+    stream = Streaming(stage, step=run.step, longest=5.0, innovation_length=p)
+    stream.push(samples(stream, run))
+    truth = batch(run, stage, innovation_length=p)
+    for name, value in stream.coefficients.items():
+        assert value == pytest.approx(truth[name], rel=1e-5), name
+
+
 def test_every_length_of_a_stream_is_the_closed_form_of_that_length(run, stage):
-    stream = Streaming(stage, step=run.step, longest=5.0)
+    stream = Streaming(stage, step=run.step, longest=5.0, prior_covariance=1.0)
     done = 0
     for rows in (40, 41, 300, 1001):
         stream.push(samples(stream, run)[done:rows])
         done = rows
         part = run.window(0.0, rows * run.step)
         assert part.length == rows
-        truth = batch(part, stage)
+        truth = batch(part, stage, prior_covariance=1.0)
         for name, value in stream.coefficients.items():
             assert value == pytest.approx(truth[name], rel=1e-8), (rows, name)
 
@@ -81,9 +90,9 @@ def test_a_term_of_higher_order_than_the_output_is_streamed():
 
 def test_fixed_coefficients_are_kept(run, stage):
     fixed = stage.equation("theta11").with_coefficients({"b1": -62.956})
-    stream = Streaming(fixed, step=run.step, longest=5.0)
+    stream = Streaming(fixed, step=run.step, longest=5.0, prior_covariance=1.0)
     stream.push(samples(stream, run))
-    truth = batch(run, fixed)
+    truth = batch(run, fixed, prior_covariance=1.0)
     assert set(stream.coefficients) == {"a1", "d1", "g1"}
     for name, value in stream.coefficients.items():
         assert value == pytest.approx(truth[name], rel=1e-8)

@@ -116,7 +116,7 @@ def dense_response(stage, p, m):
 
     def integral(eta):
         # Row vectors of coefficients times F: columns here.
-        return block_pulse_matrix(eta, m, 10.0).T
+        return block_pulse_matrix(eta, m, step=10.0 / m).T
 
     def blocks(n, own_letters):
         alpha, found = orders[f"alpha{n}"], {"own": np.zeros((m, m)), "other": np.zeros((m, m))}

@@ -1,12 +1,13 @@
 //! Boxes of orders: no box's bound exceeds a score of its candidates, and boxes change no table.
 
-use ftlm::equation::{Equation, Initial};
+use ftlm::equation::Equation;
+use ftlm::estimation::multi_innovation::{Innovation, Prior, RowBasis};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::branch_and_bound::{box_bounds, open_candidates, BoxBound};
 use ftlm::order_search::control::Control;
 use ftlm::order_search::dual_bound::lower_bounds;
 use ftlm::order_search::grid::{OrderGrid, TermAxis};
-use ftlm::order_search::options::{Criterion, Norm, Options};
+use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::regressors::Record;
 use ftlm::simulate::respond;
 
@@ -63,10 +64,16 @@ fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
             1 => (Criterion::EquationError, Norm::L2),
             _ => (Criterion::OutputError, Norm::L1),
         };
+        let prior = [Prior::WEAK, Prior::Absolute(1e-3), Prior::Absolute(1.0), Prior::Absolute(1e6)][random.below(4)];
+        let row_basis = RowBasis::Time;
+        let estimator = match random.below(3) {
+            0 => Estimator::LeastSquares,
+            n => Estimator::MultiInnovation(Innovation { length: [1, 7][n - 1], prior, row_basis }),
+        };
         let samples: usize = records.iter().map(Record::m).sum();
         // Brute force, which asks no bound.
-        let options =
-            Options { criterion, norm, top: 10_000, pruning: false, initial: Initial::Rest, ..Options::default() };
+        let bounded = Options { criterion, norm, estimator, ..Options::default() };
+        let options = Options { top: 10_000, pruning: false, ..bounded.clone() };
         let fixed = vec![None; lattice.width()];
         let found = search(&records, &lattice, &fixed, &options, &Control::default()).unwrap();
         let mut scores = vec![f64::INFINITY; lattice.count() as usize];
@@ -83,8 +90,8 @@ fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
         for index in [0, lattice.count() / 2, lattice.count() - 1] {
             let limit = ranked[random.below(ranked.len().min(20))];
             let (from, to) = (random.below(scores.len()) as u64 / 2, lattice.count());
-            let left = open_candidates(&records, &lattice, criterion, norm, index, from..to, limit).unwrap();
-            let all = box_bounds(&records, &lattice, criterion, norm, index).unwrap();
+            let left = open_candidates(&records, &lattice, &bounded, index, from..to, limit).unwrap();
+            let all = box_bounds(&records, &lattice, &bounded, index).unwrap();
             if let Some(slab) = all.iter().max_by_key(|b| b.rows * b.values) {
                 let within = slab.first.max(from)..slab.first + slab.rows * slab.stride;
                 assert!(left.iter().all(|i| within.contains(i)));

@@ -4,7 +4,7 @@
 use ftlm::equation::{Initial, Structure};
 use ftlm::error::Error;
 use ftlm::estimation::least_squares::{self, Regression};
-use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, RowBasis};
+use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, Prior, RowBasis};
 use ftlm::fractional::operational_matrices;
 use ftlm::linalg::small::{self, packed_index};
 use ftlm::parallel::pool;
@@ -193,12 +193,12 @@ fn what_cannot_be_fitted_is_refused() {
     // Fewer rows than coefficients.
     let short = obeying(&model, 3, 0.01, &[], 0.0, 51);
     assert!(matches!(fit(&[short], &FREE), Err(Error::Singular { .. })));
-    let innovation = Innovation { length: 1, prior_covariance: 1.0, row_basis: RowBasis::Haar };
+    let innovation = Innovation { length: 1, prior: Prior::Absolute(1.0), row_basis: RowBasis::Haar };
     for bad in [
         Innovation { length: 0, ..innovation },
-        Innovation { prior_covariance: 0.0, ..innovation },
-        Innovation { prior_covariance: f64::NAN, ..innovation },
-        Innovation { prior_covariance: f64::INFINITY, ..innovation },
+        Innovation { prior: Prior::Absolute(0.0), ..innovation },
+        Innovation { prior: Prior::Absolute(f64::NAN), ..innovation },
+        Innovation { prior: Prior::Absolute(f64::INFINITY), ..innovation },
     ] {
         let found = closed_form(std::slice::from_ref(&record), &model.structure, &FREE, &Initial::Rest, &bad);
         assert!(matches!(found, Err(Error::OutOfRange { .. })));
@@ -267,7 +267,7 @@ fn the_recursion_is_the_published_one() {
     let record = obeying(&model, 128, 0.02, &[], 0.02, 56);
     for rows in [RowBasis::Haar, RowBasis::Time] {
         for length in [1, 2, 5, 200] {
-            let innovation = Innovation { length, prior_covariance: 10.0, row_basis: rows };
+            let innovation = Innovation { length, prior: Prior::Absolute(10.0), row_basis: rows };
             let records = std::slice::from_ref(&record);
             let (found, _) = recursion(records, &model.structure, &FREE, &Initial::Rest, &innovation).unwrap();
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
@@ -301,7 +301,7 @@ fn the_recursion_ends_at_the_closed_form() {
         for rows in [RowBasis::Haar, RowBasis::Time] {
             for length in [1, 3, 5, 7] {
                 for prior_covariance in [1.0, 100.0] {
-                    let innovation = Innovation { length, prior_covariance, row_basis: rows };
+                    let innovation = Innovation { length, prior: Prior::Absolute(prior_covariance), row_basis: rows };
                     let closed = closed_form(records, &model.structure, fixed, &initial, &innovation).unwrap();
                     let (ended, trace) = recursion(records, &model.structure, fixed, &initial, &innovation).unwrap();
                     worst = worst.max(relative_distance(&ended.coefficients, &closed.coefficients));
@@ -320,7 +320,7 @@ fn the_recursion_ends_at_the_closed_form() {
 
 #[test]
 fn every_row_weighs_as_often_as_it_is_used() {
-    let innovation = |length| Innovation { length, prior_covariance: 1.0, row_basis: RowBasis::Time };
+    let innovation = |length| Innovation { length, prior: Prior::Absolute(1.0), row_basis: RowBasis::Time };
     let weights = |length, m| (0..m).map(|i| innovation(length).weight(i, m)).collect::<Vec<_>>();
     assert_eq!(weights(1, 4), [1, 1, 1, 1]);
     assert_eq!(weights(3, 6), [3, 3, 3, 3, 2, 1]);
@@ -330,7 +330,7 @@ fn every_row_weighs_as_often_as_it_is_used() {
     let record = obeying(&model, 64, 0.03, &[], 0.05, 60);
     for rows in [RowBasis::Haar, RowBasis::Time] {
         for length in [1, 4, 64, 100] {
-            let innovation = Innovation { length, prior_covariance: 50.0, row_basis: rows };
+            let innovation = Innovation { length, prior: Prior::Absolute(50.0), row_basis: rows };
             let records = std::slice::from_ref(&record);
             let found = closed_form(records, &model.structure, &FREE, &Initial::Rest, &innovation).unwrap();
             let mut regression = Regression::new(records, &model.structure, &FREE, &Initial::Rest).unwrap();
@@ -357,7 +357,7 @@ fn innovation_length_and_coordinates_are_all_one_without_a_prior() {
     let record = obeying(&model, 512, 0.01, &[], 0.02, 61);
     let records = std::slice::from_ref(&record);
     let of = |length, prior_covariance, rows| {
-        let innovation = Innovation { length, prior_covariance, row_basis: rows };
+        let innovation = Innovation { length, prior: Prior::Absolute(prior_covariance), row_basis: rows };
         closed_form(records, &model.structure, &FREE, &Initial::Rest, &innovation).unwrap().coefficients
     };
     // With p = 1 every row weighs the same, so coordinates cannot matter, prior or not.

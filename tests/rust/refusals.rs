@@ -6,8 +6,9 @@ use ftlm::estimation::instrumental_variables;
 use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::{structure as joint, Problem};
 use ftlm::estimation::least_squares::{self, Regression};
+use ftlm::estimation::multi_innovation::Prior;
 use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeModel, Monomial};
-use ftlm::estimation::streaming::Streaming;
+use ftlm::estimation::streaming::{Streaming, StreamingOptions};
 use ftlm::fft;
 use ftlm::fractional::exponential_sum::{integral_by_memory, Rates};
 use ftlm::fractional::integral::{fractional_derivative, fractional_integral, Derivative, IntegralRule};
@@ -205,7 +206,8 @@ fn integrals_beyond_the_range_of_numbers() {
 fn streams_that_cannot_run() {
     let s = structure(0, 1.0, &[(1, 0.0)]);
     let stream = |length, prior, s: &ftlm::equation::Structure, fixed: Option<f64>| {
-        Streaming::new(0.1, 50, &[false, true], &[(s.clone(), vec![fixed])], length, prior)
+        let options = StreamingOptions { length, prior: Prior::Absolute(prior), ..StreamingOptions::default() };
+        Streaming::new(0.1, 50, &[false, true], &[(s.clone(), vec![fixed])], options)
     };
     refused(stream(0, 1.0, &s, None));
     refused(stream(1, 0.0, &s, None));
@@ -242,10 +244,10 @@ fn numbers_that_are_none() {
     refused(metrics::correlation(&[vec![f64::NAN; 9]], &[vec![0.0; 9]], 2));
     refused(Filter { numerator: vec![(f64::NAN, 0.0)], denominator: vec![(1.0, 1.0)] }.series(9, 0.1));
     refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(9, f64::NAN));
-    refused(Recursion::new(&[0.0], f64::NAN));
+    refused(Recursion::new(&[f64::NAN]));
     refused(small::inverse(&[1.0, 2.0], 2));
     refused(small::scaled_inverse(&[1.0, 2.0], 2));
-    refused(Recursion::new(&[0.0], 1.0).unwrap().step([(&[1.0, 2.0][..], 1.0)].into_iter()));
+    refused(Recursion::new(&[1.0]).unwrap().step([(&[1.0, 2.0][..], 1.0)].into_iter()));
     refused(series::divide_naive(&[1.0, 2.0], &[1.0]));
     refused(Rates::new(1e-300, 1e300, 1e-6));
     refused(integral_by_memory(&[0.0, f64::NAN], 0.5, 0.1, 1e-6));

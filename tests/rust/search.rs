@@ -7,7 +7,7 @@ use ftlm::equation::{Equation, Initial, Structure};
 use ftlm::error::{Error, Kind};
 use ftlm::estimation::instrumental_variables::Settings;
 use ftlm::estimation::least_squares::{self, Estimate};
-use ftlm::estimation::multi_innovation::{closed_form, Innovation, RowBasis};
+use ftlm::estimation::multi_innovation::{closed_form, Innovation, Prior, RowBasis};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
 use ftlm::order_search::dual_bound::{excluded_by, is_infeasible, lower_bounds};
@@ -246,8 +246,12 @@ fn random_problem(seed: u64) -> Problem {
         norm: if random.chance(0.5) { Norm::L1 } else { Norm::L2 },
         estimator: if haar || random.chance(0.2) {
             let rows = if haar { RowBasis::Haar } else { RowBasis::Time };
-            let prior_covariance = 10.0_f64.powf(random.uniform(0.0, 6.0));
-            Estimator::MultiInnovation(Innovation { length: 1 + random.below(9), prior_covariance, row_basis: rows })
+            let prior = if random.below(2) == 0 {
+                Prior::WEAK
+            } else {
+                Prior::Absolute(10.0_f64.powf(random.uniform(0.0, 6.0)))
+            };
+            Estimator::MultiInnovation(Innovation { length: 1 + random.below(9), prior, row_basis: rows })
         } else {
             Estimator::LeastSquares
         },
@@ -530,7 +534,7 @@ fn settings_out_of_range_are_refused() {
     for threads in [0, MAX_THREADS + 1, 10_000] {
         assert!(matches!(run(&records, &[None], &Options { threads, ..options() }), Error::OutOfRange { .. }));
     }
-    let innovation = Innovation { length: 3, prior_covariance: 1.0, row_basis: RowBasis::Haar };
+    let innovation = Innovation { length: 3, prior: Prior::Absolute(1.0), row_basis: RowBasis::Haar };
     let haar = Options { estimator: Estimator::MultiInnovation(innovation), ..options() };
     assert_eq!(run(&records, &[None], &haar), Error::NotPowerOfTwo { m: 100, below: 64, above: 128 });
     let none = Innovation { length: 0, ..innovation };

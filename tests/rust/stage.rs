@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering;
 use ftlm::equation::{grains, AffineOrder, Equation, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::least_squares;
-use ftlm::estimation::multi_innovation::{Innovation, RowBasis};
+use ftlm::estimation::multi_innovation::{Innovation, Prior, RowBasis};
 use ftlm::order_search::control::Control;
 use ftlm::order_search::grid::{LawEquation, OrderLawGrid, MAX_TUPLES};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
@@ -326,7 +326,7 @@ fn distinct_orders_are_evaluated_once() {
 #[test]
 fn early_stopping_and_threads_change_nothing() {
     let lattice = OrderLawGrid::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
-    let innovation = Innovation { length: 5, prior_covariance: 100.0, row_basis: RowBasis::Haar };
+    let innovation = Innovation { length: 5, prior: Prior::Absolute(100.0), row_basis: RowBasis::Haar };
     let mut stopped = 0;
     for (seed, change) in [
         (60, options()),

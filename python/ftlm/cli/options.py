@@ -333,7 +333,7 @@ class MultiInnovationOptions:
     methods: ClassVar[tuple[str, ...]] = methods_with("innovation_length", "prior_covariance", "row_basis")
 
     innovation_length: Annotated[int | None, Option(help="Innovation length p; default 7.")] = None
-    prior_covariance: Annotated[Number, Option(help="Prior covariance K0 of the coefficients; default 1.")] = None
+    prior_covariance: Annotated[Number, Option(help="Prior covariance K0 of the coefficients; default weak.")] = None
     row_basis: Annotated[Literal["haar", "time"] | None, Option(help="Basis of the rows of (44); default haar.")] = None
 
 

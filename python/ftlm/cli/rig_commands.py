@@ -81,7 +81,7 @@ class LiveOptions:
     ] = None
     orders: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix an order of --live; default the arm's.")] = None
     innovation_length: Annotated[int | None, Option(help="Innovation length of --live; default 7.")] = None
-    prior_covariance: Annotated[Number, Option(help="Prior covariance of --live; default 1.")] = None
+    prior_covariance: Annotated[Number, Option(help="Prior covariance of --live; default weak.")] = None
 
     def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
         """Return the streaming estimator for a rate [Hz] and a longest run [s]; None if not requested."""

@@ -50,6 +50,8 @@ MAX_STEP_HALVINGS = 6
 STEP_TOLERANCE_ERRORS = 1e-3
 #: Relative size below which a singular direction of the instruments is rounding.
 INSTRUMENT_RANK_TOLERANCE = 1e-12
+#: Score of the best candidate under a prior, relative to that of a zero output, that is not reported.
+MAX_PRIOR_SCORE_RATIO = 0.5
 #: Fewest pulses a sample interval. The estimates are those of one grid.
 MIN_PULSES_PER_SAMPLE = 2
 
@@ -305,6 +307,7 @@ def fit_at_best_orders(
         },
         [
             *fit.findings,
+            *prior_findings(task, settings, m, searches),
             *step_bias_findings(task.runs, at_orders, settings, fit),
             *coefficient_law_findings(model),
             *(make_finding("on_edge", parameter=n, value=v) for n, v in edges),
@@ -312,6 +315,30 @@ def fit_at_best_orders(
         dict(searches),
         errors,
     )
+
+
+def prior_findings(
+    task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
+) -> list[Finding]:
+    """Return a finding on each search by simulation under a prior whose best candidate hardly moves."""
+    if settings.coefficients != "multi-innovation" or settings.prior_covariance is None:
+        return []
+    if settings.criterion != "output-error":
+        return []
+    findings = []
+    groups = task.structure.independent_groups() if searches else {}
+    for name, search in searches.items():
+        part = groups.get(name, task.structure)
+        if len(part.equations) > 1:
+            continue
+        (output,) = part.outputs
+        records = prepare(task.runs, part, m, power_of_two=settings.needs_haar)
+        measured = np.concatenate([record.of(output) for record in records])
+        still = np.abs(measured).sum() if settings.norm == "l1" else np.sqrt(np.mean(measured**2))
+        share = search.score / float(still)
+        if share > MAX_PRIOR_SCORE_RATIO:
+            findings.append(make_finding("prior_ranks", output=output, prior=settings.prior_covariance, share=share))
+    return findings
 
 
 def fixed_orders(task: Task) -> set[str]:

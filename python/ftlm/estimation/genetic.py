@@ -19,6 +19,7 @@ from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction, make_m
 from ftlm.estimation.model_checks import coefficient_law_findings
 from ftlm.estimation.result import Task
 from ftlm.findings import make_finding
+from ftlm.kernels import block_pulse_kernel
 from ftlm.order_search.options import Norm
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import Record, order_grid_tuple, prepare
@@ -205,7 +206,7 @@ def default_bounds(
     eta = max(item.order.at(middle) - term.order.at(middle), 0.0)
     largest = 0.0
     for record in records:
-        kernel = _core.block_pulse_kernel(eta, record.m, record.step)
+        kernel = block_pulse_kernel(eta, record.m, step=record.step)
         integral = _core.series_multiply(kernel, record.of(term.signal), record.m)
         size = float(np.linalg.norm(integral))
         largest = max(largest, float(np.linalg.norm(record.of(item.output))) / size if size else 0.0)

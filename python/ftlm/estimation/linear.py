@@ -14,6 +14,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import check_step
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError
 from ftlm.findings import Finding, make_finding
+from ftlm.kernels import Recursion
 from ftlm.order_search.options import RowBasis, SearchSettings
 from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
 from ftlm.structure.equation import Equation
@@ -22,7 +23,7 @@ from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Floats, as_floats, whole_number
+from ftlm.utils.validation import Floats, whole_number
 
 #: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
 #: the iteration has converged.
@@ -61,9 +62,10 @@ def estimate_coefficients(
             raw = _core.least_squares(*_linear(item, records))[0]
         else:
             raw = _multi_innovation(item, records, settings, settings.prior_covariance)
-            # A prior so weak that the data alone decide.
-            weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
-            fit.findings.extend(_prior_findings(item.output, raw, weak, settings))
+            if settings.prior_covariance is not None:
+                # A prior so weak that the data alone decide.
+                weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
+                fit.findings.extend(_prior_findings(item.output, raw, weak, settings))
         fit.values.update(named_coefficients(item, raw))
     return fit
 
@@ -77,7 +79,9 @@ def _linear(
     return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
 
 
-def _multi_innovation(item: Equation, records: list[Record], settings: SearchSettings, prior: float) -> list[float]:
+def _multi_innovation(
+    item: Equation, records: list[Record], settings: SearchSettings, prior: float | None
+) -> list[float]:
     """Return the coefficients by the closed form of equation (44)."""
     haar = settings.row_basis == "haar"
     (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
@@ -180,7 +184,7 @@ def multi_innovation_trace(
     equation: Structure,
     *,
     innovation_length: int = 7,
-    prior_covariance: float = 1.0,
+    prior_covariance: float | None = None,
     row_basis: RowBasis = "haar",
     m: int | None = None,
     every: int = 1,
@@ -305,7 +309,7 @@ class Streaming:
     inputs
         Which of the structure's signals are inputs, held between samples.
     innovation_length, prior_covariance
-        p and K0 of (44).
+        p and K0 of (44); by default the prior is weak, as that of :class:`ftlm.MultiInnovation`.
 
     Raises
     ------
@@ -322,7 +326,7 @@ class Streaming:
         longest: float,
         inputs: Sequence[str] = ("I1", "I2"),
         innovation_length: int = 7,
-        prior_covariance: float = 1.0,
+        prior_covariance: float | None = None,
     ) -> None:
         if structure.order_names:
             raise ModelError(
@@ -346,15 +350,27 @@ class Streaming:
             )
         self.signals = tuple(structure.signals)
         self.structure = structure
-        known = [name in inputs for name in self.signals]
-        equations = [(structure_tuple(e, self.signals), [t.fixed for t in e.terms]) for e in structure.equations]
         length = whole_number(innovation_length)
         if length is None or not 1 <= length < 1 << 31:
             raise ModelError(f"{setting('innovation_length')} {innovation_length!r} is no whole number from 1")
         step, longest = check_step(step, "step"), check_step(longest, "longest")
-        rows = max(2, round(longest / step) + 1)
         self.step = step
-        self._core = _core.Streaming(step, rows, known, equations, length, prior_covariance)
+        self._recursions: list[Recursion] = []
+        for item in structure.equations:
+            output, alpha, terms = structure_tuple(item, self.signals)
+            self._recursions.append(
+                Recursion(
+                    [alpha, *(order for _, order in terms)],
+                    [signal for signal, _ in terms],
+                    output=output,
+                    step=step,
+                    hold=[name in inputs for name in self.signals],
+                    p=length,
+                    prior_covariance=prior_covariance,
+                    longest=max(2, round(longest / step) + 1),
+                    fixed=[t.fixed for t in item.terms],
+                )
+            )
 
     @check_arguments
     def push(self, samples: Floats) -> None:
@@ -369,21 +385,23 @@ class Streaming:
         ConvergenceError
             The covariance lost its sign to rounding.
         """
-        rows = as_floats("samples", samples)
-        if rows.ndim != 2:
-            raise DataError(f"samples has shape {rows.shape}; give rows of {len(self.signals)} numbers")
-        self._core.push(rows)
+        for recursion in self._recursions:
+            recursion.push(samples)
 
     @property
     def coefficients(self) -> dict[str, float]:
         """Coefficients by name, after the newest sample."""
-        values = zip(self.structure.equations, self._core.coefficients, strict=True)
-        return {name: c for item, raw in values for name, c in named_coefficients(item, raw).items()}
+        found = zip(self.structure.equations, self._recursions, strict=True)
+        return {
+            name: c
+            for item, recursion in found
+            for name, c in named_coefficients(item, recursion.coefficients.tolist()).items()
+        }
 
     @property
     def pulses(self) -> int:
         """Number of rows of (44) so far: samples minus one."""
-        return self._core.pulses
+        return self._recursions[0].pulses
 
     def __str__(self) -> str:
         return ", ".join(f"{name} = {value:.6g}" for name, value in self.coefficients.items())

@@ -257,7 +257,8 @@ class MultiInnovation(OrderSearchMethod):
     innovation_length
         p of paper (43)-(44): a weight of the data against the prior, nothing else.
     prior_covariance
-        K0 of paper (43)-(44); a large one is a weak prior.
+        K0 of paper (43)-(44), in units of the squared coefficients. By default the prior is weak in any units: 1e10
+        over the sum of squares of the coefficient's regressor. The paper's is 1.
     row_basis
         Coordinates of paper (42): ``"haar"``, for which m is a power of two, or ``"time"``.
 
@@ -269,7 +270,7 @@ class MultiInnovation(OrderSearchMethod):
 
     name: ClassVar[str] = "multi-innovation"
     innovation_length: int = SearchSettings.innovation_length
-    prior_covariance: float = SearchSettings.prior_covariance
+    prior_covariance: float | None = SearchSettings.prior_covariance
     row_basis: RowBasis = SearchSettings.row_basis
 
 

@@ -40,7 +40,7 @@ def search_orders(
     coefficients: Coefficients = "multi-innovation",
     norm: Norm = "l1",
     innovation_length: int = 7,
-    prior_covariance: float = 1.0,
+    prior_covariance: float | None = None,
     row_basis: RowBasis = "haar",
     m: int | None = None,
     top: int = 20,
@@ -75,7 +75,8 @@ def search_orders(
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     innovation_length, prior_covariance, row_basis
         p and K0 of paper (43)-(44), and whether rows come in Haar coordinates (``"haar"``) or in the order of time
-        (``"time"``). Of ``"multi-innovation"`` alone; with other coefficients a change of them is refused.
+        (``"time"``). Without K0 the prior is weak in any units; see :class:`ftlm.MultiInnovation`. Of
+        ``"multi-innovation"`` alone; with other coefficients a change of them is refused.
     m
         Block pulses a run; default 2 048, or what the runs carry.
     top

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.errors import FtlmError, ModelError
+from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job, run_job
@@ -21,7 +21,7 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import real_number, whole_number
+from ftlm.utils.validation import real_number, short_repr, whole_number
 
 #: Default tolerance of the certificate relative to the best equation error found, and maximum number of boxes.
 DEFAULT_TOLERANCE = 0.05
@@ -39,6 +39,7 @@ def certify_orders(
     order_grid: OrderGrid | None = None,
     *,
     tolerance: float = DEFAULT_TOLERANCE,
+    start: Sequence[Mapping[str, float]] = (),
     min_separation: float | None = None,
     max_term_ratio: float = DEFAULT_MAX_TERM_RATIO,
     max_cells: int = DEFAULT_MAX_CELLS,
@@ -63,6 +64,9 @@ def certify_orders(
         Order grid. Only the ends of its intervals are used.
     tolerance
         Tolerance: how much smaller than the best error found that of other orders may be, as a fraction below 1.
+    start
+        Tuples of orders by name, such as those of another optimizer. The certificate has the error of each, and tells
+        which of them other orders may still beat.
     min_separation
         Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.
         At distance 0 every equation is trivially satisfied. Default: the increment of the order grid.
@@ -117,7 +121,25 @@ def certify_orders(
             f"{DEFAULT_MAX_TERM_RATIO:g}"
         )
     job = make_job(runs, equation, order_grid, SearchSettings(**CERTIFIED_SETTINGS), m=m, threads=threads)
-    return certify_job(job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress)
+    _check_certifiable(job)
+    errors = tuple(_equation_error(job, orders, k, len(start)) for k, orders in enumerate(start))
+    found = certify_job(
+        job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress
+    )
+    return replace(found, start_errors=errors)
+
+
+def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: int) -> float:
+    """Return the least RMS equation error at a tuple of orders; infinite for linearly dependent terms."""
+    names = {name: (min(values), max(values)) for name, values in job.values.items()}
+    numbers = {str(name): real_number("start", value) for name, value in orders.items()}
+    if set(numbers) != set(names) or not all(low <= numbers[n] <= high for n, (low, high) in names.items()):
+        intervals = ", ".join(f"{n} from {low:g} to {high:g}" for n, (low, high) in names.items())
+        raise ModelError(f"start {index} of {count} is {short_repr(dict(orders))}; give {intervals}")
+    try:
+        return run_job(replace(job, values={n: (numbers[n],) for n in names}, progress=None)).score
+    except ConvergenceError:
+        return math.inf
 
 
 def _check_certifiable(job: Job) -> None:

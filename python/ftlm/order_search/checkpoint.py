@@ -51,12 +51,13 @@ FILE_SIGNATURE = b"ftlm search store 1\n"
 HEADER_FORMAT = struct.Struct("<II")
 DIGEST_BYTES = 16
 #: Version of the search algorithm. Rounds of different versions must not be joined.
-ALGORITHM_VERSION = 5
+ALGORITHM_VERSION = 6
 #: Earlier versions whose partial searches can be resumed if the rounds of the search are the same in both versions.
 #: Version 2 excludes boxes on grids of 2²⁵ candidates or more, with longer rounds. Version 3 has sharper boxes, also
 #: for squared equation errors. Version 4 has tighter bounds of simulations from 2¹⁸ candidates on. Version 5 bounds
-#: simulations by coefficients that cancel, and constructs boxes by the coefficients of all of their candidates.
-RESUMABLE_ALGORITHMS = (1, 2, 3, 4)
+#: simulations by coefficients that cancel, and constructs boxes by the coefficients of all of their candidates. Version
+#: 6 applies these bounds to multi-innovation.
+RESUMABLE_ALGORITHMS = (1, 2, 3, 4, 5)
 #: Maximum payload [bytes]; a table of 100 000 rows with many coefficients is far smaller.
 MAX_PAYLOAD = 1 << 30
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
@@ -139,7 +140,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     structure: Structure
     values: dict[str, tuple[float, ...]]
-    settings: dict[str, str | int | float | bool]
+    settings: dict[str, str | int | float | bool | None]
     records: tuple[RecordFile, ...]
     runs: tuple[str, ...]
     units: dict[str, str]

@@ -45,7 +45,7 @@ class SearchSettings:
     norm: Norm = "l1"
     coefficients: Coefficients = "multi-innovation"
     innovation_length: int = 7
-    prior_covariance: float = 1.0
+    prior_covariance: float | None = None
     row_basis: RowBasis = "haar"
     top: int = 20
     pruning: bool = True
@@ -64,8 +64,9 @@ class SearchSettings:
             raise ModelError(
                 f"{setting('innovation_length')} {self.innovation_length!r} is no whole number from 1; the paper's is 7"
             )
-        covariance = real_number("prior_covariance", self.prior_covariance)
-        if not 0 < covariance < math.inf:
+        given = self.prior_covariance
+        covariance = None if given is None else real_number("prior_covariance", given)
+        if covariance is not None and not 0 < covariance < math.inf:
             raise ModelError(
                 f"{setting('prior_covariance')} {self.prior_covariance!r} is not positive; a large one is a weak prior"
             )

@@ -57,6 +57,8 @@ class OrderCertificate:
         bounds the equation error alone.
     unstable_poles
         Number of poles of that model with a positive real part; NaN if it is not known.
+    start_errors
+        Least RMS equation error of each tuple of orders that was given.
     """
 
     lower_bound: float
@@ -71,6 +73,12 @@ class OrderCertificate:
     m: int
     free_run_nr: float = math.nan
     unstable_poles: float = math.nan
+    start_errors: tuple[float, ...] = ()
+
+    @property
+    def beatable(self) -> tuple[bool, ...]:
+        """Whether other orders may be better than each given tuple by more than the requested tolerance."""
+        return tuple(self.lower_bound < (1 - self.requested_tolerance) * error for error in self.start_errors)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -101,11 +109,17 @@ class OrderCertificate:
             "open_cells": self.open_cells,
             "m": self.m,
             "free_run_nr": self.free_run_nr if math.isfinite(self.free_run_nr) else None,
+            "start_errors": [error if math.isfinite(error) else None for error in self.start_errors],
+            "beatable": list(self.beatable),
             "findings": [f.to_dict() for f in self.findings],
         }
 
     def __str__(self) -> str:
-        return "\n".join([self._bound_text, *(f"! {f}; {f.remedy}" for f in self.findings)])
+        given = [
+            f"start {k}: {error:.5g}, {'may still be beaten' if open_ else 'is not beaten by more than that'}"
+            for k, (error, open_) in enumerate(zip(self.start_errors, self.beatable, strict=True))
+        ]
+        return "\n".join([self._bound_text, *given, *(f"! {f}; {f.remedy}" for f in self.findings)])
 
     @property
     def _bound_text(self) -> str:

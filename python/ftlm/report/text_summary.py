@@ -206,7 +206,8 @@ def settings_text(settings: Mapping[str, Any]) -> str:
         seeds = ", ".join(map(str, settings["seeds"]))
         words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
     if "innovation_length" in settings:
-        words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
+        prior = settings["prior_covariance"]
+        words += f", p = {settings['innovation_length']}, {'weak prior' if prior is None else f'K0 = {prior:g}'}"
         words += f", {settings['row_basis']} rows"
     if "loss" in settings:
         words += f", loss: {settings['loss']} ({robust_loss_text(settings)})"
@@ -233,7 +234,10 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
     if "innovation_length" in settings:
         rows += [
             ["innovation length, p", int(settings["innovation_length"])],
-            [Markup("prior covariance, K<sub>0</sub>"), Exact(settings["prior_covariance"])],
+            [
+                Markup("prior covariance, K<sub>0</sub>"),
+                "weak" if settings["prior_covariance"] is None else Exact(settings["prior_covariance"]),
+            ],
             ["rows of the recursion", ROW_BASIS_TEXTS.get(settings["row_basis"], settings["row_basis"])],
         ]
     if "refinement" in settings:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ftlm import _core
 from ftlm.arm.flexible_link import flexible_link, integer_order, link_model
 from ftlm.data.run import Run
 from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_evolution_search, genetic_search
@@ -17,6 +16,7 @@ from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import improves_prediction, is_degenerate
+from ftlm.kernels import pulse_means
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
@@ -297,8 +297,8 @@ def manual_nr(stage: StageNumber, run: Run) -> dict[str, float]:
     for name, samples in explicit_euler(link_model(stage=stage, form="published"), run).items():
         with np.errstate(over="ignore", invalid="ignore"):
             finite_run = bool(np.all(np.isfinite(samples)))
-        measured = _core.pulse_means(run[name], m, False)
-        found[name] = metrics(measured, _core.pulse_means(samples, m, False)).nr if finite_run else math.inf
+        measured = pulse_means(run[name], m)
+        found[name] = metrics(measured, pulse_means(samples, m)).nr if finite_run else math.inf
     return found
 
 

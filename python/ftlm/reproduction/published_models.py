@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ftlm import _core
 from ftlm.analysis.poles import Stability, stability
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
+from ftlm.kernels import pulse_means
 from ftlm.model.model import Model
 from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
@@ -146,7 +146,7 @@ def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[P
                     spreads[output][1],
                     pulse_times(free),
                     response,
-                    _core.pulse_means(scaled[output], printed.PULSE_COUNT, False),
+                    pulse_means(scaled[output], printed.PULSE_COUNT),
                     *_reidentify(own, structure.equation(output), printed_numbers(stage, p)[0], p, threads),
                 )
             )

@@ -18,6 +18,7 @@ from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import InternalError
 from ftlm.fractional_calculus import haar_transform
+from ftlm.kernels import block_pulse_kernel
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.reproduction.simulated_arm import PAPERS_ARM, demo_run
 from ftlm.simulation.discretization import record, sensor_series
@@ -280,7 +281,7 @@ class _Angle:
         """Fractional integral I^order of a signal, in time and in Haar coordinates."""
         key = signal, round(order, 6)
         if key not in self._kept:
-            kernel = _core.block_pulse_kernel(order, self.m, self.step)
+            kernel = block_pulse_kernel(order, self.m, step=self.step)
             series = _core.series_multiply(kernel, self.signals[signal], self.m)
             self._kept[key] = series, haar_transform(series)
         return self._kept[key]

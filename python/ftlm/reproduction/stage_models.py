@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ftlm import _core
 from ftlm.arm.flexible_link import flexible_link, integer_order, link_model, order_law
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
@@ -21,6 +20,7 @@ from ftlm.estimation.identify import assess_fit, identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.methods import EstimationMethod, InstrumentalVariables, OutputError, method_with_options
 from ftlm.estimation.result import Identification, Task
+from ftlm.kernels import pulse_means
 from ftlm.model.model import Model
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
@@ -31,6 +31,7 @@ from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, compare_optimiz
 from ftlm.reproduction.simulated_arm import StageNumber, decimate_run
 from ftlm.reproduction.stage_result import (
     MULTI_INNOVATION_LABELS,
+    PRIOR_COVARIANCES,
     WEAK_PRIOR,
     Candidate,
     DroppedDerivative,
@@ -334,7 +335,7 @@ class StageWork:
         for name, samples in responses.items():
             with np.errstate(over="ignore", invalid="ignore"):
                 finite = bool(np.all(np.isfinite(samples)))
-            means[name] = _core.pulse_means(samples, exact.m, False) if finite else np.full(exact.m, np.inf)
+            means[name] = pulse_means(samples, exact.m) if finite else np.full(exact.m, np.inf)
         if self.preset.common_pulses:
             errors = {n: metrics(exact.measured[n][0], mean) for n, mean in means.items()}
         else:
@@ -350,7 +351,12 @@ class StageWork:
     def searches(self) -> dict[str, Candidate]:
         """Search the whole order grid by multi-innovation with the paper's p, and by least squares."""
         kinds: dict[str, dict[str, Any]] = {
-            f"p = {p}": {"coefficients": "multi-innovation", "innovation_length": p} for p in printed.INNOVATION_LENGTHS
+            f"p = {p}": {
+                "coefficients": "multi-innovation",
+                "innovation_length": p,
+                "prior_covariance": PRIOR_COVARIANCES[0],
+            }
+            for p in printed.INNOVATION_LENGTHS
         }
         kinds["least squares"] = {"coefficients": "least-squares"}
         found = {}
@@ -579,7 +585,7 @@ class StageWork:
         output, other = self.measured.outputs[1], self.in_published_form(model)
         whole, published = (compare_means(m, self.on) for m in (model, other))
         drive = f"I{self.number}"
-        current = _core.pulse_means(self.on[drive], whole.m, self.on.intersample[drive] == "zoh")
+        current = pulse_means(self.on[drive], whole.m, hold=self.on.intersample[drive] == "zoh")
         return DroppedDerivative(
             output,
             order_law(self.number, "derived")["input"].at(other.orders),

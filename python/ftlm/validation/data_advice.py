@@ -16,6 +16,7 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.findings import Finding, make_finding, unique
+from ftlm.kernels import pulse_means
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.linalg import orthonormal
@@ -401,8 +402,8 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
     if m < 4 * DRIFT_BLOCKS:
         return
     step = run.duration / m
-    means = {n: _core.pulse_means(run[n] - run[n][0], m, run.intersample.get(n) == "zoh") for n in (*inputs, *outputs)}
-    first = {n: _core.pulse_means(np.full(run.length, float(run[n][0])), m, True) for n in inputs}
+    means = {n: pulse_means(run[n] - run[n][0], m, hold=run.intersample.get(n) == "zoh") for n in (*inputs, *outputs)}
+    first = {n: pulse_means(np.full(run.length, float(run[n][0])), m, hold=True) for n in inputs}
     times = np.geomspace(2 * step, run.duration / 8, DRIFT_LAGS)
     series = [_core.filter_series([(1.0, 0.0)], [(float(t), 1.0), (1.0, 0.0)], m, step) for t in times]
     columns = [_core.series_multiply(s, means[n] + first[n], m) for n in inputs for s in series]

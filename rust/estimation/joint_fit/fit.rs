@@ -1,5 +1,8 @@
 //! Joint fit of a structure to runs: initial guesses, multistart, reweighting, step refinement and covariance.
 
+use std::collections::BTreeMap;
+
+use super::initial_guesses::OrderGrids;
 use super::multistart::{run_multistart, select_survivors, InitialGuessSource, MultistartContext};
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::ParameterSet;
@@ -8,9 +11,12 @@ use super::progress::{FitProgress, ProgressListener};
 use super::reweighting::{fit_reweighted, Loss, EVALUATIONS_PER_REWEIGHTING};
 use super::stability_preference::{prefer_stable, StabilityComparison};
 use super::step_refinement::{refine_step, Optimum, OptimumStatistics};
+use super::structure::{Equation, Structure};
+use crate::equation::Initial;
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
-use crate::recording::{Recordings, Sampling};
+use crate::recording::{Recording, Recordings, Sampling};
+use crate::regressors::BANK_LIMIT;
 use crate::signal::statistics::{mean, median, robust_deviation};
 
 /// Share of the progress of a fit that belongs to the multistart. Each sweep takes [`SWEEP_PROGRESS_SHARE`] of the
@@ -169,6 +175,42 @@ impl<'a> FitProblem<'a> {
         let place = Iterate { point: self.free.problem.point(values)?, states: Vec::new() };
         Ok(Candidate::at(place, origin))
     }
+}
+
+/// Free orders and coefficients of equations by name, and the fit that they are from.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub struct EquationFit {
+    /// Estimates by name.
+    pub values: BTreeMap<String, f64>,
+    /// The optimum; its parameters are in the sequence of [`ParameterSet::names`].
+    pub fit: JointFit,
+}
+
+/// Fit equations to runs that start at rest by output error with squared loss, automatic initial guesses, a refined
+/// step and one thread.
+///
+/// # Errors
+/// As [`fit`]; [`Error::Diverged`] if no initial guess has a finite simulation.
+pub fn fit_equations(runs: Vec<Recording>, equations: Vec<Equation>) -> Result<EquationFit> {
+    let runs = Recordings::new(runs)?;
+    let signals = runs.runs()[0].channels().iter().map(|channel| channel.name.clone()).collect();
+    let sizes = equations
+        .iter()
+        .map(|equation| {
+            let samples: Vec<Vec<f64>> = runs.samples(equation.output)?.into_iter().map(<[f64]>::to_vec).collect();
+            Ok(OutputScale::from_runs(&samples))
+        })
+        .collect::<Result<Vec<_>>>()?;
+    let free = ParameterSet::from_structure(Structure::new(signals, equations, Initial::Rest))?;
+    let stop = Stop::default();
+    let starts = OrderGrids::new(&runs, 1, BANK_LIMIT, &stop);
+    let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+    let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
+    let fit =
+        fit(problem, Initialization::Multistart { known: Vec::new(), candidates: None }, settings, &|_, _| Ok(()))?
+            .ok_or_else(|| Error::Diverged { what: "simulation of every initial guess".into(), index: 0 })?;
+    Ok(EquationFit { values: free.names().cloned().zip(fit.finished.estimate.iter().copied()).collect(), fit })
 }
 
 /// Fit a structure to runs by output error; None if no initial guess has a finite simulation.

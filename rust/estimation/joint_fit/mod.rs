@@ -22,7 +22,7 @@ pub mod stability_preference;
 pub mod step_refinement;
 pub mod structure;
 
-pub use fit::{FitProblem, Initialization, JointFit, OutputScale, Settings};
+pub use fit::{fit_equations, EquationFit, FitProblem, Initialization, JointFit, OutputScale, Settings};
 pub use multistart::InitialGuessSource;
 pub use objective::{Objective, Weights};
 pub use parameter_set::TimeScaling;

@@ -89,6 +89,19 @@ pub struct Equation {
 }
 
 impl Equation {
+    /// Equation D^order output = 0, to which [`Self::with_term`] adds terms.
+    #[must_use]
+    pub fn new(output: usize, order: Order) -> Self {
+        Self { output, order, terms: Vec::new(), friction: None }
+    }
+
+    /// Add a term coefficient · D^order signal with a free coefficient of this name.
+    #[must_use]
+    pub fn with_term(mut self, coefficient: &str, order: Order, signal: usize) -> Self {
+        self.terms.push(Term { signal, order, coefficient: Coefficient::Free(coefficient.into()), factor: 1.0 });
+        self
+    }
+
     /// Names of the free coefficients in order of appearance, friction last.
     pub fn coefficient_names(&self) -> impl Iterator<Item = &String> {
         let rubs = self.friction.iter().flat_map(|rubs| rubs.parameters()).filter_map(|(_, number)| number.name());

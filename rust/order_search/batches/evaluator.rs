@@ -23,7 +23,7 @@ use crate::order_search::candidate_index::CandidateIndex;
 use crate::order_search::control::{mismatch_error, BatchPosition, Checkpoint, Control};
 use crate::order_search::grid::independent::OrderGrid;
 use crate::order_search::grid::traversal::low_discrepancy_order;
-use crate::order_search::options::{Criterion, Options};
+use crate::order_search::options::{Criterion, Estimator, Options};
 use crate::order_search::result::{Counts, Outcome, Part, Row, TopRows};
 use crate::parallel::pool;
 use crate::regressors::Record;
@@ -308,7 +308,9 @@ pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 pub fn algorithm_version(candidates: u64, options: &Options) -> u64 {
     let bounded =
         options.criterion == Criterion::OutputError || (candidates >= MIN_BOX_CANDIDATES && !options.refines());
-    if options.pruning && bounded {
+    if options.pruning && bounded && matches!(options.estimator, Estimator::MultiInnovation(_)) {
+        6
+    } else if options.pruning && bounded {
         5
     } else {
         1

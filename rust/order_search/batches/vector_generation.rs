@@ -233,7 +233,7 @@ impl BatchEvaluation<'_> {
                     open.into_iter().filter_map(|open| {
                         let mut columns = vec![0; lattice.width()];
                         catalogue.positions(&Cursor::at(lattice, open.index), &mut columns);
-                        let coefficients = problem.least_squares_coefficients(&columns)?;
+                        let coefficients = problem.coefficients(&columns)?;
                         Some((columns, coefficients))
                     })
                 })

@@ -15,7 +15,7 @@ use crate::order_search::dual_bound::lower_bound::Bound;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, NO_INDEX};
 use crate::order_search::grid::traversal::{self, Cursor};
 use crate::order_search::grid::OrderGrid;
-use crate::order_search::options::{Criterion, Estimator, Norm, Options};
+use crate::order_search::options::{Criterion, Options};
 use crate::order_search::screening::{OpenCandidate, Screen};
 use crate::parallel::{pool, Stop};
 use crate::regressors::Record;
@@ -36,13 +36,13 @@ pub(crate) struct BranchAndBound {
 
 impl BranchAndBound {
     /// Whether branch and bound applies to a search and is worthwhile. It needs ranking by simulation with zero initial
-    /// conditions or by squared equation error, least-squares coefficients, and a large slice.
+    /// conditions or by squared equation error, coefficients from the normal equations, and a large slice.
     pub(crate) fn is_worthwhile(catalogue: &CandidateIndex<'_>) -> bool {
         let (options, lattice) = (&catalogue.options, &*catalogue.lattice);
         options.pruning
-            && options.estimator == Estimator::LeastSquares
+            && !options.refines()
             && (options.criterion == Criterion::OutputError || options.ranks_by_gram_matrix())
-            && catalogue.problem.equations.unconstrained_equations().is_some()
+            && catalogue.problem.box_equations().is_some()
             && (2..=MAX_REMAINING_COLUMNS + 2).contains(&lattice.width())
             && lattice.blocks().iter().any(|block| {
                 lattice
@@ -54,9 +54,11 @@ impl BranchAndBound {
     /// Compute the shared constants. `None` without a dual bound. Runs on the current thread pool.
     pub(crate) fn new(catalogue: &CandidateIndex<'_>) -> Option<Self> {
         let problem = &catalogue.problem;
-        let (probes, normal) = (test_vectors_of(problem)?, problem.equations.unconstrained_equations()?);
+        let (probes, normal) = (test_vectors_of(problem)?, problem.box_equations()?);
+        // A column may have its whole size in rows of weight 1, where it is the difference of large numbers.
         #[allow(clippy::cast_precision_loss)]
-        let rounding = f64::EPSILON * problem.samples() as f64;
+        let (samples, weights) = (problem.samples() as f64, catalogue.options.weights() as f64);
+        let rounding = f64::EPSILON * samples * weights;
         let others = RemainingColumns {
             normal,
             test_vectors: probes,
@@ -66,8 +68,8 @@ impl BranchAndBound {
             rounding,
             partner: None,
         };
-        let common =
-            SearchConstants::new(&others, catalogue.options.norm, problem.residual_sums.is_some(), problem.size());
+        let (norm, ranks_equation_error) = (catalogue.options.norm, problem.residual_sums.is_some());
+        let common = SearchConstants::new(&others, norm, ranks_equation_error, problem.size(), weights.sqrt());
         Some(Self { common, rounding })
     }
 
@@ -80,7 +82,7 @@ impl BranchAndBound {
         let (k, probes) = (columns.len(), test_vectors_of(&catalogue.problem)?);
         let partner = probes.first().and_then(|probes| columns.iter().position(|&p| probes.rows[p] != NO_INDEX));
         Some(RemainingColumns {
-            normal: catalogue.problem.equations.unconstrained_equations()?,
+            normal: catalogue.problem.box_equations()?,
             test_vectors: probes,
             partner,
             columns,
@@ -212,7 +214,7 @@ fn factor_remaining_columns(
 ) -> Option<(Vec<usize>, Vec<f64>)> {
     let others: Vec<usize> =
         (0..columns.len()).filter(|&t| t != slab.outer && t != slab.inner).map(|t| columns[t]).collect();
-    let normal = catalogue.problem.equations.unconstrained_equations()?;
+    let normal = catalogue.problem.box_equations()?;
     let inverse = inverse_correlation(&others, |a, b| normal.product(a, b)).ok()?;
     Some((others, inverse))
 }
@@ -254,8 +256,7 @@ pub struct BoxBound {
     pub values: u64,
     /// See `first`.
     pub stride: u64,
-    /// Lower bound of the raw errors Σ|e| or Σe² of all candidates. Coefficients are least-squares estimates, initial
-    /// conditions are zero.
+    /// Lower bound of the raw errors Σ|e| or Σe² of all candidates. Initial conditions are zero.
     pub bound: f64,
 }
 
@@ -271,25 +272,19 @@ pub struct BoxBound {
 /// ```
 /// # use ftlm::order_search::branch_and_bound::box_bounds;
 /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
-/// # use ftlm::order_search::options::{Criterion, Norm};
+/// # use ftlm::order_search::options::Options;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
 /// let lattice = OrderGrid::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
-/// let boxes = box_bounds(&[record], &lattice, Criterion::OutputError, Norm::L1, 0)?;
+/// let boxes = box_bounds(&[record], &lattice, &Options::default(), 0)?;
 /// assert!(boxes.iter().any(|b| b.rows * b.values == 6) && boxes.iter().any(|b| b.rows * b.values == 1));
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn box_bounds(
-    records: &[Record],
-    lattice: &OrderGrid,
-    criterion: Criterion,
-    norm: Norm,
-    index: u64,
-) -> Result<Vec<BoxBound>> {
-    with_slice(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
+pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, index: u64) -> Result<Vec<BoxBound>> {
+    with_slice(records, lattice, options, index, |catalogue, boxes, slab| {
         let columns = first_columns(catalogue, slab);
         let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
         let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
@@ -327,13 +322,12 @@ pub fn box_bounds(
 pub fn open_candidates(
     records: &[Record],
     lattice: &OrderGrid,
-    criterion: Criterion,
-    norm: Norm,
+    options: &Options,
     index: u64,
     range: Range<u64>,
     limit: f64,
 ) -> Result<Vec<u64>> {
-    with_slice(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
+    with_slice(records, lattice, options, index, |catalogue, boxes, slab| {
         let range = (range.start.clamp(slab.lo, slab.hi), range.end.clamp(slab.lo, slab.hi));
         let (open, ..) = screen_slice(catalogue, boxes, slab, range, limit)?;
         Some(open.iter().map(|open| open.index).collect())
@@ -344,7 +338,7 @@ pub fn open_candidates(
 fn with_slice<T>(
     records: &[Record],
     lattice: &OrderGrid,
-    (criterion, norm): (Criterion, Norm),
+    options: &Options,
     index: u64,
     work: impl FnOnce(&CandidateIndex<'_>, &BranchAndBound, &traversal::GridSlice) -> Option<Vec<T>> + Send,
 ) -> Result<Vec<T>>
@@ -352,12 +346,10 @@ where
     T: Send,
 {
     let pool = pool(1)?;
-    let options = Options { criterion, norm, ..Options::default() };
     let fixed = vec![None; lattice.width()];
-    let mut catalogue =
-        CandidateIndex::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool, &Stop::default())?;
+    let mut catalogue = CandidateIndex::new(records, Cow::Borrowed(lattice), &fixed, options, &pool, &Stop::default())?;
     catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8, &Stop::default()));
-    if criterion == Criterion::OutputError {
+    if options.criterion == Criterion::OutputError {
         let mut adapted = catalogue.problem.empty_tailored_vectors().0;
         for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {
             let mut positions = vec![0; lattice.width()];

@@ -36,14 +36,22 @@ pub(super) struct SearchConstants {
     pub(super) max_moduli: Vec<[Wide; 2]>,
     /// Largest rounding-error bound of a unit column, by record.
     pub(super) rounding: Vec<f64>,
-    /// Norm of the output over all records.
+    /// Norm of the output over all records, and its largest norm with the weights of the normal equations.
     pub(super) size: f64,
+    pub(super) weighted_size: f64,
     /// Ratio of the largest to the smallest inverse norm of the columns.
     pub(super) ratio: f64,
 }
 
 impl SearchConstants {
-    pub(super) fn new(others: &RemainingColumns<'_>, norm: Norm, ranks_equation_error: bool, size: f64) -> Self {
+    /// Compute the constants for an output of this norm, and rows weighted by at most the square of `weight`.
+    pub(super) fn new(
+        others: &RemainingColumns<'_>,
+        norm: Norm,
+        ranks_equation_error: bool,
+        size: f64,
+        weight: f64,
+    ) -> Self {
         let width = others.normal.inverse().len();
         let max_moduli = vector_groups(others.test_vectors)
             .map(|(r, g)| {
@@ -71,6 +79,7 @@ impl SearchConstants {
             max_moduli,
             rounding: others.test_vectors.iter().map(|p| most(&p.rounding)).collect(),
             size,
+            weighted_size: size * weight,
             ratio,
         }
     }
@@ -301,7 +310,7 @@ impl<'a> SliceTables<'a> {
 
         // Moduli of the coefficients and their rounding-error bounds.
         let trace = self.others.trace + sums * sums / left;
-        let all = self.common.size
+        let all = self.common.weighted_size
             + self.base_coefficients.iter().map(|c| c.abs()).sum::<f64>()
             + p_most * pu.sum
             + q_most * pv.sum;

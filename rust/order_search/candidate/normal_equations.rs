@@ -24,11 +24,11 @@ pub(crate) struct Normal {
 }
 
 impl Normal {
-    /// Build the equations from a Gram matrix over columns and target, (width + 1)² row-major. `prior` is added to its
-    /// diagonal.
-    pub(super) fn new(gram: &[f64], width: usize, prior: f64) -> Self {
+    /// Build the equations from a Gram matrix over columns and target, (width + 1)² row-major. `prior` has the inverse
+    /// prior covariances, which are added to its diagonal.
+    pub(super) fn new(gram: &[f64], width: usize, prior: &[f64]) -> Self {
         let stride = width + 1;
-        let diagonal = |p: usize| gram[p * stride + p] + prior;
+        let diagonal = |p: usize| gram[p * stride + p] + prior[p];
         let size: Vec<f64> = (0..width)
             .map(|p| if diagonal(p) > 0.0 && diagonal(p).is_finite() { diagonal(p).sqrt() } else { 0.0 })
             .collect();

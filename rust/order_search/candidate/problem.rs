@@ -38,6 +38,8 @@ pub(crate) struct Problem {
     pub(crate) equations: NormalEquations,
     /// Gram matrix without weights and prior, if the squared equation error ranks.
     pub(crate) residual_sums: Option<ResidualSumOfSquares>,
+    /// Normal equations without weights and prior, if the squared equation error ranks coefficients that have them.
+    least_squares: Option<Normal>,
     pub(crate) bound: Option<Bound>,
     /// Test vectors tailored to candidates of the search, if they are worthwhile.
     pub(crate) tailored_vectors: Option<TailoredVectors>,
@@ -198,10 +200,15 @@ impl Problem {
         let elements = (width + 1) * (width + 1);
         let mut sum = vec![0.0; elements];
         let mut unweighted = if options.ranks_by_gram_matrix() { vec![0.0; elements] } else { Vec::new() };
-        let prior = match options.estimator {
-            Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,
-            Estimator::MultiInnovation(innovation) => 1.0 / innovation.prior_covariance,
+        // Inverse prior covariances by the sums of squares of unweighted columns.
+        let precisions = |squares: &[f64]| -> Vec<f64> {
+            let precision = |&of: &f64| match options.estimator {
+                Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,
+                Estimator::MultiInnovation(innovation) => innovation.prior.precision(of),
+            };
+            squares.iter().map(precision).collect()
         };
+        let mut squares = vec![0.0; width];
         let mut parts = Vec::new();
         for ((bank, target), record) in banks.iter().zip(&targets).zip(records) {
             let mut gram = if refined {
@@ -212,14 +219,19 @@ impl Problem {
             };
             stop.check()?;
             unweighted.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
+            let own_squares: Vec<f64> = (0..width).map(|p| gram[p * (width + 2)]).collect();
+            squares.iter_mut().zip(&own_squares).for_each(|(s, g)| *s += g);
             if let Estimator::MultiInnovation(innovation) = options.estimator {
                 apply_innovation_weights(&mut gram, bank, target, innovation)?;
             }
             sum.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
             if options.initial != Initial::Rest {
-                parts.push(Normal::new(&gram, width, prior));
+                parts.push(Normal::new(&gram, width, &precisions(&own_squares)));
             }
         }
+        let weighted = matches!(options.estimator, Estimator::MultiInnovation(_));
+        let least_squares =
+            (options.ranks_by_gram_matrix() && weighted).then(|| Normal::new(&unweighted, width, &vec![0.0; width]));
         let refiner = match options.estimator {
             Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings, stop)),
             _ => None,
@@ -237,10 +249,11 @@ impl Problem {
             index,
             banks,
             targets,
-            equations: NormalEquations::new(Normal::new(&sum, width, prior), parts, fixed),
+            equations: NormalEquations::new(Normal::new(&sum, width, &precisions(&squares)), parts, fixed),
             residual_sums: options
                 .ranks_by_gram_matrix()
                 .then(|| ResidualSumOfSquares::new(unweighted, width, samples, fixed.len(), options.weights())),
+            least_squares,
             bound: None,
             tailored_vectors: None,
             unstable_zeros: None,
@@ -287,16 +300,15 @@ impl Problem {
         (TailoredVectors::new(&self.banks, &self.targets, self.options.norm), TailoredVectors::bytes(&self.banks))
     }
 
-    /// Build the tailored test vector of the candidate with these columns. Coefficients are least-squares estimates,
-    /// initial conditions are zero.
+    /// Build the tailored test vector of the candidate with these columns and zero initial conditions.
     pub(crate) fn tailor_vector(&self, adapted: &TailoredVectors, positions: &[usize]) -> Option<TailoredVector> {
-        let coefficients = self.least_squares_coefficients(positions)?;
+        let coefficients = self.coefficients(positions)?;
         adapted.fit(&self.banks, &self.targets, positions, &coefficients)
     }
 
     /// Whether these test vectors exclude that candidate.
     pub(crate) fn excluded_by_tailored(&self, adapted: &TailoredVectors, positions: &[usize], limit: f64) -> bool {
-        let Some(coefficients) = self.least_squares_coefficients(positions) else { return false };
+        let Some(coefficients) = self.coefficients(positions) else { return false };
         let mut memory = NormCache::default();
         simd::dispatch_simd(TailoredVectorKernel {
             adapted,
@@ -346,9 +358,17 @@ impl Problem {
         bytes
     }
 
-    /// Least-squares coefficients of the candidate with these columns, with zero initial conditions. `None` if it is
-    /// singular.
-    pub(crate) fn least_squares_coefficients(&self, positions: &[usize]) -> Option<Vec<f64>> {
+    /// Normal equations whose solution bounds the errors of a box: those of the candidates' coefficients if simulation
+    /// ranks, and those of the smallest squared equation error if it ranks. `None` with fixed coefficients or initial
+    /// terms.
+    pub(crate) fn box_equations(&self) -> Option<&Normal> {
+        let own = self.equations.unconstrained_equations()?;
+        Some(self.least_squares.as_ref().unwrap_or(own))
+    }
+
+    /// Coefficients of the candidate with these columns by the normal equations, with zero initial conditions. `None`
+    /// if it is singular.
+    pub(crate) fn coefficients(&self, positions: &[usize]) -> Option<Vec<f64>> {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let mut one = Solve::new();
         let [singular] = self.equations.solve(&sources, &[], &mut one);

@@ -13,21 +13,21 @@ use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
 use crate::order_search::options::{Criterion, Estimator, Norm, Options};
 use crate::order_search::result::{Counts, Failure, Part, Row, Verdict};
 use crate::order_search::stage_join::Span;
-use crate::python::convert::{initial, records, to_lists, to_vectors, InitialArg, List, RecordArg};
+use crate::python::convert::{initial, prior, records, to_lists, to_vectors, InitialArg, List, RecordArg};
 use crate::regressors::Record;
 
 /// Convergence tolerance of a candidate's instrumental variables, far below a change of the ranking.
 const IV_CONVERGENCE_TOLERANCE: f64 = 1e-4;
 
 /// Settings from a dictionary with these keys. `innovation_length` is 0 for least squares, `iterations` is 0 without
-/// instrumental variables, `memory` is in bytes.
+/// instrumental variables, `prior_covariance` is None for a weak prior, `memory` is in bytes.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 struct SettingsDict {
     criterion: String,
     norm: String,
     innovation_length: usize,
-    prior_covariance: f64,
+    prior_covariance: Option<f64>,
     haar_rows: bool,
     top: usize,
     threads: usize,
@@ -76,8 +76,8 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
                 Estimator::LeastSquares
             } else {
                 let row_basis = if given.haar_rows { RowBasis::Haar } else { RowBasis::Time };
-                let (length, prior_covariance) = (given.innovation_length, given.prior_covariance);
-                Estimator::MultiInnovation(Innovation { length, prior_covariance, row_basis })
+                let (length, prior) = (given.innovation_length, prior(given.prior_covariance));
+                Estimator::MultiInnovation(Innovation { length, prior, row_basis })
             },
             top: given.top,
             threads: given.threads,
