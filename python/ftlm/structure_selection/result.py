@@ -98,7 +98,7 @@ class Selection(ReportMixin):
         return self.best.validate(runs)
 
     def summary(self) -> str:
-        """Return the printed summary: candidates, reason of the choice, and the summary of the model."""
+        """Return the printed summary: that of the model, the candidates, and the reason of the choice."""
         return str(self)
 
     @property
@@ -238,7 +238,7 @@ class Selection(ReportMixin):
         }
 
     def __str__(self) -> str:
-        return f"{self.ranking_text()}\n\n{self.best}"
+        return f"{self.best.summary(self.validated)}\n\n{self.ranking_text()}"
 
     def ranking_text(self) -> str:
         """Table of the candidates and the reason of the choice, as text."""
