@@ -70,6 +70,7 @@ def test_calls_of_controllers_and_loops_end_in_an_answer_or_in_words():
     assert all(strange.outcome(function, given) is None for function, given in strange.recipes().values())
 
 
+@pytest.mark.slow
 def test_odd_arguments_of_public_functions_end_in_an_answer_or_in_words():
     tried = [(name, word, parameter, wrong) for name, parameter, word, wrong in odd.calls(("ftlm.", "analysis."))]
     assert [call for call in tried if call[-1] is not None] == []

@@ -72,7 +72,8 @@ def at(request, folder):
 
 
 PAGES = ("fit", "search", "model")
-ALL = (*PAGES, "paper")
+#: The page of the paper takes minutes to make.
+ALL = (*PAGES, pytest.param("paper", marks=pytest.mark.slow))
 
 
 @pytest.fixture(scope="module")
@@ -313,11 +314,15 @@ def test_paper_has_no_buttons_and_equations_are_typeset(browser, folder):
         page.emulate_media(media="print")
         assert page.locator(".zoom:visible, .slide:visible, .cursor:visible").count() == 0
         assert page.locator("nav").is_hidden()
+        parts = page.locator("details.part")
+        assert parts.count() > 4
+        assert all(part.bounding_box()["height"] > 100 for part in parts.all())
         printed = page.pdf(format="A4")
         assert printed.startswith(b"%PDF")
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
 
 
+@pytest.mark.slow
 def test_the_paper_s_page_names_what_holds_first(browser, at):
     with Opened(browser, at("paper"), viewport={"width": 360, "height": 900}) as opened:
         page = opened.page

@@ -329,6 +329,7 @@ def test_ctrl_c_ends_a_search_with_130_and_shows_progress_before(folder: Path) -
     os.close(master)
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -> None:
     signals = {"theta11": "th11", "theta12": "th12", "theta21": "th21", "theta22": "th22"}
@@ -496,6 +497,7 @@ for words in commands:
 """
 
 
+@pytest.mark.slow
 def test_no_command_prints_what_a_terminal_obeys(tmp_path):
     t = np.arange(200) * 0.05
     rows = "\n".join(f"{a},{np.sign(np.sin(a))},{np.sin(a)}" for a in t)

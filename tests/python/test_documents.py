@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -92,13 +93,20 @@ def commands() -> list[str]:
 @pytest.mark.parametrize("command", commands())
 def test_every_command_and_option_of_the_documents_exists(command: str) -> None:
     words = shlex.split(command, comments=True)
-    shown = subprocess.run(
-        [sys.executable, "-m", "ftlm", words[1], "--help"], capture_output=True, text=True, check=False, env=wide()
-    )
-    assert shown.returncode == 0, shown.stderr
+    shown = help_of(words[1])
     for word in words[2:]:
         if re.fullmatch(r"--?[a-z][\w-]*", word):
-            assert re.search(rf"{re.escape(word)}\b", shown.stdout), f"{word} is no option of ftlm {words[1]}"
+            assert re.search(rf"{re.escape(word)}\b", shown), f"{word} is no option of ftlm {words[1]}"
+
+
+@cache
+def help_of(name: str) -> str:
+    """Help of a command."""
+    shown = subprocess.run(
+        [sys.executable, "-m", "ftlm", name, "--help"], capture_output=True, text=True, check=False, env=wide()
+    )
+    assert shown.returncode == 0, shown.stderr
+    return shown.stdout
 
 
 def wide() -> dict[str, str]:

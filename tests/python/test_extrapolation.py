@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import ftlm
 from ftlm.estimation.free_parameters import FreeProblem
@@ -65,6 +66,7 @@ def test_a_bound_that_already_binds_is_kept_alone() -> None:
     np.testing.assert_allclose(found, [1.5, -1.1, 2.2], rtol=1e-12)
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_robot_arm_becomes_a_model() -> None:
     torque, acceleration = np.loadtxt(DATA / "robot_arm" / "robot_arm.dat").T

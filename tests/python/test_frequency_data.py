@@ -137,6 +137,7 @@ def test_two_outputs_that_hang_together_are_one_fit():
 # ------------------------------------------------------------------------------------------------ what intervals say
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Of 200 seeds a 95 % interval holds it 181 to 198 times with a probability above 99.9 %."""
     structure = ftlm.equation(ARC, orders={"alpha": [0.7, 0.8, 0.9]})

@@ -83,6 +83,7 @@ def test_regular_times_leave_intervals_that_cover() -> None:
     assert min(covered.values()) >= 27, covered
 
 
+@pytest.mark.slow
 def test_jitter_of_thirty_percent_leaves_intervals_that_cover_as_well() -> None:
     """The output is compared when it was read; straight lines to a grid moved estimates by a standard error."""
     covered, errors = coverage(0.3)

@@ -542,6 +542,7 @@ def test_least_squares_at_the_true_orders_is_biased_by_noise(clean_a, record_a):
     assert max(estimates) == pytest.approx(79, abs=150)
 
 
+@pytest.mark.slow
 def test_least_squares_bias_with_noise_on_point_samples(clean_a, with_noise, record_a):
     # The same noise on the 5 000 point samples is averaged by the pulses: -322 on average, standard deviation 198.
     structure = replace(record_a[1], coefficient_law=())

@@ -128,6 +128,7 @@ def test_the_optimum_is_scipys() -> None:
     assert ours["evaluations"] < theirs.nfev * 3
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     scores = []
     for seed in range(16):
@@ -142,7 +143,10 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     assert np.max(np.abs(z)) < 4.5
 
 
-@pytest.mark.parametrize(("stage", "noise"), [(1, 1e-2), (1, 1e-4), (2, 1e-2)])
+@pytest.mark.parametrize(
+    ("stage", "noise"),
+    [(1, 1e-2), pytest.param(1, 1e-4, marks=pytest.mark.slow), pytest.param(2, 1e-2, marks=pytest.mark.slow)],
+)
 def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int, noise: float) -> None:
     run = arm_run(stage, 3001, noise, 3)
     found = ftlm.identify(run, ftlm.flexible_link(form="published", stage=stage), method="output-error")

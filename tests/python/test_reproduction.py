@@ -422,6 +422,7 @@ def test_nothing_is_overwritten_in_a_folder(reproduction, saved):
     assert len(reproduction.save(saved, force=True)) == len(list(saved.iterdir()))
 
 
+@pytest.mark.slow
 def test_measured_runs_of_one_stage(reproduction, tmp_path):
     run = reproduction.square.select(["I2", "theta21", "theta22"])
     other = reproduction.sine.select(["theta21", "theta22", "I2"])
@@ -461,6 +462,7 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
     ] == pytest.approx(same)
 
 
+@pytest.mark.slow
 def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypatch):
     own = ["I2", "theta21", "theta22"]
     moving = reproduction.square.select(own).window(1.3, 4.3)
@@ -556,6 +558,7 @@ def test_what_cannot_be_done_is_said_before_any_work(tmp_path, words, code, mess
     assert not (tmp_path / "paper.html").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absent", ["pygad", "scipy.optimize"])
 def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reproduction, tmp_path, monkeypatch, absent):
     def stage_without_searches(work, genetic):

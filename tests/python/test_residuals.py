@@ -285,6 +285,7 @@ def test_a_missing_dead_time_is_found():
     assert sum(not t.white["y"] for t in found) >= 19
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coloured", [False, True])
 def test_the_true_dead_time_raises_no_alarm(coloured):
     true = ftlm.Model(ftlm.equation("D y = -8.333333333333334 y + 66.66666666666667 u").with_delays({"u": 0.035}))

@@ -26,6 +26,7 @@ def law(name: str) -> dict[str, float]:
     return demo_plant(1 if name == "A" else 2, form="published").coefficients
 
 
+@pytest.mark.slow
 def test_instrumental_variables_find_the_coefficients_that_least_squares_loses() -> None:
     orders = {n: v for n, v in ARM.items() if n in plants.structure("A").order_names}
     at_truth = plants.structure("A").with_orders(orders)
@@ -205,7 +206,10 @@ def test_estimates_do_not_depend_on_the_grid() -> None:
     assert np.max(np.abs(biased)) > 5
 
 
-@pytest.mark.parametrize("seed", [0, 5, 26, 44, 78, 100, 150, 169])
+LONG_FITS = [pytest.param(seed, marks=pytest.mark.slow) for seed in (26, 44, 169)]
+
+
+@pytest.mark.parametrize("seed", [0, 5, *LONG_FITS, 78, 100, 150])
 def test_random_plants_are_found_from_the_automatic_start(seed: int) -> None:
     _, excess, _, words = truth.random_plant(seed)
     assert excess < truth.SAME_OPTIMUM, words
@@ -267,6 +271,7 @@ def test_a_richer_equation_never_fits_worse_than_a_simpler_one() -> None:
     assert any("from a" in origin and "= 0" in origin for _, origin in rich.fit.starts)
 
 
+@pytest.mark.slow
 def test_starts_that_stay_above_the_noise_are_not_the_last_word() -> None:
     run, structure = plants.noisy_run("A2", 60, 41), plants.structure("A2")
     found = fit_output_error([run], structure, refine=False)
@@ -292,6 +297,7 @@ def test_an_order_too_many_ends_as_a_pole_too_fast_to_see_and_not_in_a_mode_of_t
     assert second.fit.noise["y"] == pytest.approx(second.output_error["y"].rmse, rel=0.1)
 
 
+@pytest.mark.slow
 def test_of_neighbouring_orders_of_a_stage_the_coupled_run_decides() -> None:
     run, free = plants.noisy_run("A", 40, 3), plants.structure("A")
     near = ftlm.order_grid(alpha=(1.95, 2.0), gamma1=(0.95, 1.0), beta2=(0.1, 0.15), mu2=(0.8, 0.85))
