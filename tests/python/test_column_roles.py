@@ -84,3 +84,25 @@ def test_inspect_needs_no_names(tmp_path):
     shown = command("inspect", write(tmp_path / "a.csv", ["t", "u", "y"]))
     assert shown.returncode == 0, shown.stderr
     assert "'u' drives 'y', by their names" in shown.stdout
+
+
+def test_open_writes_a_columns_file_that_loads_the_same_run(tmp_path):
+    file, columns = (
+        write(tmp_path / "a.csv", ["t", 'Motor "A" voltage [V]', "Tip angle [deg]"]),
+        tmp_path / "bench.toml",
+    )
+    shown = command("open", file, "--write-columns", str(columns))
+    assert shown.returncode == 0, shown.stderr
+    assert f"written: {columns}" in shown.stdout
+    run, again = ftlm.open_file(file).load(), ftlm.load(file, columns=columns)
+    assert run.units == again.units
+    assert all(np.array_equal(run[n], again[n]) for n in run.signals)
+    assert not any("by their names" in str(w) for w in again.warnings)
+    assert command("open", file, "--write-columns", str(columns)).returncode == 3
+    assert command("open", file, "--write-columns", str(columns), "--force").returncode == 0
+
+
+def test_a_file_that_is_no_run_has_no_columns_to_write(tmp_path):
+    file = write(tmp_path / "a.csv", ["t", "foo", "bar"])
+    with pytest.raises(ftlm.DataError, match="no run yet"):
+        ftlm.open_file(file).write_columns(tmp_path / "bench.toml")

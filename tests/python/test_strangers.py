@@ -138,4 +138,4 @@ def test_the_command_that_open_names_works(files, name):
     (figures,) = json.loads(looked.stdout)
     assert (figures["rows"], figures["step"]) == (strangers.ROWS, pytest.approx(strangers.STEP))
     words = shlex.split(lines[1])[1:]
-    assert words[words.index("--structure") + 1] == strangers.EQUATION
+    assert words[words.index("--structure") + 1] == "auto"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from typing import Annotated
 
-from typer import Argument
+from typer import Argument, Option
 
-from ftlm.cli.framework import command, print_text, show
-from ftlm.cli.reading_options import Files, Json, ReadingOptions
+from ftlm.cli.framework import command, print_text, say_written, show
+from ftlm.cli.reading_options import OUTPUT_PANEL, Files, Force, Json, ReadingOptions, Text
+from ftlm.utils.files import COMMAND_MESSAGES, check_free
 
 
 @command
@@ -16,10 +17,25 @@ def open_(
     *,
     file: Annotated[str, Argument(metavar="FILE", help="Measured file.")],
     reading: ReadingOptions,
+    write_columns: Annotated[
+        Text,
+        Option(
+            metavar="TOML",
+            rich_help_panel=OUTPUT_PANEL,
+            help="Write columns, units and layout to this file for --columns.",
+        ),
+    ] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Preview a file: columns, units, roles, step, assumptions with contrary evidence, next command."""
-    show(reading.preview_file(file), as_json=as_json)
+    check_free(write_columns, force=force, words=COMMAND_MESSAGES)
+    opened = reading.preview_file(file)
+    if write_columns is not None:
+        opened.write_columns(write_columns, force=force)
+    show(opened, as_json=as_json)
+    if not as_json:
+        say_written(write_columns)
 
 
 @command

@@ -44,6 +44,10 @@ class _ColumnsFile(msgspec.Struct, forbid_unknown_fields=True):
     layout: dict[str, str | int] | None = None
 
 
+#: Keys of a columns file.
+COLUMN_KEYS = _ColumnsFile.__struct_fields__
+
+
 @check_arguments
 def load(
     path: PathLike | Sequence[PathLike],
@@ -419,7 +423,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
         return {key: value for key, value in read.items() if value is not None}
     if not isinstance(columns, Mapping):
         raise DataError(f"{parameter('columns')} is a {type(columns).__name__}; pass a dict or the path of a TOML file")
-    known = _ColumnsFile.__struct_fields__
+    known = COLUMN_KEYS
     unknown = [key for key in columns if key not in known]
     if unknown:
         raise DataError(

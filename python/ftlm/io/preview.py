@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from ftlm.errors import DataError
 from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles, has_numbers
 from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.load import (
+    COLUMN_KEYS,
     LoadOptions,
     PathLike,
     load,
@@ -29,6 +32,7 @@ from ftlm.io.load import (
 from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.files import write_atomically
 from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, flag_of, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
@@ -118,19 +122,40 @@ class OpenedFile:
         Parameters
         ----------
         verb
-            Command of `ftlm`: ``identify`` with the simplest equation of the first output, ``inspect``, ``select``.
+            Command of `ftlm`: ``identify``, ``inspect``, ``select``. The structure is chosen automatically; of several
+            outputs, that of the first.
         """
         if self.problem:
             return ""
         words = ["ftlm", verb, self.path if not self.path.startswith("-") else f"./{self.path}", *self._flags()]
         outputs = [c.signal for c in self.columns if c.role == "output"]
-        inputs = [c.signal for c in self.columns if c.role == "input"]
-        if verb == "identify":
-            drives = "".join(f" + b{k} {name}" for k, name in enumerate(inputs))
-            words += ["--structure", f"D^alpha {outputs[0]} = a0 {outputs[0]}{drives}"]
-        elif verb == "select":
+        if verb in ("identify", "select"):
             words += ["--structure", "auto"]
+            words += ["--only", outputs[0]] if len(outputs) > 1 else []
         return " ".join(map(shlex.quote, words))
+
+    def write_columns(self, path: PathLike, *, force: bool = False) -> Path:
+        """Write time, columns, units and layout as a TOML file for ``columns=`` and ``--columns``.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite an existing file.
+
+        Raises
+        ------
+        DataError
+            Inputs or outputs are still unknown; the file exists and ``force`` is not set, or cannot be written.
+        """
+        if self.problem:
+            raise DataError(f"{self.path} is no run yet, so there are no columns to write: {self.problem}")
+        said = {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items() if k in COLUMN_KEYS}
+        lines = [f"{key} = {_toml(value)}" for key, value in said.items() if not isinstance(value, dict)]
+        for table, values in ((k, v) for k, v in said.items() if isinstance(v, dict)):
+            lines += ["", f"[{table}]", *(f"{_toml(str(k))} = {_toml(v)}" for k, v in values.items())]
+        return write_atomically(path, ("\n".join(lines) + "\n").encode(), force=force)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the preview as a JSON-compatible dictionary."""
@@ -388,6 +413,11 @@ def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> F
     if not there.size:
         return FileColumn(column.name, role, signal, unit, None, None, None, "empty")
     return FileColumn(column.name, role, signal, unit, float(values[0]), float(there.min()), float(there.max()))
+
+
+def _toml(value: object) -> str:
+    """Return a text or a number as TOML, whose basic strings are those of JSON."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _role(column: FileColumn) -> str:
