@@ -40,7 +40,7 @@ def main():
     found.model.save(folder / "model.json")
     structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
     lattice = ftlm.order_grid(increment=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
-    options = {"m": 32, "pruning": False, "threads": 1, "top": 5}
+    options = {"m": 32, "pruning": False, "threads": 1, "top": 5, "prior_covariance": 1.0}
     whole = ftlm.search_orders(given, structure, lattice, store=folder / "search.ftlm", **options)
     settings = SearchSettings(top=5, pruning=False)
     job = make_job(given, structure, lattice, settings, m=32, threads=1)
@@ -64,7 +64,7 @@ def main():
 def under_a_law(folder, given):
     """A finished store of a search under an order law, and its table."""
     structure = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u", initial="rest")
-    options = {"m": 32, "threads": 1, "top": 5, "store": folder / "law.ftlm"}
+    options = {"m": 32, "threads": 1, "top": 5, "prior_covariance": 1.0, "store": folder / "law.ftlm"}
     found = ftlm.search_orders(given, structure, ftlm.order_grid(increment=0.05), **options)
     (folder / "law.json").write_text(json.dumps(found.to_dict(), indent=1) + "\n", encoding="utf-8")
 

@@ -116,20 +116,6 @@ def test_boxes_keep_the_table_of_squared_equation_errors_of_multi_innovation(run
         check_one_by_one(run, whole, prior_covariance=prior, **options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("p", [1, 7])
-@pytest.mark.parametrize("prior", [1.0, 1e6])
-def test_one_slab_of_the_paper_keeps_the_rows_of_brute_force(clean_a, p, prior):
-    equation = ftlm.flexible_link(form="published", stage=1).equation("theta12")
-    options = {"coefficients": "multi-innovation", "innovation_length": p, "prior_covariance": prior, "threads": 2}
-    grid = ftlm.order_grid(increment=0.02, alpha=(1.91, 1.91))
-    quick = ftlm.search_orders(clean_a, equation, grid, **options)
-    slow = ftlm.search_orders(clean_a, equation, grid, pruning=False, **options)
-    assert quick.candidates > 1 << 18
-    assert len(quick.table) == 20
-    assert rows_of(quick) == rows_of(slow)
-
-
 def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tmp_path):
     path = tmp_path / "s.ftlm"
     whole = closely(unruly, path, threads=2)

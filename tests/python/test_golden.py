@@ -115,12 +115,12 @@ def test_a_store_is_written_as_it_was_then(folder, tmp_path, monkeypatch, name):
     path = tmp_path / "now.ftlm"
     if name == "law":
         structure = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u", initial="rest")
-        ftlm.search_orders(run, structure, ftlm.order_grid(increment=0.05), m=32, threads=1, top=5, store=path)
+        lattice, options = ftlm.order_grid(increment=0.05), {"m": 32}
     else:
         structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
         lattice = ftlm.order_grid(increment=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
-        options = {"m": 32, "pruning": False, "threads": 1, "top": 5, "store": path}
-        ftlm.search_orders(run, structure, lattice, **options)
+        options = {"m": 32, "pruning": False}
+    ftlm.search_orders(run, structure, lattice, prior_covariance=1.0, threads=1, top=5, store=path, **options)
     now, then = payloads(path), payloads(folder / f"{name}.ftlm")
     assert (now[0].pop("version"), then[0].pop("version")) == (ftlm.__version__, folder.name)
     # Small lattices are searched as they were by the first algorithm.
