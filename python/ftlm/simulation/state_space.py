@@ -103,8 +103,8 @@ class StateSpace:
 
 
 def _are_integers(orders: Sequence[float]) -> bool:
-    """Whether all orders or exponents are integers."""
-    return all(abs(order - round(order)) <= ORDER_TOLERANCE for order in orders)
+    """Whether all orders or exponents are integers; differences of two of them are so within the core's tolerance."""
+    return all(abs(order - round(order)) <= 0.5 * ORDER_TOLERANCE for order in orders)
 
 
 def _drivers(model: Model) -> list[str]:
