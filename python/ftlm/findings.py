@@ -590,7 +590,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "standard deviations from where it rested, about {rows:.2g} rows early|; the input was logged after it acted, "
         "or one of the two signals is late",
         "{output} moves before its input {input}, by about {rows:.2g} rows",
-        "log the input before it acts, or shift its rows",
+        "log the input before it acts, shift its rows, or let {ask[delay]} be negative, to one row",
         prefix="{run}: ",
     ),
     "looked_like_rest": FindingKind(

@@ -270,7 +270,7 @@ LAG: Any = ((0, 1.0, [(0, 0.0), (1, 0.0)]), [-1.0, 1.0])
         ({"terms": [[], []]}, ftlm.DataError, "initial terms has length 2, but 1 is needed"),
         ({"driving": [(1, np.ones(4), True, 0.0, 0.0)]}, ftlm.DataError, "input has length 4, but 3 is needed"),
         ({"driving": [(1, np.full(3, np.nan), True, 0.0, 0.0)]}, ftlm.DataError, "input is not finite at index 0"),
-        ({"driving": [(1, np.ones(3), True, -1.0, 0.0)]}, ftlm.ModelError, "delay = -1 is outside"),
+        ({"driving": [(1, np.ones(3), True, np.inf, 0.0)]}, ftlm.DataError, "delay is not finite"),
         ({"rows": 1 << 40}, ftlm.ModelError, "samples of all outputs = 1099511627776 is outside"),
         ({"step": 0.0}, ftlm.ModelError, "step = 0 is outside"),
     ],
