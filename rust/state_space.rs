@@ -19,7 +19,7 @@ use crate::equation::{check_regular, Equation, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
 use crate::linalg::{dense, small};
 use crate::parallel::Stop;
-use crate::signal::block_pulse::{delay_samples, Intersample};
+use crate::signal::block_pulse::{delay_samples, delayed_row, Intersample};
 
 /// Input of the equations.
 #[derive(Debug, Clone, PartialEq)]
@@ -94,14 +94,7 @@ pub fn respond(
         check_length("input", rows, input.samples.len())?;
         check_finite("input", &input.samples)?;
         check_finite("input before the record", &[input.before])?;
-        if !(input.delay >= 0.0 && input.delay.is_finite()) {
-            return Err(Error::OutOfRange {
-                name: "delay".into(),
-                value: input.delay,
-                range: "[0, ∞) steps".into(),
-                remedy: "an input acts after it is given".into(),
-            });
-        }
+        check_finite("delay", &[input.delay])?;
     }
     let Some(model) = Realization::new(equations, inputs, initial, step)? else { return Ok(None) };
     let Some(recursion) = model.discretize(inputs)? else { return Ok(None) };
@@ -250,23 +243,23 @@ impl Realization {
         let mut channels = Vec::with_capacity(inputs.len());
         for (input, (drive, direct)) in inputs.iter().zip(&self.drives) {
             let nearest = input.delay.round();
-            let is_whole = (input.delay - nearest).abs() <= DELAY_TOLERANCE * nearest.max(1.0);
+            let is_whole = (input.delay - nearest).abs() <= DELAY_TOLERANCE * nearest.abs().max(1.0);
             let delay = if is_whole { nearest } else { input.delay };
             let fraction = delay - delay.floor();
-            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-            let whole = delay.floor().min(1e18) as usize;
+            #[allow(clippy::cast_possible_truncation)]
+            let whole = delay.floor().clamp(-1e18, 1e18) as isize;
             let Some(InputGains { now, later }) =
                 InputGains::new(&interval, &self.system, drive, input.between, fraction)
             else {
                 return Ok(None);
             };
             let (samples, lag) = match input.between {
-                Intersample::Linear if delay > 0.0 => {
+                Intersample::Linear if delay != 0.0 => {
                     (Cow::Owned(delay_samples(&input.samples, delay, input.before)?), 0)
                 }
                 Intersample::Linear => (Cow::Borrowed(input.samples.as_slice()), 0),
                 Intersample::Hold => {
-                    (Cow::Borrowed(input.samples.as_slice()), whole.saturating_add(usize::from(fraction > 0.0)))
+                    (Cow::Borrowed(input.samples.as_slice()), whole.saturating_add(isize::from(fraction > 0.0)))
                 }
             };
             let channel = Channel { samples, lag, before: input.before, now, later, direct: direct.clone() };
@@ -371,7 +364,7 @@ impl InputGains {
 struct Channel<'a> {
     samples: Cow<'a, [f64]>,
     /// Rows by which the samples are late, and the value before them.
-    lag: usize,
+    lag: isize,
     before: f64,
     /// Gains of a row's own value and of the next row's value on the next state.
     now: Vec<f64>,
@@ -407,8 +400,8 @@ impl Recursion<'_> {
             forcing.fill(0.0);
             for channel in &self.channels {
                 for (row, value) in values.iter_mut().enumerate() {
-                    *value = match (begin + row).checked_sub(channel.lag) {
-                        Some(k) => channel.samples.get(k).copied().unwrap_or(0.0),
+                    *value = match delayed_row(begin + row, channel.lag) {
+                        Some(k) => channel.samples.get(k).or(channel.samples.last()).copied().unwrap_or(0.0),
                         None => channel.before,
                     };
                 }

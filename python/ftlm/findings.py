@@ -273,6 +273,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "the free run on {run} still moves with the step at the finest grid: the model is stiffer than these samples "
         "can show, and its output error is provisional",
     ),
+    "mode_sampled_coarsely": FindingKind(
+        "step",
+        LEVEL_FACT,
+        "a mode of {frequency:.4g} rad/s has {samples:.2g} samples a period|: its numbers rest on how the inputs move "
+        "between samples, since a held input lags a linear one by half a sample, {phase:.0f} degrees of that mode, and "
+        "is {loss:.1g} % smaller there",
+        remedy="sample eight times a period at least, or state how the inputs move with {ask[intersample]}",
+    ),
     "scheme_unstable": FindingKind(
         "step",
         LEVEL_WITH_CARE,
@@ -477,6 +485,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "add a term of {input}; of the flexible link {ask[cross_stage is torques]} adds the other link, and "
         "{ask[friction]} the dry friction of the hubs",
     ),
+    "arm_leaves_out": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "the equations of the flexible link leave out {parts}, which an arm has, and the model leaves something out",
+        "the equations of the flexible link leave out {parts}",
+        "{ask[coupling is simulated]} with {ask[friction]} adds the dry friction of the hubs, and "
+        "{ask[cross_stage is inertial]} the other link",
+    ),
     "follow_undecided": FindingKind(
         "other",
         LEVEL_FACT,
@@ -580,7 +596,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "standard deviations from where it rested, about {rows:.2g} rows early|; the input was logged after it acted, "
         "or one of the two signals is late",
         "{output} moves before its input {input}, by about {rows:.2g} rows",
-        "log the input before it acts, or shift its rows",
+        "log the input before it acts, shift its rows, or let {ask[delay]} be negative, to one row",
         prefix="{run}: ",
     ),
     "looked_like_rest": FindingKind(
@@ -742,7 +758,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "samples",
         LEVEL_WITH_CARE,
         "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation) beside what the inputs "
-        "explain; let the sensor settle, or subtract a line if it is known to be the sensor's",
+        "explain; let the sensor settle, or have the line estimated with the model: {ask[offset is ramp]}",
+        remedy="{ask[offset is ramp]} estimates a line with the model",
     ),
     "starts_off_zero": FindingKind(
         "history",
@@ -1099,7 +1116,8 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
     for place, item in enumerate(unique(findings)):
         alone = place if item.kind.topic == "other" else 0
         by.setdefault((FINDING_LEVELS.index(item.level), order.index(item.kind.topic), alone), []).append(item)
-    return tuple(FindingGroup(tuple(by[key])) for key in sorted(by))
+    # A finding with a remedy of its own says more than one with that of its topic.
+    return tuple(FindingGroup(tuple(sorted(by[key], key=lambda item: not item.kind.remedy))) for key in sorted(by))
 
 
 def hidden_findings_text(found: Sequence[FindingGroup]) -> str:

@@ -133,8 +133,9 @@ impl<'a> SampleResponses<'a> {
                 }
                 let direct = (term.order - structure.order).abs() <= ORDER_TOLERANCE;
                 // Inputs before the run, and at its last sample, are no response to one of its samples.
-                let late = channel.delay.unwrap_or(0.0) > 0.0;
-                if channel.role == Role::Derived || (late && (direct || !recording.is_at_rest)) {
+                let delay = channel.delay.unwrap_or(0.0);
+                let late = delay > 0.0 && (direct || !recording.is_at_rest);
+                if channel.role == Role::Derived || delay < 0.0 || late {
                     return None;
                 }
                 let samples = interpolate_gaps(&recording.acting_samples(term.signal)).into_owned();

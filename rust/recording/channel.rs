@@ -60,17 +60,18 @@ impl Channel {
     /// Return an error for values that no channel has.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] for a sample of an input, [`Error::OutOfRange`] for a delay or a limit below 0.
+    /// [`Error::NotFinite`] for a sample of an input, [`Error::OutOfRange`] for a limit below 0.
     pub fn check(&self) -> Result<()> {
         if matches!(self.role, Role::Input(_)) {
             let all = std::iter::once(&self.samples).chain(&self.nonuniform);
             all.into_iter().try_for_each(|samples| check_finite(&format!("signal {}", self.name), samples))?;
         }
-        let limits = self.nonlinearities.iter().filter_map(|(_, value)| *value);
-        match self.delay.into_iter().chain(limits).find(|v| !(*v >= 0.0 && v.is_finite())) {
+        check_finite(&format!("delay of {}", self.name), &[self.lag()])?;
+        let mut limits = self.nonlinearities.iter().filter_map(|(_, value)| *value);
+        match limits.find(|v| !(*v >= 0.0 && v.is_finite())) {
             None => Ok(()),
             Some(value) => Err(Error::OutOfRange {
-                name: format!("delay or limit of {}", self.name),
+                name: format!("limit of {}", self.name),
                 value,
                 range: "[0, ∞)".into(),
                 remedy: "give a number from 0".into(),

@@ -385,7 +385,7 @@ impl Recording {
         }
         let acting = self.acting_samples(signal);
         let mut samples = interpolate_gaps(&acting);
-        if channel.lag() > 0.0 {
+        if channel.lag() != 0.0 {
             let intervals = self.len() - 1;
             // On a finer grid the delayed command switches within an interval, so it is held on that grid before the
             // delay.
@@ -580,14 +580,14 @@ impl Recording {
             return Ok(PointValues::default());
         }
         let is_zero_order_hold = channel.is_held_input();
-        if channel.lag() > 0.0 && is_zero_order_hold {
+        if channel.lag() != 0.0 && is_zero_order_hold {
             // A command switches between samples after a delay: what it is then is the pulse that follows.
             let mut values: Vec<f64> = pulses.means[signal].iter().copied().step_by(every).collect();
             values.extend(values.last().copied());
             return Ok(PointValues { values: Some(values), is_zero_order_hold });
         }
         let mut samples = self.acting_samples(signal);
-        if channel.lag() > 0.0 {
+        if channel.lag() != 0.0 {
             samples = delay_samples(&samples, channel.lag() / self.step, self.value_before(&samples))?.into();
         }
         Ok(PointValues { values: Some(samples.iter().copied().step_by(decimation).collect()), is_zero_order_hold })

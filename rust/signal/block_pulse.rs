@@ -104,9 +104,10 @@ fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f6
 /// Delay samples by `delay` steps, whole and fractional: u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
 ///
 /// The result gives exact means of a held command after a delay of (d+φ)h. `before` is the value before the record.
+/// With a negative delay the last sample stays behind the end of the record.
 ///
 /// # Errors
-/// A delay that is negative or not finite, a sample that is not finite.
+/// A delay or a sample that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -116,21 +117,14 @@ fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f6
 /// ```
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
-    if !(delay >= 0.0 && delay.is_finite()) {
-        return Err(Error::OutOfRange {
-            name: "delay".into(),
-            value: delay,
-            range: "[0, ∞) steps".into(),
-            remedy: "an input acts after it is given".into(),
-        });
-    }
+    check_finite("delay", &[delay])?;
     check_finite("samples", samples)?;
     check_finite("before", &[before])?;
-    let whole = delay.floor();
+    let (count, whole) = (samples.len(), delay.floor());
     let fraction = delay - whole;
-    let whole = whole.min(samples.len() as f64) as usize;
-    let at = |j: usize, back: usize| j.checked_sub(back).map_or(before, |i| samples[i]);
-    Ok((0..samples.len())
+    let whole = whole.clamp(-(count as f64), count as f64) as isize;
+    let at = |j: usize, back: isize| delayed_row(j, back).map_or(before, |i| samples[i.min(count - 1)]);
+    Ok((0..count)
         .map(|j| {
             let near = at(j, whole);
             if fraction == 0.0 {
@@ -140,6 +134,11 @@ pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64
             }
         })
         .collect())
+}
+
+/// Row that acts in row `j` after a delay by whole rows, negative ones included; None before the record.
+pub(crate) fn delayed_row(j: usize, delay: isize) -> Option<usize> {
+    j.checked_add_signed(delay.saturating_neg())
 }
 
 /// Point samples at 0, h, …, mh from m pulse means: the average of neighboring pulses, with second-order extrapolation

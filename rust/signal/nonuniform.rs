@@ -37,11 +37,19 @@ impl<'a> NonuniformSignal<'a> {
         Self { times: Cow::Borrowed(times), values: Cow::Borrowed(values), intersample }
     }
 
-    /// Signal after a delay \[s\], with the value before its first sample.
+    /// Signal after a delay \[s\], with the value before its first sample; after a negative one the last value stays.
     #[must_use]
     pub fn with_delay(self, delay: f64, before: f64) -> Self {
         if delay == 0.0 {
             return self;
+        }
+        if delay < 0.0 {
+            let (first, last) = (self.at(&[-delay])[0], self.times.len().checked_sub(1));
+            let kept = self.times.partition_point(|t| t + delay <= 0.0);
+            let ends = last.map(|k| (self.times[k], self.values[k]));
+            let moved = self.times.iter().zip(self.values.iter()).skip(kept).map(|(t, v)| (t + delay, *v));
+            let (times, values): (Vec<f64>, Vec<f64>) = std::iter::once((0.0, first)).chain(moved).chain(ends).unzip();
+            return Self { times: times.into(), values: values.into(), ..self };
         }
         let times = std::iter::once(0.0).chain(self.times.iter().map(|t| t + delay)).collect();
         let values = std::iter::once(before).chain(self.values.iter().copied()).collect();

@@ -289,7 +289,7 @@ BAD = {
         lambda: ftlm.operational_matrix(0.5, 3, step=1.0),
     ),
     # Equations and models
-    "negative delay": (MODEL, "delay of u = -0.1 s", lambda: ftlm.equation("D y = a y + b u", delay={"u": -0.1})),
+    "infinite delay": (MODEL, "delay of u = inf s", lambda: ftlm.equation("D y = a y + b u", delay={"u": np.inf})),
     "delay of an output": (MODEL, "delayed input 'y'", lambda: ftlm.equation("D y = a y + b u", delay={"y": 0.1})),
     "delay of what a run has as an output": (
         MODEL,

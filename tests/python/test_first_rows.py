@@ -9,6 +9,7 @@ from scipy.signal import cont2discrete, lfilter, lsim
 from scipy.stats import beta
 
 import ftlm
+from ftlm.simulation.initial_conditions import rest_evidence
 
 H = 0.5
 
@@ -348,6 +349,46 @@ def panel_table(seeds):
             if right and name != "fractional":
                 covered += [found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in TRUTHS[name].items()]
     return wrong, covered
+
+
+@pytest.mark.parametrize("cut", [0, 150, 151, 152])
+def test_an_output_that_hardly_moves_at_first_was_at_rest(cut):
+    # The input acts from row 0 on, as a rig's command does; a structure without the fast lag must not ask for a past.
+    u = np.repeat(np.random.default_rng(2).choice([-1.0, 1.0], 40), 20)
+    y = plant([3.0], [1.0, 4.0, 6.0, 0.0], u, 0.02)
+    first = int(np.argmin(np.abs(y[cut : cut + 100]))) + cut if cut else 0
+    y = y[first:] - (y[first] if cut else 0.0) + 1e-6 * np.random.default_rng(3).standard_normal(y.size - first)
+    run = run_of(u[first:], y, 0.02)
+    structure = ftlm.equation("D^alpha y = a D y + b u")
+    evidence = rest_evidence(run, structure)
+    assert (evidence is not None) == (cut == 0)
+    if cut == 0:
+        assert ftlm.identify(run, structure).settings["initial"] == "rest"
+
+
+def test_a_mode_with_few_samples_a_period_is_named():
+    g = np.random.default_rng(1)
+    u = np.repeat(g.choice([-1.0, 1.0], 200), 3)
+    for step, named in ((0.25, True), (0.1, False)):
+        y = plant([16.0], [1.0, 0.8, 16.0], u, step) + 0.01 * g.standard_normal(u.size)
+        found = ftlm.identify(run_of(u, y, step), ftlm.equation("D^2 y = -p D y - q y + b u"))
+        said = [f for f in found.findings if f.code == "mode_sampled_coarsely"]
+        assert len(said) == named
+        if named:
+            assert said[0].numbers["samples"] == pytest.approx(2 * np.pi / (4 * step), rel=0.02)
+            # A hold is half a sample late and sinc(1/n) small.
+            assert said[0].numbers["phase"] == pytest.approx(180 / said[0].numbers["samples"])
+
+
+def test_a_level_that_drifts_is_named_with_its_remedy():
+    u = np.repeat(np.random.default_rng(4).choice([-1.0, 1.0], 60), 10)
+    y = plant([1.0], [3.0, 1.0], u) + np.linspace(0.0, 8.0, 600) + 0.01 * np.random.default_rng(5).standard_normal(600)
+    said = [f for f in run_of(u, y).advice() if f.code == "drift"]
+    assert len(said) == 1
+    assert "offset='ramp'" in said[0].text
+    assert said[0].remedy.startswith("offset='ramp'")
+    found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS, offset="ramp"))
+    assert gain_of(found) == pytest.approx(1.0, rel=0.02)
 
 
 @pytest.mark.parametrize(("name", "start"), [("fractional and a lag", "rest"), ("fractional", "rest")])

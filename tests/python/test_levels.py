@@ -5,7 +5,8 @@ import pytest
 from scipy.signal import lsim, lti
 
 import ftlm
-from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE
+from ftlm.estimation.identify import arm_findings
+from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, group_findings, make_finding
 
 STEP = 0.05
 
@@ -110,3 +111,17 @@ def test_an_outlier_at_an_end_of_the_run_is_named_and_not_taken_for_a_poor_model
     assert not {"explains_little", "buried_in_noise"} & set(codes(found))
     assert found.verdict.level == LEVEL_WITH_CARE
     assert found.verdict.reason.startswith("the first or the last row of y lies far off")
+
+
+def test_a_flexible_link_names_what_it_leaves_out_of_an_arm():
+    left = [make_finding("residuals_not_white", output="theta11")]
+    (said,) = arm_findings(ftlm.flexible_link(stage=1), left)
+    assert said.numbers["parts"] == "dry friction of the hubs and the other link"
+    assert "friction=" in said.remedy
+    assert "cross_stage='inertial'" in said.remedy
+    # It leads what shares its topic.
+    assert group_findings([*left, said])[0].first_finding is said
+    both = ftlm.flexible_link(stage="both", coupling="simulated", friction=True, cross_stage="inertial")
+    assert arm_findings(both, left) == []
+    assert arm_findings(ftlm.flexible_link(stage=1), []) == []
+    assert arm_findings(ftlm.equation("D y = a y + b u"), left) == []

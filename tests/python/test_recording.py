@@ -200,7 +200,7 @@ def test_the_core_refuses_runs_that_are_none():
     shorter, unknown, late, holes = (told() for _ in range(4))
     shorter["signals"][1]["samples"] = np.arange(4.0)
     unknown["signals"][1]["role"] = "spline"
-    late["signals"][1]["delay"] = -1.0
+    late["signals"][1]["delay"] = np.inf
     holes["signals"][1]["samples"] = np.array([0.0, np.nan, 1.0, 2.0, 3.0])
     refused = [
         ({**told(), "step": 0.0}, ftlm.ModelError, "step = 0"),
@@ -209,7 +209,7 @@ def test_the_core_refuses_runs_that_are_none():
         ({**told(), "signals": []}, ftlm.DataError, "length 0"),
         (shorter, ftlm.DataError, "signal u has length 4"),
         (unknown, ftlm.ModelError, "role 'spline'"),
-        (late, ftlm.ModelError, "delay or limit of u = -1"),
+        (late, ftlm.DataError, "delay of u is not finite"),
         (holes, ftlm.DataError, "signal u is not finite at index 1"),
     ]
     for given, kind, words in refused:

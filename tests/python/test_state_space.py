@@ -270,7 +270,7 @@ LAG: Any = ((0, 1.0, [(0, 0.0), (1, 0.0)]), [-1.0, 1.0])
         ({"terms": [[], []]}, ftlm.DataError, "initial terms has length 2, but 1 is needed"),
         ({"driving": [(1, np.ones(4), True, 0.0, 0.0)]}, ftlm.DataError, "input has length 4, but 3 is needed"),
         ({"driving": [(1, np.full(3, np.nan), True, 0.0, 0.0)]}, ftlm.DataError, "input is not finite at index 0"),
-        ({"driving": [(1, np.ones(3), True, -1.0, 0.0)]}, ftlm.ModelError, "delay = -1 is outside"),
+        ({"driving": [(1, np.ones(3), True, np.inf, 0.0)]}, ftlm.DataError, "delay is not finite"),
         ({"rows": 1 << 40}, ftlm.ModelError, "samples of all outputs = 1099511627776 is outside"),
         ({"step": 0.0}, ftlm.ModelError, "step = 0 is outside"),
     ],
@@ -294,3 +294,15 @@ def test_exponents_of_more_states_than_are_simulated_are_left_to_the_series(expo
     model = [((0, 2.0, [(0, 0.0), (1, 0.0)]), [-1.0, 1.0])]
     inputs = [(1, np.ones(8), True, 0.0, 0.0)]
     assert _core.state_space_respond(model, [False, True], inputs, [[(exponent, 1.0)]], 0.1, 8) is None
+
+
+@pytest.mark.parametrize("order", [4e-10, 1e-9, 1.1e-9])
+def test_an_order_off_an_integer_by_rounding_is_simulated(order):
+    # The search for an order ends where a bound lies, off it by rounding.
+    u = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 20), 10)
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.zeros(200)})
+    near, whole = (
+        ftlm.Model(ftlm.equation(f"D^2 y = -1.0 D y - 2.0 D^{nu!r} y + 1.0 u")).simulate(run)["y"]
+        for nu in (order, 0.0)
+    )
+    np.testing.assert_allclose(near, whole, atol=1e-6)

@@ -102,8 +102,12 @@ fn delays_move_samples() {
     assert_eq!(delay_samples(&u, 0.5, 1.0).unwrap(), [1.0, 1.5, 3.0, 6.0]);
     assert_eq!(delay_samples(&u, 1e300, -1.0).unwrap(), [-1.0; 4]);
     assert_eq!(delay_samples(&[], 2.0, 0.0).unwrap(), [0.0; 0]);
-    for delay in [-0.1, f64::NAN, f64::INFINITY] {
-        assert!(matches!(delay_samples(&u, delay, 0.0), Err(Error::OutOfRange { .. })));
+    // Logged after it acts: the last sample stays.
+    assert_eq!(delay_samples(&u, -1.0, 9.0).unwrap(), [2.0, 4.0, 8.0, 8.0]);
+    assert_eq!(delay_samples(&u, -0.5, 9.0).unwrap(), [1.5, 3.0, 6.0, 8.0]);
+    assert_eq!(delay_samples(&u, -1e300, 9.0).unwrap(), [8.0; 4]);
+    for delay in [f64::NAN, f64::INFINITY] {
+        assert!(matches!(delay_samples(&u, delay, 0.0), Err(Error::NotFinite { .. })));
     }
 }
 

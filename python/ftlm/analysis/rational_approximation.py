@@ -239,6 +239,12 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
     builder = _Builder(len(inputs), len(outputs))
     delays = model.structure.delay
+    early = next((name for name, delay in delays.items() if delay < 0.0), None)
+    if early is not None:
+        raise ModelError(
+            f"{early} acts {-delays[early]:g} s before it is logged, and no linear system answers before its input; "
+            "shift the rows of that input, and identify again"
+        )
     sources: dict[str, _Signal] = {o: ({}, {}, {i: 1.0}) for i, o in enumerate(outputs)}
     for i, name in enumerate(inputs):
         sources[name] = _delay_input(builder, i, delays[name]) if delays.get(name) else ({}, {i: 1.0}, {})

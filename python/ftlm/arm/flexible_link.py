@@ -200,6 +200,10 @@ def order_law(
     return {name: Order.parse(text) for name, text in law.items()}
 
 
+#: First word of the names of these structures.
+FLEXIBLE_LINK = "flexible link"
+
+
 @check_arguments
 def flexible_link(
     *,
@@ -405,7 +409,7 @@ def flexible_link(
         sensor_filter=sensor_filter,
         coefficient_law=tuple(coefficient_law) if "coefficients" in laws and hub else (),
         reference=reference,
-        name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages",
+        name=f"{FLEXIBLE_LINK}, stage {stage}" if stage != "both" else f"{FLEXIBLE_LINK}, both stages",
         hints=_hints(form),
         offset=check_offset(offset),
     )

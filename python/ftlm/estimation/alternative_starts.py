@@ -32,6 +32,8 @@ MAX_SQUARES_RATIO = 1.05
 GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 #: Step of the derivatives of gains, in standard errors of a parameter.
 DERIVATIVE_STEP = 0.01
+#: Least step, relative to the parameter, that rounding leaves.
+DERIVATIVE_ROUNDING = 1e-7
 
 
 def start_not_told_findings(fit: Fit) -> list[Finding]:
@@ -91,7 +93,8 @@ def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple
         values, errors = joint.values, np.sqrt(np.maximum(np.diag(joint.covariance), 0.0))
         at = gains(values)
         slopes: dict[tuple[str, str], list[float]] = {pair: [] for pair in at}
-        for k, step in enumerate(DERIVATIVE_STEP * errors):
+        steps = np.maximum(DERIVATIVE_STEP * errors, DERIVATIVE_ROUNDING * np.maximum(np.abs(values), 1.0))
+        for k, step in enumerate(steps):
             above, below = (gains(values + side * step * np.eye(values.size)[k]) for side in (0.5, -0.5))
             for pair, slope in slopes.items():
                 slope.append((above[pair] - below[pair]) / step)

@@ -61,7 +61,9 @@ def make_model(
 ) -> Model:
     """Return the structure of the task as a model with all parameters fixed."""
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
-    told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **about}
+    steps = {run.step for run in task.runs}
+    known = {"step": steps.pop()} if len(steps) == 1 else {}
+    told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **known, **about}
     return Model(structure, orders=orders, units=units, m=m, about=told)
 
 

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
+from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
@@ -26,6 +27,8 @@ from ftlm.estimation.model_checks import (
     discretization_findings,
     excitation_findings,
     friction_direction_findings,
+    join_names,
+    mode_sampling_findings,
     stability_findings,
     start_findings,
     stribeck_findings,
@@ -42,11 +45,11 @@ from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import WHOLE_RUN_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
-from ftlm.findings import Finding, make_finding, unique
+from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import default_m
-from ftlm.simulation.initial_conditions import HISTORY_MARGIN
+from ftlm.simulation.initial_conditions import START_SETTINGS
 from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
@@ -125,7 +128,7 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
     Two fits are compared by the color of the one that leaves more.
     """
     best, chosen, numbers = fit.joint, None, 0
-    margin = HISTORY_MARGIN if best is not None and isinstance(best.initial, History) else 0.0
+    margin = START_SETTINGS.history_margin if best is not None and isinstance(best.initial, History) else 0.0
     for initial in LEVEL_STARTS:
         try:
             level = estimate(replace(structure, initial=initial, offset="level"))
@@ -312,6 +315,7 @@ def assess_fit(fit: Fit) -> Identification:
     findings += (
         discretization_findings(model, comparison)
         + stability_findings(replace(model, estimate=_estimate(fit, comparison, None, ())))
+        + mode_sampling_findings(model, runs)
         + friction_direction_findings(model, free)
         + stribeck_findings(model, runs, free)
     )
@@ -334,6 +338,7 @@ def assess_fit(fit: Fit) -> Identification:
     if tests is not None:
         findings = [_noise_finding(f, tests) for f in findings] + _residual_findings(fit, tests)
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
+        findings += arm_findings(fit.task.structure, findings)
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
     result = Identification(
@@ -374,6 +379,17 @@ def _coupling_finding(item: Finding, structure: Structure) -> Finding:
     if item.code != "residuals_follow_input" or item.input in structure.signals:
         return item
     return msgspec.structs.replace(item, code="coupling_missing")
+
+
+def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Finding]:
+    """Return a finding on what a flexible link leaves out of an arm, if residuals show that something is missing."""
+    if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in LEFT_OUT_CODES for f in findings):
+        return []
+    parts = [] if structure.has_friction else ["dry friction of the hubs"]
+    stages = {name[len("theta")] for name in structure.signals if name.startswith("theta")}
+    parts += ["the other link"] if len(stages) == 1 else []
+    outputs = join_names(list(dict.fromkeys(f.output for f in findings if f.code in LEFT_OUT_CODES)))
+    return [make_finding("arm_leaves_out", output=outputs, parts=join_names(parts))] if parts else []
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:

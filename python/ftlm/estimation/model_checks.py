@@ -32,6 +32,9 @@ from ftlm.validation.data_advice import check_excitation, find_dead_channel
 
 #: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
+#: Least number of samples a period of a mode whose numbers do not rest on the inputs between samples, and damping
+#: ratio from which on a mode is no swing.
+MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
 #: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
 MAX_RELATIVE_STANDARD_ERROR = 0.1
@@ -519,6 +522,25 @@ def stability_findings(model: Model) -> list[Finding]:
         return []
     code = "free_run_grows" if has_growing_mode(model, model.structure.coupling) else "growth_not_told"
     return [make_finding(code, stability=str(stable), poles=unstable_poles_text(stable.unstable_poles))]
+
+
+def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
+    """Return a finding on the fastest oscillation that has too few samples a period."""
+    if model.structure.has_friction:
+        return []
+    try:
+        swings = [m for m in modes(model, coupling=model.structure.coupling) if m.oscillatory]
+    except FtlmError:
+        return []
+    fastest = max((m.frequency for m in swings if abs(m.damping) < MAX_SWING_DAMPING), default=0.0)
+    if not fastest > 0.0:
+        return []
+    samples = 2.0 * math.pi / (fastest * max(run.step for run in runs))
+    if samples >= MIN_SAMPLES_PER_PERIOD:
+        return []
+    loss = 100.0 * (1.0 - float(np.sinc(1.0 / samples)))
+    about = {"frequency": fastest, "samples": samples, "phase": 180.0 / samples, "loss": loss}
+    return [make_finding("mode_sampled_coarsely", **about)]
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:

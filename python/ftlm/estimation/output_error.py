@@ -476,7 +476,7 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
         order_values={n: (values[n] - ORDER_BOUND_MARGIN, values[n] + ORDER_BOUND_MARGIN) for n in names},
         coefficient_law=tuple((n, sign, factors) for n, (sign, factors) in known.products.items()),
         delay={s: d for s, d in model.structure.delay.items() if s not in delays},
-        free_delays={s: (0.0, 2.0 * d + 1.0) for s, d in delays.items()},
+        free_delays={s: (min(d, 0.0), 2.0 * abs(d) + 1.0) for s, d in delays.items()},
         initial="rest",
     )
     problem = FreeProblem.of(structure)

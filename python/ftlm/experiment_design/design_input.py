@@ -340,9 +340,8 @@ def _check_arguments(
     _check_signals(laid, reference_run)
     if free.covariance is None:
         _raise_too_uncertain(laid, "some of its numbers have infinite intervals", None)
-    time = _positive(
-        "step", step if step is not None else None if reference_run is None else reference_run.step, "a step [s]"
-    )
+    known = solved.about.get("step") if reference_run is None else reference_run.step
+    time = _positive("step", known if step is None else step, "a step [s]")
     length = _positive(
         "duration",
         duration if duration is not None else None if reference_run is None else reference_run.duration,

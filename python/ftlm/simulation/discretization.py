@@ -32,6 +32,8 @@ from ftlm.utils.validation import Floats, check_pulses, nearest
 DEFAULT_PULSES = 2048
 #: Maximum number of pulses of a record: 2^24 of one signal are 128 MB.
 MAX_M = 1 << 24
+#: Largest relative excess of a negative delay over one sampling interval that is rounding.
+MAX_EARLY_ROUNDING = 1e-9
 #: Minimum peak of a nonzero signal. Squares of smaller signals underflow.
 MIN_SIGNAL_PEAK = 1e-140
 COULOMB_PREFIX = "coulomb_"
@@ -229,6 +231,7 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
     delay = structure.delay.get(name)
     if delay and name not in run.inputs:
         raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
+    check_early_input(run, name, delay if delay is not None else structure.free_delays.get(name, (0.0,))[0])
     limits = [limit for limit in structure.limits if limit.signal == name]
     return {
         **channel,
@@ -238,6 +241,15 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
         "delay": delay,
         "limits": [(limit.law, None if isinstance(limit.value, tuple) else limit.value) for limit in limits],
     }
+
+
+def check_early_input(run: Run, name: str, delay: float) -> None:
+    """Raise ModelError for an input that acts more than one sampling interval before it is logged."""
+    if delay < -run.step * (1.0 + MAX_EARLY_ROUNDING):
+        raise ModelError(
+            f"delay of {name} = {delay:g} s is more than one sampling interval ({run.step:g} s) of run {run.name!r} "
+            "before the row that logs it; shift the rows of that input"
+        )
 
 
 def _check_known_inputs(structure: Structure) -> None:

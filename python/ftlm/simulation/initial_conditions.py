@@ -37,11 +37,6 @@ REFERENCE_SIGNAL_RATIO, REFERENCE_QUARTERS = 2500.0, 6
 SIGNAL_RATIO_PER_QUARTER = 2.5
 #: Minimum and maximum number of quarters.
 MIN_QUARTERS, MAX_QUARTERS = 2, 12
-#: Inflation of the variance of a mean above which residuals are those of a structure that leaves something out.
-MAX_WHITE_INFLATION = 2.0
-#: Difference of :func:`start_score` from which on a history is believed where residuals have a color (chosen on
-#: simulated records of three plants with one lag too few).
-HISTORY_MARGIN = 30.0
 #: Minimum number of samples of a run per quarter.
 MIN_SAMPLES_PER_QUARTER = 16
 #: Integer powers below this are always included, so that the list is the same for any order up to 3.
@@ -55,21 +50,53 @@ HISTORY_TEST_LEVEL, HISTORY_TEST_LEVEL_WITH_OFFSET = 0.25, 0.02
 SQUARES_WEIGHT = 0.25
 
 
-#: Least number of rows before the inputs move that can show rest.
-MIN_QUIET_ROWS = 5
-#: Standard errors within which slope, scatter and level of quiet rows are those of noise.
-QUIET_SIGMAS = 3.3
-#: Relative standard error of the noise, times the root of the number of samples (300 records of 30 to 4000 samples).
-NOISE_ERROR = 1.5
-#: Noise of a signal without noise, as a share of its standard deviation.
-NOISE_SHARE = 1e-6
-#: Standard error of a drift in quiet rows, over the whole run and as a share of the output's standard deviation, up to
-#: which they show rest under a command that is held at a value other than 0 and changes often.
-MAX_DRIFT_SHARE = 0.1
-#: Largest share of quiet rows that may be outliers; one may always be.
-MAX_OUTLIER_SHARE = 0.1
-#: Change of a constant input, relative to its largest value, that is rounding.
-CONSTANT_SHARE = 1e-9
+@dataclass(frozen=True)
+class StartSettings:
+    """Thresholds of the choice of a run's start. They were set on simulated records and checked on others.
+
+    Parameters
+    ----------
+    quiet_rows
+        Least number of rows before the inputs move that can show rest.
+    sigmas
+        Standard errors within which slope, scatter and level of quiet rows are those of noise.
+    noise_error
+        Relative standard error of the noise, times the root of the number of samples.
+    least_noise
+        Noise of a signal without noise, as a share of its standard deviation.
+    drift_share
+        Standard error of a drift in quiet rows, over the whole run and as a share of the output's standard deviation,
+        up to which they show rest under a command that is held at a value other than 0 and changes often.
+    outlier_share
+        Largest share of quiet rows that may be outliers; one may always be.
+    rounding
+        Change of a constant input, relative to its largest value, that is rounding.
+    slow_share
+        Change of an output from row to row, as a share of its median change, below which it hardly moves. Noise must be
+        smaller as well.
+    moving_share
+        Least share of the rows in which an output moves by more than that, so that one that does not at first was at
+        rest.
+    white_inflation
+        Inflation of the variance of a mean above which residuals are those of a structure that leaves something out.
+    history_margin
+        Difference of :func:`start_score` from which on a history is believed where residuals have a color.
+    """
+
+    quiet_rows: int = 5
+    sigmas: float = 3.3
+    noise_error: float = 1.5
+    least_noise: float = 1e-6
+    drift_share: float = 0.1
+    outlier_share: float = 0.1
+    rounding: float = 1e-9
+    slow_share: float = 0.1
+    moving_share: float = 0.8
+    white_inflation: float = 2.0
+    history_margin: float = 30.0
+
+
+START_SETTINGS = StartSettings()
 
 
 @dataclass(frozen=True)
@@ -79,8 +106,8 @@ class RestEvidence:
     Parameters
     ----------
     rows
-        Number of rows in which inputs and outputs stand still before an input moves; 0 if the inputs are constant from
-        the first or second row on, so that rest is an assumption.
+        Number of rows in which inputs and outputs stand still before an input moves; 1 if only the outputs do, at zero,
+        and 0 if the inputs are constant from the first or second row on, so that rest is an assumption.
     levels
         Level of each output before the run.
     inputs
@@ -105,7 +132,7 @@ def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     found = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
     if key not in found:
-        found[key] = _rest_evidence(run, structure)
+        found[key] = _rest_evidence(run, structure) or _slow_start_evidence(run, structure)
     return found[key]
 
 
@@ -122,7 +149,7 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
         return None
     moves = [_rows_of_change(run[n]) for n in inputs]
     quiet = min((int(rows[0]) for rows in moves if rows.size), default=0)
-    if quiet >= MIN_QUIET_ROWS:
+    if quiet >= START_SETTINGS.quiet_rows:
         levels = {}
         visible = any(run[n][0] != 0.0 for n in inputs)
         # A command that is held and changed again and again may have been so before: quiet rows must be long then.
@@ -130,12 +157,14 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
         for name in outputs:
             noise = noise_at_start(run[name])
             rows = _without_outliers(drop_missing(run[name][:quiet]), noise)
-            if rows.size < MIN_QUIET_ROWS or not _stands_still(rows, noise):
+            if rows.size < START_SETTINGS.quiet_rows or not _stands_still(rows, noise):
                 return None
-            if held and noise * run.length / _slope_weight(rows.size) > MAX_DRIFT_SHARE * float(np.nanstd(run[name])):
+            if held and noise * run.length / _slope_weight(rows.size) > START_SETTINGS.drift_share * float(
+                np.nanstd(run[name])
+            ):
                 return None
             levels[name] = float(np.mean(rows))
-            size = QUIET_SIGMAS * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
+            size = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
             visible |= abs(levels[name]) > size
         return RestEvidence(quiet, levels, {n: float(run[n][0]) for n in inputs}, visible)
     constant = all(_rows_of_change(run[n][1:]).size == 0 for n in inputs)
@@ -145,16 +174,41 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     return RestEvidence(0, first, dict.fromkeys(inputs, 0.0), not starts_at_rest(run, structure))
 
 
+def _slow_start_evidence(run: Run, structure: Structure) -> RestEvidence | None:
+    """Return the evidence of outputs that are zero and hardly move at first, though an input may act from row 0 on."""
+    inputs = [n for n in structure.signals if n in run.inputs]
+    outputs = [n for n in structure.signals if n in run.outputs]
+    if not inputs or not outputs or any(n not in run for n in structure.signals) or run.sample_times is not None:
+        return None
+    if not starts_at_rest(run, structure) or not _starts_slowly([run[n] for n in outputs]):
+        return None
+    return RestEvidence(1, dict.fromkeys(outputs, 0.0), dict.fromkeys(inputs, 0.0), shows_level=False)
+
+
+def _starts_slowly(outputs: Sequence[Floats]) -> bool:
+    """Whether no output moves noticeably at first, and one of them does so at most other times."""
+    conclusive = False
+    for samples in outputs:
+        noise = START_SETTINGS.sigmas * math.sqrt(2.0) * noise_at_start(samples)
+        changes = np.abs(np.diff(samples))
+        limit = START_SETTINGS.slow_share * float(np.nanmedian(changes))
+        if noise <= limit and np.mean(drop_missing(changes) > limit) > START_SETTINGS.moving_share:
+            conclusive = True
+            if not changes[0] <= limit:
+                return False
+    return conclusive
+
+
 def noise_at_start(samples: Floats) -> float:
     """Return the largest likely standard deviation of the noise: two standard errors above its estimate."""
     count = min(samples.size, NOISE_SAMPLES)
-    noise = white_noise(samples) * (1.0 + 2.0 * NOISE_ERROR / math.sqrt(count))
-    return max(noise, NOISE_SHARE * float(np.nanstd(samples)))
+    noise = white_noise(samples) * (1.0 + 2.0 * START_SETTINGS.noise_error / math.sqrt(count))
+    return max(noise, START_SETTINGS.least_noise * float(np.nanstd(samples)))
 
 
 def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
     """Return the rows in which a signal differs from its first value."""
-    return np.flatnonzero(np.abs(samples - samples[0]) > CONSTANT_SHARE * float(np.max(np.abs(samples))))
+    return np.flatnonzero(np.abs(samples - samples[0]) > START_SETTINGS.rounding * float(np.max(np.abs(samples))))
 
 
 def _stands_still(rows: Floats, noise: float) -> bool:
@@ -162,13 +216,13 @@ def _stands_still(rows: Floats, noise: float) -> bool:
     t = np.arange(rows.size) - 0.5 * (rows.size - 1)
     slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
     limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
-    return abs(slope) <= QUIET_SIGMAS * limits[0] and scatter <= noise + QUIET_SIGMAS * limits[1]
+    return abs(slope) <= START_SETTINGS.sigmas * limits[0] and scatter <= noise + START_SETTINGS.sigmas * limits[1]
 
 
 def _without_outliers(rows: Floats, noise: float) -> Floats:
     """Return rows without values far from their median, if these are single ones."""
     near = np.abs(rows - np.median(rows)) <= REST_SIGMAS * noise if rows.size else np.ones(0, dtype=bool)
-    few = max(1.0, MAX_OUTLIER_SHARE * rows.size)
+    few = max(1.0, START_SETTINGS.outlier_share * rows.size)
     return rows[near] if np.count_nonzero(~near) <= few else rows
 
 
@@ -336,7 +390,7 @@ def needs_history(
     """
     more = terms[1] - terms[0]
     finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few, *many))
-    if finite and more > 0 and max(variance_inflation(drop_missing(r)) for r in many) > MAX_WHITE_INFLATION:
-        return start_score(many, terms[1], few) + HISTORY_MARGIN < start_score(few, terms[0], few)
+    if finite and more > 0 and max(variance_inflation(drop_missing(r)) for r in many) > START_SETTINGS.white_inflation:
+        return start_score(many, terms[1], few) + START_SETTINGS.history_margin < start_score(few, terms[0], few)
     doubt = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
     return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, doubt)

@@ -11,7 +11,12 @@ from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD
 from ftlm.model.model import Model
-from ftlm.simulation.discretization import MIN_SIGNAL_PEAK, apply_input_nonlinearity, equation_tuple
+from ftlm.simulation.discretization import (
+    MIN_SIGNAL_PEAK,
+    apply_input_nonlinearity,
+    check_early_input,
+    equation_tuple,
+)
 from ftlm.simulation.initial_conditions import resolve_initial_conditions
 from ftlm.simulation.output_samples import (
     ORDER_TOLERANCE,
@@ -55,6 +60,8 @@ class StateSpace:
         run, drivers = apply_input_nonlinearity(run, structure), _drivers(model)
         if any(structure.delay.get(name) and name not in run.inputs for name in drivers):
             return None
+        for name, delay in structure.delay.items():
+            check_early_input(run, name, delay)
         for name in structure.signals:
             # The peak of a driver with a missing sample is NaN, which is in neither range.
             peak = (np.max if name in drivers else np.fmax.reduce)(np.abs(run[name]))
@@ -103,8 +110,8 @@ class StateSpace:
 
 
 def _are_integers(orders: Sequence[float]) -> bool:
-    """Whether all orders or exponents are integers."""
-    return all(abs(order - round(order)) <= ORDER_TOLERANCE for order in orders)
+    """Whether all orders or exponents are integers; differences of two of them are so within the core's tolerance."""
+    return all(abs(order - round(order)) <= 0.5 * ORDER_TOLERANCE for order in orders)
 
 
 def _drivers(model: Model) -> list[str]:

@@ -55,7 +55,8 @@ def equation(
     fixed
         Known coefficients, by name.
     delay
-        Delay of inputs [s], by name, not negative: a number fixes one, (lower, upper) is estimated by output error.
+        Delay of inputs [s], by name: a number fixes one, (lower, upper) is estimated by output error. It is negative
+        where an input is logged after it acts, by one sampling interval at most.
     saturation, dead_zone
         Symmetric saturation level and half-width of the dead zone of inputs, in their units: a number fixes one,
         (lower, upper) is estimated by output error. As text: ``sat(u, 0.94)``, ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.

@@ -178,12 +178,12 @@ class Structure:
         external = [s for s in self.signals if s not in outputs]
         check_known("delayed input", [*self.delay, *self.free_delays], external)
         for name, delay in self.delay.items():
-            if not 0 <= real_number(f"delay of {name}", delay) < math.inf:
-                raise ModelError(f"delay of {name} = {delay} s is not a non-negative number; give seconds")
+            if not math.isfinite(real_number(f"delay of {name}", delay)):
+                raise ModelError(f"delay of {name} = {delay} s is not a finite number; give seconds")
         for name, (low, high) in self.free_delays.items():
             numbers = real_number(f"least delay of {name}", low), real_number(f"largest delay of {name}", high)
-            if not 0 <= numbers[0] < numbers[1] < math.inf:
-                raise ModelError(f"delay of {name} from {low} to {high} s is no interval; give two rising times from 0")
+            if not -math.inf < numbers[0] < numbers[1] < math.inf:
+                raise ModelError(f"delay of {name} from {low} to {high} s is no interval; give two rising times")
         check_known("limited input", [limit.signal for limit in self.limits], external)
         check_nonlinearities(self.limits, self.delay, self.free_delays)
         for item in self.free_inputs:
@@ -442,10 +442,12 @@ class Structure:
     def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
         """Set input delays [s]: a number fixes one, (lower, upper) bounds an estimated one.
 
+        A delay is negative where an input is logged after it acts, by one sampling interval of a run at most.
+
         Raises
         ------
         ModelError
-            A name that is no input, a delay that is negative, or no interval.
+            A name that is no input, a delay that is not finite, or no interval.
         """
         known, free = dict(self.delay), dict(self.free_delays)
         for name, delay in delays.items():

@@ -19,7 +19,7 @@ use crate::error::{Error, Result};
 use crate::estimation::least_squares;
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 use crate::linalg::small::spectral_radius;
-use crate::signal::block_pulse::Intersample;
+use crate::signal::block_pulse::{delayed_row, Intersample};
 use crate::state_space::{InputGains, Transition};
 
 /// Difference below which an order or exponent is an integer.
@@ -228,9 +228,9 @@ impl Discretization {
         let (mut states, mut values) = (Vec::with_capacity(n * count), Vec::with_capacity(count));
         let lag = input.map_or(0, |input| {
             let late = input.between == Intersample::Hold && input.delay > input.delay.floor();
-            input.delay.floor().min(1e15) as usize + usize::from(late)
+            input.delay.floor().clamp(-1e15, 1e15) as isize + isize::from(late)
         });
-        let at = |k: usize| match (input, k.checked_sub(lag)) {
+        let at = |k: usize| match (input, delayed_row(k, lag)) {
             (None, _) => 0.0,
             (Some(input), None) => input.before,
             (Some(input), Some(k)) => input.samples[k.min(input.samples.len() - 1)],

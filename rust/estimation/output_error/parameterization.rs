@@ -163,7 +163,7 @@ impl FreeModel {
                 order.check(&self.order_bounds)?;
             }
         }
-        for (k, &FreeInput { signal, bounds: (low, high), .. }) in self.inputs.iter().enumerate() {
+        for (k, &FreeInput { signal, law, bounds: (low, high) }) in self.inputs.iter().enumerate() {
             if signal >= signals || self.equations.iter().any(|e| e.output == signal) {
                 let what = format!("signal {signal} has a free delay or limit and is no input");
                 return refuse(what, "delay and limit inputs only");
@@ -171,8 +171,9 @@ impl FreeModel {
             if self.law_of(signal) != Some(k) {
                 return refuse(format!("signal {signal} has two free numbers"), "free one of an input");
             }
-            if !(0.0 <= low && low <= high && high.is_finite()) {
-                return refuse(format!("bounds {low} to {high} of a delay or limit"), "give two rising values from 0");
+            let least = if law == InputLaw::Delay { f64::MIN } else { 0.0 };
+            if !(least <= low && low <= high && high.is_finite()) {
+                return refuse(format!("bounds {low} to {high} of a delay or limit"), "give two rising values");
             }
         }
         if let Some((low, high)) =
@@ -311,7 +312,7 @@ impl InputLaw {
     /// exact for a zero-order hold.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a parameter that is negative or not finite.
+    /// [`Error::OutOfRange`] for a limit that is negative, or a parameter that is not finite.
     ///
     /// ```
     /// use ftlm::estimation::output_error::InputLaw;
@@ -324,7 +325,7 @@ impl InputLaw {
     /// # }
     /// ```
     pub fn apply(self, means: &[f64], value: f64, step: f64, before: f64) -> Result<(Vec<f64>, Vec<f64>)> {
-        if !(value >= 0.0 && value.is_finite()) {
+        if !(value.is_finite() && (value >= 0.0 || self == Self::Delay)) {
             return Err(Error::OutOfRange {
                 name: "number of an input".into(),
                 value,
