@@ -39,15 +39,6 @@ pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, deriv
 }
 
 #[pyfunction]
-pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResult<Array<'_>> {
-    let weights = run_interruptible(py, m, None, move |_| {
-        check_points("m", m)?;
-        Ok(kernels::grunwald_letnikov_weights(order, m))
-    })?;
-    Ok(PyArray1::from_vec(py, weights))
-}
-
-#[pyfunction]
 pub fn haar_transform<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
     map_rows(py, &x, operational_matrices::haar_transform)
 }

@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
 from ftlm.simulation.initial_conditions import deviations, resolve_start, start_score
 from ftlm.simulation.output_samples import (
     FRICTION_REFINEMENT,
+    InitialTermsTuple,
     OutputSamples,
     Terms,
     add_levels,
@@ -21,8 +23,8 @@ from ftlm.simulation.output_samples import (
     output_simulation,
     with_initial_conditions,
 )
-from ftlm.simulation.state_space import simulate_state_space
-from ftlm.utils.resources import stop_flag
+from ftlm.utils.resources import memory_limit, stop_flag
+from ftlm.utils.validation import Floats
 
 #: Minimum number of intervals of a long record. Below it, refinement of the whole grid costs no more.
 LONG_RECORD_INTERVALS = 1 << 14
@@ -39,7 +41,7 @@ def simulate_refined(
 ) -> OutputSamples:
     """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
 
-    Integer orders on uniform samples need no grid (:func:`ftlm.simulation.state_space.simulate_state_space`). A long
+    Integer orders on uniform samples need no grid (:func:`exact_samples`). A long
     record is refined only as far as that moves it by superposition of responses.
 
     Parameters
@@ -84,14 +86,23 @@ def _simulate_refined(
     model: Model, run: Run, initial: Terms | None, tolerance: float, max_m: int, on_grid: bool
 ) -> OutputSamples:
     """Simulate as :func:`simulate_refined`, with a start that is resolved, and deviations for a level."""
-    exact = simulate_state_space(model, run, initial)
-    if exact is not None:
-        return exact
     if initial is None and not model.structure.has_friction:
         model = with_initial_conditions(model, run)
     times = (
         run.time if on_grid and has_nonuniform_samples(run, model.structure) else nonuniform_sample_times(model, run)
     )
     core, terms = output_simulation(model, run, initial, times, FRICTION_REFINEMENT)
-    (outputs, found), refinement, change = core.refine(terms, tolerance, max_m, LONG_RECORD_INTERVALS, stop_flag())
+    exact = exact_samples(core, terms)
+    if exact is not None:
+        return OutputSamples(exact[0], named_terms(model, exact[1]), 1, np.zeros(len(model.outputs)))
+    (outputs, found), refinement, change = core.refine(
+        terms, tolerance, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()
+    )
     return OutputSamples(outputs, named_terms(model, found), refinement, change)
+
+
+def exact_samples(
+    core: _core.OutputSimulation, terms: InitialTermsTuple
+) -> tuple[Floats, list[list[tuple[float, float]]]] | None:
+    """Return samples and initial terms of a model with integer orders; None if it needs a grid."""
+    return core.exact_samples(terms, stop_flag())
