@@ -90,8 +90,8 @@ pub enum Error {
         /// Memory allowed, in bytes.
         limit: u128,
     },
-    /// Working memory of a search over its limit.
-    #[error("{what} need {bytes} bytes, more than the {limit} that a search may take; take a smaller m, a larger step, narrower intervals or fewer runs at once, or allow more")]
+    /// Working memory over its limit.
+    #[error("{what} need {bytes} bytes, more than the {limit} that may be taken; take a smaller m, a larger step, narrower intervals, fewer or shorter runs at once, or allow more")]
     Memory {
         /// Data that need the memory.
         what: String,
@@ -289,6 +289,17 @@ pub fn check_points(name: &str, m: usize) -> Result<()> {
         range: format!("[0, {MOST_POINTS}]"),
         remedy: "ask for as many points as the record has".into(),
     })
+}
+
+/// Return an error for data of more bytes than the limit.
+///
+/// # Errors
+/// [`Error::Memory`].
+pub fn check_memory(what: impl FnOnce() -> String, bytes: usize, limit: usize) -> Result<()> {
+    if bytes <= limit {
+        return Ok(());
+    }
+    Err(Error::Memory { what: what(), bytes: bytes as u128, limit: limit as u128 })
 }
 
 /// Largest size of a dense matrix: two gigabytes. Dense matrices serve study only.

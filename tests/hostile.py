@@ -27,7 +27,7 @@ SOUND, TWICE = 0.1, 0.3
 LARGE = 1 << 34
 ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
 #: Where a fit is told how often it may evaluate its cost, which it does; an attack asks it to so often at most.
-EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10, "JointProblem.minimize": 4}, 2000
+EVALUATIONS, MOST_EVALUATIONS = {"JointProblem.minimize": 4}, 2000
 #: Where a count multiplies other sizes, and the most of it: pulses a sample, pulses of a simulation, rows of up to 128
 #: states.
 COUNTS = {
@@ -35,7 +35,6 @@ COUNTS = {
     "OutputSimulation.samples": (0, 1 << 12),
     "OutputSimulation.refine": (2, 1 << 12),
     "OutputSimulation.fit_friction_terms": (1, 16),
-    "state_space_respond": (5, 1 << 12),
 }
 
 
@@ -115,9 +114,6 @@ class Sound:
         return kernels, self.normal((3, m)), [0, 1, self.one(0, 1)]
 
     toeplitz_solve = toeplitz_apply
-
-    def grunwald_letnikov_weights(self):
-        return self.order(), self.m()
 
     def haar_transform(self):
         return (self.normal((self.one(1, 3), self.m())),)
@@ -272,27 +268,6 @@ class Sound:
         value = {"delay": ((0.0, 0.1), 0.05), "saturation": ((0.1, 3.0), 1.0), "dead_zone": ((0.0, 1.0), 0.1)}
         return [(1, law, *value[law]) for law in self.one((), *((law,) for law in laws))]
 
-    def output_error(self):
-        coupled = self.one(True, False)
-        law = (0, (0.0, [1.0]), [(0, (0.0, [0.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0]), (1.0, [(1, 1)]))])
-        bounds, start = [(0.5, 2.0)], [self.number(0.8, 1.8)]
-        free = self.free_inputs("delay", "saturation", "dead_zone")
-        return (
-            self.experiments(own=not free and self.one(True, False)),
-            [law],
-            bounds,
-            [self.one("plain", "logarithm"), self.one("plain", "held")],
-            coupled,
-            self.terms(),
-            start,
-            [1.5, 0.7],
-            free,
-            self.one(1, 3, 20),
-            1e-6,
-            self.one(True, False),
-            self.one(None, _core.Stop()),
-        )
-
     # ------------------------------------------------------------------------------------------------------ joint fits
 
     def joint_problem_new(self):
@@ -392,14 +367,8 @@ class Sound:
     def joint_problem_products(self):
         return self.one_of("JointProblem"), ()
 
-    def joint_problem_whole_orders(self):
-        return self.one_of("JointProblem"), ()
-
     def joint_problem_bounds(self):
         return self.one_of("JointProblem"), ()
-
-    def joint_problem_free_from(self):
-        return self.one_of("JointProblem"), ({"a": 1.0, "b": self.one(2.0, -1.0)},)
 
     def joint_problem_feasible(self):
         problem, _, values = self.sampled()
@@ -408,8 +377,9 @@ class Sound:
     def joint_problem_minimize(self):
         problem, runs, values = self.sampled()
         held = self.one((), (0,), (1, 2))
+        given = self.experiments(own=len(values) == 3 and self.one(True, False))
         return problem, (
-            [run.experiment(1, 1, [1.0]) for run in runs],
+            self.one([run.experiment(1, 1, [1.0]) for run in runs], given),
             (values, []),
             self.one(True, False),
             held,
@@ -421,20 +391,15 @@ class Sound:
 
     def joint_multistart(self):
         problem, runs, _ = self.sampled()
-        return problem, runs, [1.0], 1.0, (self.one(1, 2), 1 << 30), self.heard(), self.one(None, _core.Stop())
-
-    def refine_candidates(self):
-        problem, runs, values = self.sampled()
-        return problem, runs, [1.0], self.one(1, 2), [(values, "here")], self.one(1, 2), self.one(None, _core.Stop())
+        return problem, runs, (self.one(1, 2), 1 << 30), self.heard(), self.one(None, _core.Stop())
 
     def joint_fit(self):
         problem, runs, values = self.sampled()
         near, start = self.one((values, [1.0], 1), None), self.one(values, None)
-        raced = self.one(None, _core.refine_candidates(problem, runs, [1.0], 1, [(values, "here")], 1))
+        raced = self.one(None, _core.joint_multistart(problem, runs, (1, 1 << 30)))
         return (
             problem,
             runs,
-            [(1.0, 0.1)],
             self.one([], [values]),
             start,
             near,
@@ -466,37 +431,6 @@ class Sound:
         callbacks = (lambda v: v - 1.0), (lambda v: np.eye(len(v)))
         return *callbacks, np.zeros(2), np.array(rows), np.array(limits), options
 
-    def joint_multistart_values(self):
-        problem, runs, values = self.sampled()
-        return _core.refine_candidates(problem, runs, [1.0], 1, [(values, "here")], 1), ()
-
-    joint_multistart_len = joint_multistart_origins = joint_multistart_values
-
-    def joint_problem_time_scaling(self):
-        return self.one_of("JointProblem"), ([(0.05, 1.65)] * self.one(1, 2),)
-
-    def clocked(self):
-        """A clock, and values of what it tells."""
-        problem, runs, values = self.sampled()
-        return problem.time_scaling([(0.05, 1.65)] * len(runs)), np.array(values)
-
-    def joint_time_scaling_unit(self):
-        return self.clocked()[0], ()
-
-    def joint_time_scaling_to_scaled(self):
-        clock, values = self.clocked()
-        return clock, (values,)
-
-    joint_time_scaling_to_unscaled = joint_time_scaling_to_scaled
-
-    def joint_time_scaling_step(self):
-        clock, values = self.clocked()
-        return clock, (values, 0.1 * values)
-
-    def joint_time_scaling_errors(self):
-        clock, values = self.clocked()
-        return clock, (values, np.diag(values**2))
-
     def covariance_of(self):
         return self.normal((3, 40)), [self.normal(20), self.normal(20)], self.number(0.1, 50.0)
 
@@ -512,9 +446,6 @@ class Sound:
 
     autocovariances = whitening_filter
 
-    def filter_autocovariances(self):
-        return np.array([1.0, self.number(-0.9, 0.9)]), self.number(0.1, 2.0), self.one(1, 8, 100)
-
     def is_white(self):
         return self.normal(60), self.one(5, 25)
 
@@ -523,26 +454,6 @@ class Sound:
 
     def chi_squared(self):
         return float(self.one(1, 5, 20)), self.one(1.6, 2.3)
-
-    def friction_error(self):
-        own, force = (0, (0.0, [0.0, 1.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0, 0.0]), (1.0, [(1, 1)]))
-        law = (0, (0.0, [1.0, 0.0]), [own, force])
-        strength = [(1.0, [(2, 1)]), self.one((0.0, []), (0.3, [(2, 1)])), (1.0, [])]
-        return (
-            self.experiments(),
-            [law],
-            [(0, strength)],
-            [(1.05, 2.0), (0.0, 1.0)],
-            ["plain", "plain", self.one("plain", "logarithm")],
-            self.one((True, []), (True, [], 1)),
-            [self.number(1.5, 2.0), self.number(0.3, 0.9)],
-            [0.7, 1.1, 0.2],
-            self.free_inputs("saturation", "dead_zone"),
-            [],
-            self.one(1, 3, 10),
-            1e-6,
-            self.one(None, _core.Stop()),
-        )
 
     def friction_respond(self):
         law = self.one((0.3, 0.0, 1.0), (0.3, 0.1, 0.5), (0.0, 0.0, 1.0))
@@ -593,11 +504,6 @@ class Sound:
         applies = self.sensor(record[1].shape[1], record[0]), [True, False][: len(model)]
         return record, model, list(self.INPUTS), self.terms(), self.one(None, None, applies)
 
-    def state_space_respond(self):
-        model = [((0, 2.0, [(0, 0.0), (0, 1.0), (2, 0.0)]), [-3.0, self.number(-1, 0), 1.0])]
-        rows = self.m()
-        return model, list(self.INPUTS), [(2, self.normal((rows,)), True, 0.5, 0.0)], [[(0.0, 1.0)]], self.step(), rows
-
     def output_simulation_new(self):
         """A free run, or a body with friction, on a run of the structure of `joint_problem_new`."""
         run = _core.Recording(*self.recording_new(uniform=True))
@@ -610,16 +516,17 @@ class Sound:
 
     def output_simulation_refine(self):
         target, (_, terms) = self.output_simulation_samples()
-        return target, (terms, 1e-3, 1 << 11, self.one(8, 1 << 14))
+        return target, (terms, 1e-3, 1 << 11, self.one(8, 1 << 14), 1 << 30)
+
+    def output_simulation_exact_samples(self):
+        run, _, _, _ = self.output_simulation_new()
+        model = [((0, self.one(1.0, 2.0), [(0, 0.0), (1, 0.0)]), [-3.0, self.number(-1, 1)])]
+        _, (_, terms) = self.output_simulation_samples()
+        return _core.OutputSimulation(run, model, [], None), (terms,)
 
     def output_simulation_fit_friction_terms(self):
         run, model, _, times = self.output_simulation_new()
         return _core.OutputSimulation(run, model, [(0, (0.3, 0.1, 0.5))], times), ((True, []), self.one(1, 2))
-
-    def fit_initial_terms(self):
-        rows = self.m()
-        units, columns = [(0, 0.0), (1, 1.0)], [self.normal((2, rows)) for _ in range(2)]
-        return self.normal((2, rows)), self.normal((2, rows)), units, columns, self.one(True, False)
 
     def richardson_limit(self):
         return [(self.normal((2, 20)), [self.number(-1, 1)]) for _ in range(self.one(1, 4, 5))], [self.one(0, 1)]

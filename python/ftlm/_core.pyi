@@ -15,7 +15,6 @@ __all__ = [
     "Guard",
     "JointMultistart",
     "JointProblem",
-    "JointTimeScaling",
     "OrderSearch",
     "OutputSimulation",
     "Points",
@@ -36,17 +35,13 @@ __all__ = [
     "delay_samples",
     "equation_error",
     "explicit_euler",
-    "filter_autocovariances",
     "filter_series",
     "fit_covariance",
-    "fit_initial_terms",
     "force_portable",
     "fractional_derivative",
     "fractional_integral",
     "fractional_memory",
-    "friction_error",
     "friction_respond",
-    "grunwald_letnikov_weights",
     "haar_inverse",
     "haar_matrix",
     "haar_transform",
@@ -67,14 +62,12 @@ __all__ = [
     "nyquist_margin",
     "operational_matrix",
     "order_grid_size",
-    "output_error",
     "panic_on_purpose",
     "point_samples",
     "portmanteau",
     "profile_intervals",
     "projected_errors",
     "pulse_mean_rows",
-    "refine_candidates",
     "respond",
     "respond_with_initial",
     "richardson_limit",
@@ -85,7 +78,6 @@ __all__ = [
     "series_divide",
     "series_multiply",
     "singular_values",
-    "state_space_respond",
     "toeplitz_apply",
     "toeplitz_solve",
     "trace_errors",
@@ -131,10 +123,6 @@ _Lattice: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[f
 _Affine: TypeAlias = tuple[float, Sequence[float]]
 #: (output, alpha, [(signal, order), ...])
 _LawEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine]]]
-#: (known factor, [(coefficient, power), ...])
-_Monomial: TypeAlias = tuple[float, Sequence[tuple[int, int]]]
-#: (output, alpha, [(signal, order, coefficient), ...])
-_FreeEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine, _Monomial]]]
 #: (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between)
 _OwnTimes: TypeAlias = tuple[_Floats, Sequence[tuple[_Floats, _Floats] | None]]
 
@@ -267,22 +255,6 @@ class _FoundStage(TypedDict):
     #: distinct candidates of each equation
     distinct: list[int]
 
-class _Fit(TypedDict):
-    orders: list[float]
-    coefficients: list[float]
-    inputs: list[float]
-    #: half the weighted sum of squared residuals
-    cost: float
-    #: weighted residuals, records one after the other, outputs within
-    residuals: _Vector
-    #: one row a free order, then one a coefficient, then one a delay
-    jacobian: _Matrix
-    #: initial terms per record and equation, and their exponents per equation
-    initial: list[list[list[float]]]
-    exponents: list[list[float]]
-    evaluations: int
-    status: Literal["converged", "exhausted", "stalled", "wall"]
-
 __version__: Final[str]
 SIMD: Final[str]
 
@@ -291,7 +263,6 @@ SIMD: Final[str]
 def block_pulse_kernels(orders: _Floats, m: int, step: float, *, derivative: bool = False) -> _Matrix: ...
 def toeplitz_apply(first_columns: _Floats, x: _Floats, groups: Sequence[int]) -> _Matrix: ...
 def toeplitz_solve(first_columns: _Floats, b: _Floats, groups: Sequence[int]) -> _Matrix: ...
-def grunwald_letnikov_weights(order: float, m: int) -> _Vector: ...
 def haar_transform(x: _Floats) -> _Matrix: ...
 def haar_inverse(x: _Floats) -> _Matrix: ...
 def haar_matrix(m: int) -> _Matrix: ...
@@ -368,21 +339,6 @@ def instrumental_variables(
     iterations: int,
     tolerance: float,
 ) -> _InstrumentalFit: ...
-def output_error(
-    runs: Sequence[Experiment | _Experiment],
-    laws: Sequence[_FreeEquation],
-    order_bounds: Sequence[tuple[float, float]],
-    coordinates: Sequence[str],
-    coupled: bool,
-    terms: _Initial,
-    start_orders: Sequence[float],
-    start_coefficients: Sequence[float],
-    inputs: Sequence[tuple[int, str, tuple[float, float], float]],
-    evaluations: int,
-    tolerance: float,
-    steady: bool = False,
-    stop: Stop | None = None,
-) -> _Fit: ...
 def has_unstable_pole(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
 
 # ----------------------------------------------------------------------------------------------------------- joint fits
@@ -460,10 +416,7 @@ class JointProblem:
     @property
     def products(self) -> list[tuple[str, float, list[str]]]: ...
     @property
-    def whole_orders(self) -> list[float]: ...
-    @property
     def bounds(self) -> list[tuple[float, float]]: ...
-    def free_from(self, /, estimated: Mapping[str, float]) -> list[float]: ...
     def feasible(self, /, at: _Floats, towards: _Floats) -> _Vector: ...
     def minimize(
         self,
@@ -477,38 +430,20 @@ class JointProblem:
         steady: bool,
         stop: Stop | None = None,
     ) -> dict[str, Any]: ...
-    def time_scaling(self, /, spans: Sequence[tuple[float, float]]) -> JointTimeScaling: ...
 
 @final
-class JointMultistart:
-    def __len__(self) -> int: ...
-    @property
-    def values(self) -> list[list[float]]: ...
-    @property
-    def origins(self) -> list[str]: ...
+class JointMultistart: ...
 
 def joint_multistart(
     problem: JointProblem,
     runs: Sequence[Recording],
-    weights: Sequence[float],
-    floor: float,
     means: tuple[int, int],
     progress: Callable[[int, int], object] | None = None,
-    stop: Stop | None = None,
-) -> JointMultistart: ...
-def refine_candidates(
-    problem: JointProblem,
-    runs: Sequence[Recording],
-    weights: Sequence[float],
-    decimation: int,
-    starts: Sequence[tuple[Sequence[float], str]],
-    threads: int,
     stop: Stop | None = None,
 ) -> JointMultistart: ...
 def joint_fit(
     problem: JointProblem,
     runs: Sequence[Recording],
-    sizes: Sequence[tuple[float, float]],
     known: Sequence[Sequence[float]],
     start: Sequence[float] | None,
     near: tuple[Sequence[float], Sequence[float], int] | None,
@@ -544,21 +479,10 @@ def cost_surface(
     evaluations: int = 20,
     stop: Stop | None = None,
 ) -> tuple[float, _Vector, _Vector, _Matrix]: ...
-
-@final
-class JointTimeScaling:
-    @property
-    def unit(self) -> float: ...
-    def to_scaled(self, /, values: _Floats) -> _Vector: ...
-    def to_unscaled(self, /, values: _Floats) -> _Vector: ...
-    def step(self, /, values: _Floats, moved: _Floats) -> _Vector: ...
-    def errors(self, /, values: _Floats, covariance: _Floats) -> _Vector: ...
-
 def covariance_of(jacobian: _Floats, series: Sequence[_Floats], squares: float) -> _Matrix: ...
 def fit_covariance(jacobian: _Floats, series: Sequence[_Floats], shares: _Floats | None) -> _Matrix: ...
 def long_run_covariance(jacobian: _Floats, series: Sequence[_Floats]) -> _Matrix: ...
 def whitening_filter(series: Sequence[_Floats], most: int) -> tuple[_Vector, float]: ...
-def filter_autocovariances(through: _Floats, power: float, count: int) -> _Vector: ...
 def autocovariances(series: Sequence[_Floats], most: int) -> tuple[_Vector, _Vector]: ...
 def portmanteau(series: Sequence[_Floats], lags: int) -> float: ...
 def is_white(series: _Floats, lags: int) -> bool: ...
@@ -578,21 +502,6 @@ def friction_respond(
     frictions: Sequence[tuple[int, tuple[float, float, float]]],
     terms: Sequence[Sequence[tuple[float, float]]],
 ) -> _Motion: ...
-def friction_error(
-    runs: Sequence[Experiment | _Experiment],
-    laws: Sequence[_FreeEquation],
-    frictions: Sequence[tuple[int, Sequence[_Monomial]]],
-    order_bounds: Sequence[tuple[float, float]],
-    names: Sequence[str],
-    terms: _Initial,
-    orders: Sequence[float],
-    coefficients: Sequence[float],
-    inputs: Sequence[tuple[int, str, tuple[float, float], float]],
-    states: Sequence[Sequence[float]],
-    evaluations: int,
-    tolerance: float,
-    stop: Stop | None = None,
-) -> dict[str, Any]: ...
 
 # ---------------------------------------------------------------------------------------------------------- simulation
 
@@ -609,26 +518,11 @@ def respond_with_initial(
     terms: _Initial,
     filter: tuple[_Floats, Sequence[bool]] | None,
 ) -> tuple[_Matrix, list[list[float]], list[list[float]]]: ...
-def state_space_respond(
-    model: Sequence[_Equation],
-    inputs: Sequence[bool],
-    driving: Sequence[tuple[int, _Floats, bool, float, float]],
-    terms: Sequence[Sequence[tuple[float, float]]],
-    step: float,
-    rows: int,
-) -> _Matrix | None: ...
 def equation_error(run: _Record, equation: _Equation, inputs: Sequence[bool], terms: _Initial) -> _Vector: ...
 def explicit_euler(signals: _Floats, step: float, model: Sequence[_Equation], inputs: Sequence[bool]) -> _Matrix: ...
 def trace_errors(run: _Record, equation: _Structure, inputs: Sequence[bool], trace: _Floats) -> _Vector: ...
 def nyquist_margin(own_terms: Sequence[tuple[float, float]], step: float) -> float: ...
 def correlation(x: Sequence[_Floats], y: Sequence[_Floats], lags: int) -> tuple[_Vector, float, int]: ...
-def fit_initial_terms(
-    measured: _Floats,
-    driven: _Floats,
-    units: Sequence[tuple[int, float]],
-    columns: Sequence[_Floats],
-    has_level: bool,
-) -> tuple[_Matrix, list[list[tuple[float, float]]]]: ...
 def richardson_limit(
     grids: Sequence[tuple[_Floats, Sequence[float]]], owners: Sequence[int]
 ) -> tuple[_Matrix, _Vector, list[float]]: ...
@@ -649,6 +543,9 @@ class OutputSimulation:
     def samples(
         self, /, every: int, terms: _Terms, stop: Stop | None = None
     ) -> tuple[_Matrix, list[list[tuple[float, float]]]]: ...
+    def exact_samples(
+        self, /, terms: _Terms, stop: Stop | None = None
+    ) -> tuple[_Matrix, list[list[tuple[float, float]]]] | None: ...
     def refine(
         self,
         /,
@@ -656,6 +553,7 @@ class OutputSimulation:
         tolerance: float,
         max_pulses: int,
         long_record_intervals: int,
+        memory: int,
         stop: Stop | None = None,
     ) -> tuple[tuple[_Matrix, list[list[tuple[float, float]]]], int, _Vector]: ...
     def fit_friction_terms(

@@ -1,7 +1,7 @@
 //! Output-error fit of bodies with friction by Levenberg–Marquardt: orders, coefficients and initial states.
 
 use super::model::{Evaluation, FrictionModel, Point};
-use crate::error::{check_finite, check_length, Result};
+use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::optimization::damped_step::Problem;
 use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
 use crate::estimation::output_error::Experiment;
@@ -57,8 +57,7 @@ impl Problem for OutputError<'_> {
     type Evaluation = Evaluation;
 
     fn evaluate(&self, point: &Point) -> Result<Evaluation> {
-        self.stop.check()?;
-        self.model.evaluate(self.experiments, point)
+        self.model.evaluate(self.experiments, point, self.stop)
     }
 
     fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
@@ -66,8 +65,7 @@ impl Problem for OutputError<'_> {
     }
 
     fn jacobian(&self, point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
-        self.stop.check()?;
-        self.model.jacobian(self.experiments, point, evaluation, true)
+        self.model.jacobian(self.experiments, point, evaluation, true, self.stop)
     }
 
     fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
@@ -167,8 +165,7 @@ impl Problem for InitialStateProblem<'_> {
     type Evaluation = Evaluation;
 
     fn evaluate(&self, states: &Vec<f64>) -> Result<Evaluation> {
-        self.stop.check()?;
-        self.model.evaluate(std::slice::from_ref(self.experiment), &self.at(states))
+        self.model.evaluate(std::slice::from_ref(self.experiment), &self.at(states), self.stop)
     }
 
     fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
@@ -176,7 +173,7 @@ impl Problem for InitialStateProblem<'_> {
     }
 
     fn jacobian(&self, states: &Vec<f64>, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
-        self.model.jacobian(std::slice::from_ref(self.experiment), &self.at(states), evaluation, false)
+        self.model.jacobian(std::slice::from_ref(self.experiment), &self.at(states), evaluation, false, self.stop)
     }
 
     fn apply_step(&self, states: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
@@ -207,7 +204,7 @@ fn estimate_initial_state(
     inputs: &[f64],
     experiment: &Experiment,
     stop: &Stop,
-) -> Vec<f64> {
+) -> Result<Vec<f64>> {
     let problem = InitialStateProblem { model, experiment, orders, coefficients, inputs, stop };
     let held: Vec<f64> = model.frictions.iter().map(|(_, law)| law.at(coefficients).breakaway()).collect();
     let plain = model.first_states(orders, experiment, &vec![0.0; held.len()]);
@@ -224,14 +221,14 @@ fn estimate_initial_state(
         if share != 0.0 && start == plain {
             continue;
         }
-        // A start with a simulation that overflows is skipped.
-        if let Ok(found) = minimize(&problem, start, INITIAL_STATE_SETTINGS)
-            && found.cost < best.0
-        {
-            best = (found.cost, found.point);
+        match minimize(&problem, start, INITIAL_STATE_SETTINGS) {
+            Ok(found) if found.cost < best.0 => best = (found.cost, found.point),
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            // A start with a simulation that overflows is skipped.
+            _ => {}
         }
     }
-    best.1
+    Ok(best.1)
 }
 
 /// Least-squares fit with weights of the output error from an initial guess.
@@ -276,7 +273,7 @@ pub fn fit_until(
         states = experiments
             .iter()
             .map(|e| estimate_initial_state(model, &orders, &coefficients, &inputs, e, stop))
-            .collect();
+            .collect::<Result<_>>()?;
     }
     for values in &states {
         check_finite("states of the start", values)?;

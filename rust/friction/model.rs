@@ -7,6 +7,7 @@ use super::law::FrictionLaw;
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
+use crate::parallel::Stop;
 use crate::regressors::{add_impulses, split_impulses, Record};
 use crate::series::Kernel;
 
@@ -262,13 +263,14 @@ impl FrictionModel {
         Ok((Some(Record::new(record.step(), signals, None)?), bent))
     }
 
-    pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point) -> Result<Evaluation> {
+    pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation> {
         let body = self.body(&point.orders, &point.coefficients);
         // Same error as for a step that is too long, so that an optimizer shortens it.
         let far = |_| Error::Diverged { what: "orders or friction out of range; the free run".into(), index: 0 };
         body.check(usize::MAX).map_err(far)?;
         let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
         for (experiment, values) in experiments.iter().zip(&point.states) {
+            stop.check()?;
             let (acting, bent) = self.transform_inputs(&experiment.record, &point.inputs)?;
             let operators = Operators::new(&body, acting.as_ref().unwrap_or(&experiment.record))?;
             let forcing = self.initial_forcing(&point.orders, &point.coefficients, values, &experiment.record)?;
@@ -296,6 +298,7 @@ impl FrictionModel {
         point: &Point,
         at: &Evaluation,
         numbers: bool,
+        stop: &Stop,
     ) -> Result<Vec<Vec<f64>>> {
         let mut all: Vec<Parameter> = Vec::new();
         if numbers {
@@ -315,6 +318,7 @@ impl FrictionModel {
                     column.extend(std::iter::repeat_n(0.0, self.equations.len() * experiment.compared_count()));
                     continue;
                 }
+                stop.check()?;
                 let slopes = self.slopes(&body, experiment, part, &spectra, point, index, moved)?;
                 // Residuals are measurement minus response.
                 column.extend(experiment.weighted_samples(&slopes).into_iter().map(|v| -v));

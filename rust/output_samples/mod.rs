@@ -2,8 +2,10 @@
 //!
 //! Pulse means of the outputs become samples by integrals from the left, and direct feedthrough by the values of its
 //! inputs at the samples. Initial terms are given, or fitted to the measured samples. The step is halved until
-//! Richardson extrapolation has converged; the responses of long records are refined only where they change.
+//! Richardson extrapolation has converged; the responses of long records are refined only where they change. Integer orders
+//! on uniform samples need no grid.
 
+mod exact;
 mod initial_terms;
 mod refinement;
 mod richardson;

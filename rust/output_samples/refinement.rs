@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::initial_terms::{fit_initial_terms, OutputSamples};
 use super::richardson::{add_multiple, combine, peak, relative_change, RichardsonTable, Rows};
 use super::simulation::{Grid, InitialTerms, OutputSimulation, ORDER_TOLERANCE};
-use crate::error::{Error, Kind, Result};
+use crate::error::{check_memory, Error, Kind, Result};
 use crate::parallel::Stop;
 use crate::recording::Role;
 use crate::series;
@@ -46,6 +46,8 @@ pub struct Refinement {
     pub max_pulses: usize,
     /// Number of sampling intervals from which on a record is simulated by superposition of responses.
     pub long_record_intervals: usize,
+    /// Memory limit \[bytes\].
+    pub memory: usize,
 }
 
 impl OutputSimulation {
@@ -54,8 +56,30 @@ impl OutputSimulation {
     ///
     /// # Errors
     /// As [`OutputSimulation::samples`], if the equations are singular on two grids in a row;
-    /// [`Error::Interrupted`] after a stop.
-    pub fn refine(&self, initial: &InitialTerms, options: Refinement, stop: &Stop) -> Result<RefinedSamples> {
+    /// [`Error::Memory`] for a first grid above the memory limit; [`Error::Interrupted`] after a stop.
+    ///
+    /// ```
+    /// # use ftlm::equation::{Equation, Structure, Term};
+    /// # use ftlm::output_samples::{InitialTerms, OutputSimulation, Refinement};
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+    /// # let plant = Equation::new(Structure { output: 0, order: 0.5, terms }, vec![-1.0, 1.0])?;
+    /// # let u = Channel::new("u", vec![1.0; 21], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.05, None, vec![Channel::new("y", vec![0.0; 21], Role::Output), u], vec![0])?;
+    /// # let simulation = OutputSimulation::new(run.into(), vec![plant], Vec::new(), None)?;
+    /// // D^0.5 y = −y + u from rest, 0.5724 one second after a step.
+    /// let rest = InitialTerms::Given(vec![Vec::new()]);
+    /// let options = Refinement { tolerance: 1e-6, max_pulses: 1 << 16, long_record_intervals: 1 << 14, memory: 1 << 30 };
+    /// let found = simulation.refine(&rest, options, &ftlm::parallel::Stop::default())?;
+    /// assert!((found.samples.outputs[0][20] - 0.572_416_423_844_193).abs() < 1e-6);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn refine(&self, initial: &InitialTerms, mut options: Refinement, stop: &Stop) -> Result<RefinedSamples> {
+        let (pulse, pulses) = (self.bytes_per_pulse(initial), FIRST_REFINEMENT.saturating_mul(self.recording.len()));
+        let what = || format!("the {pulses} pulses of a simulation of run '{}'", self.recording.name());
+        check_memory(what, pulse.saturating_mul(pulses), options.memory)?;
+        options.max_pulses = options.max_pulses.min(options.memory / pulse);
         if let Some(found) = refine_long_record(self, initial, options, stop)? {
             return Ok(found);
         }
@@ -87,6 +111,16 @@ impl OutputSimulation {
             }
             every *= 2;
         }
+    }
+
+    /// Memory of a grid for each of its pulses \[bytes\]: signals, series and spectra of the system, and responses.
+    fn bytes_per_pulse(&self, initial: &InitialTerms) -> usize {
+        let units = match initial {
+            InitialTerms::Given(_) => 0,
+            InitialTerms::Fitted { exponents, .. } => exponents.iter().map(Vec::len).sum(),
+        };
+        let n = self.equations.len();
+        size_of::<f64>() * (2 * self.recording.channels().len() + (10 * n + 2 * units + 8) * n)
     }
 
     /// Samples of a grid on which the equations are singular.

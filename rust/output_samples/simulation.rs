@@ -18,7 +18,7 @@ use crate::signal::block_pulse::{point_samples, SampleInterpolation};
 use crate::simulate;
 
 /// (exponent, coefficient) of the initial terms of each equation.
-type Terms = Vec<Vec<(f64, f64)>>;
+pub(super) type Terms = Vec<Vec<(f64, f64)>>;
 
 /// Difference below which two orders are equal.
 pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
@@ -73,7 +73,7 @@ impl OutputSimulation {
     /// let simulation = OutputSimulation::new(run.into(), vec![plant], Vec::new(), None)?;
     /// let rest = InitialTerms::Given(vec![Vec::new()]);
     /// assert!((simulation.samples(4, &rest)?.outputs[0][20] - 0.5724).abs() < 1e-2);
-    /// let options = Refinement { tolerance: 1e-6, max_pulses: 1 << 16, long_record_intervals: 1 << 14 };
+    /// let options = Refinement { tolerance: 1e-6, max_pulses: 1 << 16, long_record_intervals: 1 << 14, memory: 1 << 30 };
     /// let found = simulation.refine(&rest, options, &ftlm::parallel::Stop::default())?;
     /// assert!((found.samples.outputs[0][20] - 0.572_416_423_844_193).abs() < 1e-6);
     /// # Ok(())
@@ -101,6 +101,25 @@ impl OutputSimulation {
     ///
     /// # Errors
     /// As [`Recording::experiment`] and [`friction::fit_until`].
+    ///
+    /// ```
+    /// use ftlm::equation::{Equation, Initial, Structure, Term};
+    /// use ftlm::friction::FrictionLaw;
+    /// use ftlm::output_samples::OutputSimulation;
+    /// use ftlm::parallel::Stop;
+    /// use ftlm::recording::{Channel, Recording, Role};
+    /// use ftlm::signal::block_pulse::Intersample;
+    /// // A block rests at 2.
+    /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
+    /// let u = Channel::new("u", vec![0.0; 21], Role::Input(Intersample::Hold));
+    /// let run = Recording::new("run", 0.05, None, vec![Channel::new("y", vec![2.0; 21], Role::Output), u], vec![0])?;
+    /// let block = Equation::new(structure, vec![1.0])?;
+    /// let friction = vec![(0, FrictionLaw::coulomb(0.5))];
+    /// let simulation = OutputSimulation::new(run.into(), vec![block], friction, None)?;
+    /// let terms = simulation.fit_friction_terms(Initial::Caputo, 1, &Stop::default())?;
+    /// assert!((terms[0][0].1 - 2.0).abs() < 1e-6);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     pub fn fit_friction_terms(&self, initial: Initial, every: usize, stop: &Stop) -> Result<Vec<Vec<(f64, f64)>>> {
         let experiment = self.recording.experiment(Sampling { pulses_per_sample: every, ..Sampling::default() })?;
         let weights: Vec<f64> = (self.recording.outputs().iter())
@@ -138,6 +157,22 @@ impl OutputSimulation {
     ///
     /// # Errors
     /// As [`Recording::pulses`], [`simulate::respond`], [`Body::run`].
+    ///
+    /// ```
+    /// # use ftlm::equation::{Equation, Structure, Term};
+    /// # use ftlm::output_samples::{InitialTerms, OutputSimulation};
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+    /// # let plant = Equation::new(Structure { output: 0, order: 0.5, terms }, vec![-1.0, 1.0])?;
+    /// # let u = Channel::new("u", vec![1.0; 21], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.05, None, vec![Channel::new("y", vec![0.0; 21], Role::Output), u], vec![0])?;
+    /// # let simulation = OutputSimulation::new(run.into(), vec![plant], Vec::new(), None)?;
+    /// // D^0.5 y = −y + u from rest, 0.5724 one second after a step.
+    /// let rest = InitialTerms::Given(vec![Vec::new()]);
+    /// assert!((simulation.samples(4, &rest)?.outputs[0][20] - 0.5724).abs() < 1e-2);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     pub fn samples(&self, every: usize, initial: &InitialTerms) -> Result<OutputSamples> {
         let grid = Grid::new(self, every)?;
         let (units, has_level) = match initial {

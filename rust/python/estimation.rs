@@ -1,16 +1,15 @@
-//! Bindings of least squares, multi-innovation least squares, instrumental variables and the joint output-error fit.
+//! Bindings of least squares, multi-innovation least squares, instrumental variables and experiments.
 
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
 
 use super::convert::{
     initial, prior, record, records, rows, stack_rows, structure, to_vectors, vector, InitialArg, List, RecordArg,
     StructureArg,
 };
 use super::errors::{run_attached, run_detached};
-use super::recording::{input_law, Experiment};
-use crate::equation::{AffineOrder, Initial};
+use super::recording::Experiment;
+use crate::equation::Initial;
 use crate::error::{check_finite, check_length, Error};
 use crate::estimation::instrumental_variables as instruments;
 use crate::estimation::least_squares::{self as batch, Estimate};
@@ -159,12 +158,6 @@ pub fn instrumental_variables(
     Ok(InstrumentalFit { estimates, covariances, iterations, converged, damped })
 }
 
-/// Affine order: (constant, weight of each free order).
-pub type AffineArg = (f64, List<f64>);
-/// Monomial of coefficients: (factor, (coefficient, power) pairs).
-pub type MonomialArg = (f64, List<(usize, i32)>);
-/// Equation with free parameters: (output, alpha, [(signal, order, coefficient), …]).
-pub type FreeEquationArg = (usize, AffineArg, List<(usize, AffineArg, MonomialArg)>);
 /// Nonuniform samples: (sample positions in pulses, positions and sizes of the jumps of each held signal).
 pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
@@ -190,10 +183,6 @@ pub struct ExperimentFields<'py> {
 pub enum ExperimentArg<'py> {
     Sampled(Py<Experiment>),
     Given(ExperimentFields<'py>),
-}
-
-fn affine((constant, weights): AffineArg) -> AffineOrder {
-    AffineOrder { constant, weights: weights.into() }
 }
 
 /// Jumps of a held signal near the sample times.
@@ -252,35 +241,6 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     })
 }
 
-/// Equation with free orders and coefficients.
-pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEquation {
-    joint::FreeEquation {
-        output,
-        order: affine(order),
-        terms: terms
-            .into_iter()
-            .map(|(signal, order, (factor, powers))| {
-                (signal, affine(order), joint::Monomial { factor, powers: powers.into() })
-            })
-            .collect(),
-    }
-}
-
-/// Coordinates of the parameters by name.
-pub fn coordinates(names: &[String]) -> PyResult<Vec<joint::Coordinate>> {
-    let known = |name: &String| match name.as_str() {
-        "plain" => Ok(joint::Coordinate::Plain),
-        "logarithm" => Ok(joint::Coordinate::Logarithm),
-        "excess" => Ok(joint::Coordinate::ExcessLogarithm),
-        "held" => Ok(joint::Coordinate::Fixed),
-        other => Err(Error::Structure {
-            what: format!("coordinate '{other}' is not known"),
-            remedy: "use plain, logarithm, excess or held".into(),
-        }),
-    };
-    Ok(names.iter().map(known).collect::<Result<Vec<_>, _>>()?)
-}
-
 /// Termination status of an optimization as text.
 pub fn status(status: joint::Status) -> &'static str {
     match status {
@@ -289,69 +249,6 @@ pub fn status(status: joint::Status) -> &'static str {
         joint::Status::Stalled => "stalled",
         joint::Status::DomainLimit => "wall",
     }
-}
-
-/// Free parameter of an input: signal, law, bounds, initial guess.
-pub(super) type FreeInputArg = (usize, String, (f64, f64), f64);
-
-pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeInput>> {
-    let free = |(signal, name, bounds, _): &FreeInputArg| {
-        Ok::<_, Error>(joint::FreeInput { signal: *signal, law: input_law(name)?, bounds: *bounds })
-    };
-    Ok(inputs.iter().map(free).collect::<Result<Vec<_>, _>>()?)
-}
-
-#[pyfunction]
-#[pyo3(signature = (
-    runs, laws, order_bounds, coordinates, coupled, terms, start_orders, start_coefficients, inputs, evaluations, tolerance,
-    steady=false, stop=None,
-))]
-#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
-pub fn output_error<'py>(
-    py: Python<'py>,
-    runs: List<ExperimentArg<'py>>,
-    laws: List<FreeEquationArg>,
-    order_bounds: List<(f64, f64)>,
-    coordinates: List<String>,
-    coupled: bool,
-    terms: InitialArg,
-    start_orders: List<f64>,
-    start_coefficients: List<f64>,
-    inputs: List<FreeInputArg>,
-    evaluations: usize,
-    tolerance: f64,
-    steady: bool,
-    stop: Option<&Stop>,
-) -> PyResult<Bound<'py, PyDict>> {
-    let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
-    let equations = laws.into_iter().map(free_equation).collect();
-    let order_bounds = order_bounds.into();
-    let coordinates = self::coordinates(&coordinates)?;
-    let start = joint::Point {
-        orders: start_orders.into(),
-        coefficients: start_coefficients.into(),
-        inputs: inputs.iter().map(|input| input.3).collect(),
-    };
-    let free = free_inputs(&inputs)?;
-    let model =
-        joint::FreeModel { equations, order_bounds, coordinates, inputs: free, coupled, initial: initial(terms)? };
-    let settings = joint::Settings { evaluations, tolerance };
-    let points = count_evaluated_pulses(&experiments, evaluations);
-    let fit = run_interruptible(py, points, stop, move |stop| {
-        joint::fit_until(&model, &experiments, &start, settings, steady, stop)
-    })?;
-    let dict = PyDict::new(py);
-    dict.set_item("orders", fit.point.orders)?;
-    dict.set_item("coefficients", fit.point.coefficients)?;
-    dict.set_item("inputs", fit.point.inputs)?;
-    dict.set_item("cost", fit.cost)?;
-    dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
-    dict.set_item("jacobian", if fit.jacobian.is_empty() { None } else { Some(stack_rows(py, &fit.jacobian)?) })?;
-    dict.set_item("initial", fit.initial)?;
-    dict.set_item("exponents", fit.exponents)?;
-    dict.set_item("evaluations", fit.evaluations)?;
-    dict.set_item("status", status(fit.status))?;
-    Ok(dict)
 }
 
 /// Whether s^alpha minus the own terms (coefficient, order) has a zero in the closed right half-plane.

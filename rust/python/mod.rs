@@ -24,8 +24,8 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::operators::{
-        block_pulse_matrix, delay_samples, filter_series, fractional_derivative, fractional_integral,
-        grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix, point_samples,
+        block_pulse_matrix, delay_samples, filter_series, fractional_derivative, fractional_integral, haar_inverse,
+        haar_matrix, haar_transform, operational_matrix, point_samples,
         series_divide, series_multiply,
     };
 
@@ -39,18 +39,17 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::estimation::{
-        has_unstable_pole, instrumental_variables, least_squares, multi_innovation, output_error, projected_errors,
-        Streaming,
+        has_unstable_pole, instrumental_variables, least_squares, multi_innovation, projected_errors, Streaming,
     };
 
     #[pymodule_export]
-    use crate::python::friction::{friction_error, friction_respond};
+    use crate::python::friction::friction_respond;
 
     #[pymodule_export]
     use crate::python::joint_fit::{
-        autocovariances, chi_squared, cost_surface, covariance_of, filter_autocovariances, fit_covariance, is_white,
-        joint_fit, joint_multistart, long_run_covariance, portmanteau, profile_intervals, refine_candidates,
-        whitening_filter, JointMultistart, JointProblem, JointTimeScaling,
+        autocovariances, chi_squared, cost_surface, covariance_of, fit_covariance, is_white, joint_fit,
+        joint_multistart, long_run_covariance, portmanteau, profile_intervals, whitening_filter, JointMultistart,
+        JointProblem,
     };
 
     #[pymodule_export]
@@ -61,9 +60,8 @@ mod _core {
 
     #[pymodule_export]
     use crate::python::simulation::{
-        correlation, equation_error, explicit_euler, fit_initial_terms, interpolate_samples, kink_correction, metrics,
-        nyquist_margin, respond, respond_with_initial, richardson_limit, state_space_respond, trace_errors,
-        OutputSimulation,
+        correlation, equation_error, explicit_euler, interpolate_samples, kink_correction, metrics, nyquist_margin,
+        respond, respond_with_initial, richardson_limit, trace_errors, OutputSimulation,
     };
 
     #[pymodule_export]

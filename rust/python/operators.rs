@@ -23,12 +23,6 @@ fn choice(name: &str, given: &str, known: &str) -> Error {
 }
 
 #[pyfunction]
-pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResult<Array<'_>> {
-    let weights = run_interruptible(py, m, None, move |_| {
-        check_points("m", m)?;
-        Ok(kernels::grunwald_letnikov_weights(order, m))
-    })?;
-    Ok(PyArray1::from_vec(py, weights))
 }
 
 #[pyfunction]

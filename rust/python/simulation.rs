@@ -6,8 +6,8 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use super::convert::{
-    copy_vector, equations, initial, matrix, record, rows, stack_rows, structure, to_vectors, vector, EquationArg,
-    InitialArg, List, RecordArg, StructureArg,
+    copy_vector, equations, initial, record, rows, stack_rows, structure, to_vectors, vector, EquationArg, InitialArg,
+    List, RecordArg, StructureArg,
 };
 use super::errors::run_detached;
 use super::estimation::jumps_near;
@@ -16,9 +16,8 @@ use crate::error::check_length;
 use crate::friction::FrictionLaw;
 use crate::output_samples::{self, InitialTerms, OutputSamples, Refinement};
 use crate::python::order_search::watch::{run_interruptible, Stop};
-use crate::signal::block_pulse::{Intersample, SampleInterpolation};
+use crate::signal::block_pulse::SampleInterpolation;
 use crate::simulate::{self, OutputFilter};
-use crate::state_space::{self, Input};
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
@@ -55,35 +54,6 @@ pub fn respond_with_initial<'py>(
         simulate::respond_with_initial(&equations, &record, &initial, filter)
     })?;
     Ok((stack_rows(py, &response.outputs)?, response.exponents, response.initial))
-}
-
-/// (signal, samples, whether held, delay in steps, value before the record).
-type InputArg<'py> = (usize, PyReadonlyArray1<'py, f64>, bool, f64, f64);
-
-#[pyfunction]
-#[allow(clippy::needless_pass_by_value)]
-pub fn state_space_respond<'py>(
-    py: Python<'py>,
-    model: List<EquationArg>,
-    inputs: List<bool>,
-    driving: List<InputArg<'py>>,
-    terms: List<List<(f64, f64)>>,
-    step: f64,
-    rows: usize,
-) -> PyResult<Option<Bound<'py, PyArray2<f64>>>> {
-    let equations = equations(model, inputs.len(), &inputs)?;
-    let driving = (driving.iter())
-        .map(|(signal, samples, held, delay, before)| {
-            let between = if *held { Intersample::Hold } else { Intersample::Linear };
-            let samples = vector("input", samples)?;
-            Ok(Input { signal: *signal, samples, between, delay: *delay, before: *before })
-        })
-        .collect::<PyResult<Vec<_>>>()?;
-    let count = equations.len();
-    let found = run_interruptible(py, rows, None, move |stop| {
-        state_space::respond(&equations, &driving, &to_vectors(terms), step, rows, stop)
-    })?;
-    found.map(|samples| matrix(py, samples, count)).transpose()
 }
 
 #[pyfunction]
@@ -264,8 +234,22 @@ impl OutputSimulation {
         samples_tuple(py, run_interruptible(py, points, stop, move |_| inner.samples(every, &initial))?)
     }
 
+    /// Exact samples of a model with integer orders, and initial terms; None if it needs a grid.
+    #[pyo3(signature = (terms, stop=None))]
+    fn exact_samples<'py>(
+        &self,
+        py: Python<'py>,
+        terms: TermsArg,
+        stop: Option<&Stop>,
+    ) -> PyResult<Option<SamplesTuple<'py>>> {
+        let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
+        let found = run_interruptible(py, self.points, stop, move |stop| inner.exact_samples(&initial, stop))?;
+        found.map(|samples| samples_tuple(py, samples)).transpose()
+    }
+
     /// Samples in the limit for zero step, initial terms, pulses per sampling interval, and remaining change by output.
-    #[pyo3(signature = (terms, tolerance, max_pulses, long_record_intervals, stop=None))]
+    #[pyo3(signature = (terms, tolerance, max_pulses, long_record_intervals, memory, stop=None))]
+    #[allow(clippy::too_many_arguments)]
     fn refine<'py>(
         &self,
         py: Python<'py>,
@@ -273,10 +257,11 @@ impl OutputSimulation {
         tolerance: f64,
         max_pulses: usize,
         long_record_intervals: usize,
+        memory: usize,
         stop: Option<&Stop>,
     ) -> PyResult<(SamplesTuple<'py>, usize, Bound<'py, PyArray1<f64>>)> {
         let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
-        let options = Refinement { tolerance, max_pulses, long_record_intervals };
+        let options = Refinement { tolerance, max_pulses, long_record_intervals, memory };
         // How far a simulation is refined is not known.
         let found = run_interruptible(py, usize::MAX, stop, move |stop| inner.refine(&initial, options, stop))?;
         Ok((samples_tuple(py, found.samples)?, found.refinement, PyArray1::from_vec(py, found.change)))
@@ -294,22 +279,6 @@ impl OutputSimulation {
         let (inner, initial) = (Arc::clone(&self.inner), initial(start)?);
         run_interruptible(py, usize::MAX, stop, move |stop| inner.fit_friction_terms(initial, every, stop))
     }
-}
-
-#[pyfunction]
-#[allow(clippy::needless_pass_by_value)]
-pub fn fit_initial_terms<'py>(
-    py: Python<'py>,
-    measured: PyReadonlyArray2<'py, f64>,
-    driven: PyReadonlyArray2<'py, f64>,
-    units: List<(usize, f64)>,
-    columns: List<PyReadonlyArray2<'py, f64>>,
-    has_level: bool,
-) -> PyResult<SamplesTuple<'py>> {
-    let (measured, driven) = (rows(&measured)?, rows(&driven)?);
-    let columns = columns.iter().map(rows).collect::<PyResult<Vec<_>>>()?;
-    let found = run_detached(py, || output_samples::fit_initial_terms(&measured, driven, &units, columns, has_level))?;
-    samples_tuple(py, found)
 }
 
 /// Limit for zero step of samples on grids of 1, 1/2, 1/4, … of a step: samples, change of each output, and the limits

@@ -61,6 +61,12 @@ impl Channel {
     ///
     /// # Errors
     /// [`Error::NotFinite`] for a sample of an input, [`Error::OutOfRange`] for a limit below 0.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// assert!(Channel::new("u", vec![f64::NAN], Role::Input(Intersample::Hold)).check().is_err());
+    /// ```
     pub fn check(&self) -> Result<()> {
         if matches!(self.role, Role::Input(_)) {
             let all = std::iter::once(&self.samples).chain(&self.nonuniform);
@@ -80,6 +86,12 @@ impl Channel {
     }
 
     /// Behavior between samples.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// assert_eq!(Channel::new("y", vec![0.0], Role::Output).intersample(), Intersample::Linear);
+    /// ```
     #[must_use]
     pub fn intersample(&self) -> Intersample {
         match self.role {

@@ -80,6 +80,21 @@ pub fn robust_deviation(values: &[f64]) -> f64 {
     median(values.iter().map(|v| v.abs()).collect()) / NORMAL_MAD_PER_SIGMA
 }
 
+/// Standard deviation of white noise on a smooth signal, from the median of its second differences.
+#[must_use]
+pub fn white_noise_deviation(samples: &[f64]) -> f64 {
+    let bends = |samples: &[f64]| -> Vec<f64> {
+        let second = samples.windows(3).map(|w| (w[2] - w[1]) - (w[1] - w[0]));
+        second.filter(|bend| !bend.is_nan()).collect()
+    };
+    let mut found = bends(samples);
+    if found.is_empty() {
+        // No three neighboring samples are present: use the samples that are, in order.
+        found = bends(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
+    }
+    robust_deviation(&found) / 6.0_f64.sqrt()
+}
+
 /// Median of values, NaN if there are none.
 ///
 /// ```
@@ -242,6 +257,11 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 }
 
 /// Autocovariances at lags 0 to `count` − 1 of an autoregression with this filter and innovation variance.
+///
+/// ```
+/// let found = ftlm::signal::statistics::filter_autocovariances(&[1.0, -0.9], 1.0, 30);
+/// assert!((0..30).all(|k| (found[k] * 0.19 - 0.9_f64.powi(k as i32)).abs() < 1e-9));
+/// ```
 #[must_use]
 pub fn filter_autocovariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
     // The circle of frequencies is so fine that wrapped-around covariances have decayed.

@@ -43,6 +43,32 @@ from ftlm.utils.validation import Floats
 SMOOTH_INTEGRATION_ORDER, COLLINEARITY_TOLERANCE = 2.0, 1e-12
 
 
+@dataclass(frozen=True)
+class TransientRecord(Record):
+    """Record with filter transients (of which signals), initial levels, and impulse responses of the filter."""
+
+    has_transient: tuple[bool, ...] = ()
+    initial_levels: tuple[float, ...] = ()
+    filter_responses: Floats | None = None
+
+    @classmethod
+    def of_run(cls, run: Run, structure: Structure, m: int) -> TransientRecord:
+        """Build for a run."""
+        plain = record(run, structure, m, filtered=structure.all_filtered)
+        _, _, _, (transient, levels, responses) = recording(run, structure, plain.initial).pulses(
+            m, structure.all_filtered
+        )
+        return cls(
+            **vars(plain), has_transient=tuple(transient), initial_levels=tuple(levels), filter_responses=responses
+        )
+
+    def core_with_transients(self) -> tuple:
+        """The record as an argument of the core."""
+        if not any(self.has_transient) and not any(self.initial_levels):
+            return self.core()
+        return (*self.core(), (self.has_transient, self.initial_levels, self.filter_responses))
+
+
 @dataclass(frozen=True, eq=False)
 class SampleTimes:
     """Sample times of a run on its grid of pulses, with the original input samples.
@@ -91,7 +117,7 @@ def simulate_samples(
 
     At the sample times of the grid, or at given times [s].
     """
-    rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.all_filtered)
+    rec = TransientRecord.of_run(run, model.structure, (run.length - 1) * every)
     at = None if times is None else SampleTimes.of(run, rec, model.structure, times)
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
@@ -110,13 +136,13 @@ def simulate_samples(
 
 def unit_samples(model: Model, run: Run, every: int, names: Sequence[tuple[str, float]]) -> list[Floats]:
     """Return samples of all outputs for unit initial terms, by output and power, without inputs."""
-    rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.all_filtered)
+    rec = TransientRecord.of_run(run, model.structure, (run.length - 1) * every)
     return _columns(model, rec, every, names, _free_and_units(model, rec, names)[1], None)
 
 
 def _columns(
     model: Model,
-    rec: Record,
+    rec: TransientRecord,
     every: int,
     names: Sequence[tuple[str, float]],
     units: Sequence[Floats],
@@ -165,7 +191,7 @@ def fit_initial_terms(
     return total, terms
 
 
-def _responses(model: Model, rec: Record, terms: Terms) -> Floats:
+def _responses(model: Model, rec: TransientRecord, terms: Terms) -> Floats:
     """Return pulse means of the outputs before the sensor filter: coupled, or each with the measured others as inputs.
 
     Impulses (-1, -2, ...) represent the initial state of the sensor filter.
@@ -178,7 +204,9 @@ def _responses(model: Model, rec: Record, terms: Terms) -> Floats:
     return np.concatenate([_core.respond(core, [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
-def _free_and_units(model: Model, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
+def _free_and_units(
+    model: Model, rec: TransientRecord, names: Sequence[tuple[str, float]]
+) -> tuple[Floats, list[Floats]]:
     """Pulse means of all outputs before the sensor filter: from rest, and for a unit of each initial term."""
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     still = replace(rec, means=np.zeros_like(rec.means), initial_levels=(0.0,) * len(rec.signals))
@@ -186,7 +214,7 @@ def _free_and_units(model: Model, rec: Record, names: Sequence[tuple[str, float]
 
 
 def _samples_from_pulses(
-    model: Model, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms, at: SampleTimes | None
+    model: Model, run: Run | None, rec: TransientRecord, every: int, means: Floats, terms: Terms, at: SampleTimes | None
 ) -> Floats:
     """Return samples from pulse means: integrals from the left, direct feedthrough with its value at the sample.
 
@@ -254,7 +282,7 @@ def _samples_from_pulses(
         return np.concatenate([(gain * start + held)[:, None], later], axis=1) + gain[:, None] * now
 
 
-def _early_response(model: Model, run: Run, rec: Record, every: int) -> Floats:
+def _early_response(model: Model, run: Run, rec: TransientRecord, every: int) -> Floats:
     """Early part of the mean of the pulses on either side of each inner sample, shape (outputs, N - 2).
 
     It is half of the response of the first pulse after a jump or a corner of the inputs, of which only the direct gain
@@ -351,7 +379,7 @@ def leading_gain(sensor: SensorFilter) -> float:
 
 
 def _values_at_samples(
-    run: Run, rec: Record, structure: Structure, name: str, every: int, at: SampleTimes | None
+    run: Run, rec: TransientRecord, structure: Structure, name: str, every: int, at: SampleTimes | None
 ) -> Floats:
     """Values of a signal just after the sample times."""
     if at is not None:

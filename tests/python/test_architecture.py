@@ -78,13 +78,18 @@ ATTACHED = {
     "force_portable": "sets one flag, for tests",
 }
 
+#: Classes without methods, whose objects are only handed back to the core.
+HANDLES = {"JointMultistart"}
+
 
 def test_every_entry_of_the_extension_computes_detached_and_caught():
     """A panic becomes InternalError, and other Python threads go on: each entry calls the one way into the core."""
     bodies, _ = crate_structure.entries(ROOT / "rust" / "python")
     reached = {name.split("::")[1] for name in bodies}
     public = {name for name in dir(_core) if not name.startswith("__") and callable(getattr(_core, name))}
-    assert public == {name for name in reached if "." not in name} | {n.split(".")[0] for n in reached if "." in n}
+    assert public - HANDLES == {name for name in reached if "." not in name} | {
+        n.split(".")[0] for n in reached if "." in n
+    }
     bare = crate_structure.unwrapped(ROOT / "rust" / "python", ["run_detached", "run_attached"])
     assert [name for name in bare if name.split("::")[1] not in ATTACHED] == []
 

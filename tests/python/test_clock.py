@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 import ftlm
-from ftlm.estimation.free_parameters import FreeProblem, sampling_spans
+from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, minimize_cost
 
 #: Of a lag of first order two orders and an own term too many: along the bottom of a valley nothing tells them.
@@ -22,11 +22,6 @@ def lag(seed, scale):
     y = signal.dlsim(system, u)[1][:, 0]
     y = y + 0.05 * np.std(y) * rng.standard_normal(rows)
     return ftlm.Run.from_arrays(step=0.02 * scale, inputs={"u": u}, outputs={"y": y}, name="lag")
-
-
-def clock_of(problem, run):
-    """Unit of time of a fit: between the frequency of the run's length and Nyquist's."""
-    return problem.core.time_scaling(sampling_spans([run]))
 
 
 def in_seconds(values, scale):
@@ -72,31 +67,3 @@ def test_a_descent_takes_the_same_steps_in_any_unit(plain):
     for other in ended[1:]:
         assert other.orders == pytest.approx(ended[0].orders, abs=1e-7)
         assert other.outcome["cost"] == pytest.approx(ended[0].outcome["cost"], rel=1e-9)
-
-
-def test_the_clock_tells_numbers_steps_and_errors():
-    problem = FreeProblem.of(ftlm.equation("D^alpha y = d D^mu y + a y + b0 D^gamma u + b1 u", delay={"u": (0.0, 0.3)}))
-    clock = clock_of(problem, lag(0, 60.0))
-    scale = np.exp(clock.unit)
-    assert scale == pytest.approx(60.0 * np.exp(clock_of(problem, lag(0, 1.0)).unit))
-    values = dict(alpha=1.9, mu=0.7, gamma=0.4, d=-2.0, a=-30.0, b0=4.0, b1=0.0, delay_u=0.1)
-    powers = {"d": 1.2, "a": 1.9, "b0": 1.5, "b1": 1.9}
-    point = np.array([values[n] for n in problem.names])
-    told = clock.to_scaled(point)
-    expected = [values[n] * scale ** powers.get(n, 0.0) for n in problem.names]
-    np.testing.assert_allclose(told, expected, rtol=1e-12)
-    np.testing.assert_allclose(clock.to_unscaled(told), point, rtol=1e-12)
-    # By differences: a step in the unit, and how each number moves with each.
-    tiny = 1e-6 * np.random.default_rng(3).standard_normal(point.size)
-    np.testing.assert_allclose(clock.step(point, clock.to_scaled(point + tiny) - told), tiny, rtol=1e-4, atol=1e-9)
-    turned = np.stack([(clock.to_scaled(point + 1e-6 * e) - told) / 1e-6 for e in np.eye(point.size)], axis=1)
-    root = np.random.default_rng(4).standard_normal((point.size, point.size))
-    covariance = root @ root.T
-    expected = np.sqrt(np.diag(turned @ covariance @ turned.T))
-    np.testing.assert_allclose(clock.errors(point, covariance), expected, rtol=1e-3)
-    # What the runs do not see has no error in any unit, nor has what moves with it.
-    place = problem.names.index("gamma")
-    covariance[place, :] = covariance[:, place] = np.nan
-    covariance[place, place] = np.inf
-    told_of = dict(zip(problem.names, clock.errors(point, covariance), strict=True))
-    assert [n for n, e in told_of.items() if np.isinf(e)] == ["gamma", "b0"]

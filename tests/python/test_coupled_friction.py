@@ -11,6 +11,7 @@ import friction
 import ftlm
 from ftlm import _core
 from ftlm.errors import DataError, ModelError
+from numbered_problem import NumberedProblem
 
 #: Hub (a, d, b) and link (k, c): D^2 x = a q + d Dq + b Dx + u - friction, D^2 q = - D^2 x - k q - c Dq.
 HUB, LINK = (30.0, 0.4, -1.5), (90.0, 1.2)
@@ -222,21 +223,10 @@ def test_derivatives_are_those_of_finite_differences(orders, passes) -> None:
     begun = (True, [], 1) if passes is None else (True, [], 1, 2)
     law = [(1.0, [(5, 1)]), (0.4, [(5, 1)]), (0.2, [])]
 
+    problem = NumberedProblem(laws, [(0, law)], [(1.05, 2.0), (0.0, 1.5), (0.0, 2.5)], begun)
+
     def at(point):
-        return _core.friction_error(
-            runs,
-            laws,
-            [(0, law)],
-            [(1.05, 2.0), (0.0, 1.5), (0.0, 2.5)],
-            ["plain"] * 6,
-            begun,
-            list(point[:3]),
-            list(point[3:count]),
-            [],
-            [list(point[count : count + each]), list(point[count + each :])],
-            1,
-            1e-9,
-        )
+        return problem.evaluate(runs, point[:count], [point[count : count + each], point[count + each :]])
 
     plain = [0.02, -0.3, 0.01, 0.2, 0.4, 0.1, -0.05, 0.1, 0.02, -0.3, 0.3, -0.1]
     starts = [v for run in (plain[:6], plain[6:]) for v in (*run, *rng.normal(scale=0.01, size=each - 6))]

@@ -13,10 +13,9 @@ from typer.testing import CliRunner
 import ftlm
 import plants
 from ftlm import _core, cli
-from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.free_parameters import FreeProblem, core_arguments
 from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
-from laws import laws
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 
@@ -183,28 +182,19 @@ def test_a_model_has_no_free_delay_and_no_second_name():
 
 
 def test_the_core_refuses_delays_that_are_none():
-    problem = FreeProblem.of(structure())
-    prepared = [sample_run(plants.noisy_run("3T", 40, 5), problem, [1.0])]
+    plain = structure()
+    prepared = [sample_run(plants.noisy_run("3T", 40, 5), FreeProblem.of(plain), [1.0])]
 
     def core(delays):
-        return _core.output_error(
-            prepared,
-            laws(problem),
-            list(problem.bounds),
-            ["plain"] * 3,
-            False,
-            (False, []),
-            [2.2, 0.9],
-            [-0.6, -1.2, 1.2],
-            [(s, "delay", ends, v) for s, ends, v in delays],
-            1,
-            1e-9,
-        )
+        inputs = [("delay", s, "delay", ends) for s, ends, _ in delays]
+        problem = _core.JointProblem({**core_arguments(replace(plain, free_delays={})), "inputs": inputs})
+        start = [2.2, 0.9, -0.6, -1.2, 1.2, *(v for *_, v in delays)]
+        return problem.minimize(prepared, (start, []), True, [], 1, 1e-9, False)
 
     for delays in ([(0, (0.0, 0.1), 0.0)], [(7, (0.0, 0.1), 0.0)], [(1, (0.2, 0.1), 0.1)], [(1, (0.0, 0.1), np.nan)]):
         with pytest.raises(ftlm.ModelError):
             core(delays)
-    assert core([(1, (0.0, 0.1), 5.0)])["inputs"] == [pytest.approx(0.1)]
+    assert core([(1, (0.0, 0.1), 5.0)])["values"][-1] == pytest.approx(0.1)
 
 
 def test_on_the_command_line(tmp_path):

@@ -14,6 +14,7 @@ from ftlm import _core
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.linear import Streaming
+from numbered_problem import NumberedProblem
 
 BLOCK = "D^2 y = u - fc*sign(D y)"
 CART = "D^2 y = - v D y + g u - fc*sign(D y)"
@@ -205,21 +206,11 @@ def test_initial_terms_are_level_and_velocity() -> None:
 def test_derivatives_are_those_of_finite_differences(orders) -> None:
     runs, law = friction.two_records()
 
+    friction_law = [(1.0, [(2, 1)]), (0.0, []), (1.0, [])]
+    problem = NumberedProblem([law], [(0, friction_law)], [(1.05, 2.0), (0.0, 1.5)], (True, [], 1))
+
     def at(point):
-        return _core.friction_error(
-            runs,
-            [law],
-            [(0, [(1.0, [(2, 1)]), (0.0, []), (1.0, [])])],
-            [(1.05, 2.0), (0.0, 1.5)],
-            ["plain"] * 3,
-            (True, [], 1),
-            list(point[:2]),
-            list(point[2:5]),
-            [],
-            [list(point[5:8]), list(point[8:])],
-            1,
-            1e-9,
-        )
+        return problem.evaluate(runs, point[:5], [point[5:8], point[8:]])
 
     point = np.array([*orders, 0.7, 1.1, 0.9, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])
     assert max(friction.slope_errors(at, point, 5)) < 1e-6

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import ftlm
+from ftlm.estimation import objective
 
 PACKAGE = str(Path(ftlm.__file__).parent)
 #: Functions that the core reports its progress to.
 DRIVERS = (
-    "estimation/output_error.py:fit_output_error.<locals>.<lambda>",
     "progress.py:ShareTracker.advance_to",
     "progress.py:ShareTracker.subtask.<locals>.report_subtask",
 )
@@ -80,6 +80,12 @@ def identify(rows: int, _: int) -> object:
     return ftlm.identify(make_run(rows), ftlm.equation(FREE), method="output-error", threads=1)
 
 
+def identify_friction(rows: int, _: int) -> object:
+    words = "D^2 y = v D y + b u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"
+    method = ftlm.OutputError(intervals="quadratic")
+    return ftlm.identify(make_run(rows), ftlm.equation(words, initial="rest"), method=method, threads=1)
+
+
 def search(rows: int, points: int) -> object:
     grid = ftlm.OrderGrid(increment=0.8 / points, alpha=(1.0, 1.8))
     return ftlm.search_orders(make_run(rows), ftlm.equation("D^alpha y = a y + c D^nu y + b u"), order_grid=grid)
@@ -87,6 +93,15 @@ def search(rows: int, points: int) -> object:
 
 def select(rows: int, _: int) -> object:
     return ftlm.select(make_run(rows), ftlm.equation("D^alpha y = a y + c D^nu y + b u"), threads=1)
+
+
+def test_a_fit_with_friction_is_computed_by_the_core(monkeypatch):
+    """Initial guesses of friction come from the multistart of the core, not from optimizations in Python."""
+    made = []
+    monkeypatch.setattr(objective, "minimize_cost", lambda *_, **__: made.append(1))
+    _, callbacks = count_calls(lambda: identify_friction(200, 0))
+    assert [name for name in callbacks if name not in DRIVERS] == []
+    assert made == []
 
 
 def assert_flat(
@@ -102,7 +117,7 @@ def assert_flat(
     assert grown == {}
 
 
-@pytest.mark.parametrize("work", [simulate, compare, identify, search, select])
+@pytest.mark.parametrize("work", [simulate, compare, identify, identify_friction, search, select])
 def test_no_call_for_each_sample(work):
     assert_flat(work, (200, 8), (800, 8), 2.0)
 

@@ -119,7 +119,7 @@ WHOLE = {
 @pytest.mark.parametrize("words", WHOLE)
 @pytest.mark.parametrize("kind", ["zoh", "foh"])
 def test_fewer_grids_are_as_close_to_state_space_as_was_asked(words, kind, monkeypatch):
-    monkeypatch.setattr(step_refinement, "simulate_state_space", lambda *_: None)
+    monkeypatch.setattr(step_refinement, "exact_samples", lambda *_: None)
     # The oracle shares no code: SciPy's matrix exponential, exact for inputs that hold or are linear in between.
     rng = np.random.default_rng(3)
     u = np.cumsum(rng.standard_normal(400)) * 0.1

@@ -10,6 +10,7 @@ import pytest
 
 import ftlm
 from ftlm.errors import ModelError
+from ftlm.estimation.output_error import fit_output_error
 from ftlm.utils.resources import (
     DEFAULT_MEMORY_SHARE,
     FALLBACK_MEMORY_BYTES,
@@ -18,7 +19,7 @@ from ftlm.utils.resources import (
     memory_limit,
 )
 
-REFUSED = re.compile(r"(\d+) regressors of all runs.* need (\d+) bytes, more than the (\d+) that a search may take")
+REFUSED = re.compile(r"(\d+) regressors of all runs.* need (\d+) bytes, more than the (\d+) that may be taken")
 
 
 def machine(folder, **files):
@@ -135,6 +136,11 @@ def needed(monkeypatch, structure, runs, **options):
     return int(told[1]), int(told[2])
 
 
+def ranking(found):
+    """Rows of the table of a search."""
+    return [line for line in str(found).splitlines() if re.match(r"\s*\d+\s", line)]
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_the_border_is_exact_and_all_runs_count(monkeypatch, case):
     structure, options = CASES[case]
@@ -150,7 +156,9 @@ def test_the_border_is_exact_and_all_runs_count(monkeypatch, case):
     with pytest.raises(ModelError, match=f"need {one} bytes, more than the {one - 1} that"):
         search(structure, of_one, **options)
     monkeypatch.delenv(MEMORY_VARIABLE)
-    assert str(search(structure, of_one, **options)) == str(found)
+    # Findings may differ: simulations of the best candidates are refined only as far as memory allows.
+    assert ranking(found)
+    assert ranking(search(structure, of_one, **options)) == ranking(found)
 
 
 def test_a_layout_and_the_banks_of_all_its_equations_count_together(monkeypatch, plant, drive):
@@ -234,3 +242,21 @@ def test_a_long_record_is_fitted_in_little_memory(tmp_path):
     alpha, peak = map(float, done.stdout.split())
     assert alpha == pytest.approx(1.4, abs=1e-3)
     assert peak * 1024 < 150e6
+
+
+def long_run(rows):
+    t = 0.1 * np.arange(rows)
+    return ftlm.Run.from_arrays(step=0.1, inputs={"u": np.sin(t)}, outputs={"y": np.cos(t)}, name="long")
+
+
+def test_a_simulation_asks_for_memory_before_it_takes_it(monkeypatch):
+    monkeypatch.setenv("FTLM_MEMORY", "100K")
+    with pytest.raises(ftlm.ModelError, match=r"the 10000 pulses of a simulation of run 'long' need .* FTLM_MEMORY"):
+        ftlm.Model(ftlm.equation("D^0.7 y = -2 y + u")).simulate(long_run(5000))
+
+
+def test_a_fit_asks_for_the_memory_of_its_grids(monkeypatch):
+    structure, start = ftlm.equation("D^alpha y = a y + b u", initial="rest"), {"alpha": 0.7, "a": -2.0, "b": 1.0}
+    monkeypatch.setenv("FTLM_MEMORY", "100K")
+    with pytest.raises(ftlm.ModelError, match=r"grids of 1 pulses a sample of run 'long' need .* FTLM_MEMORY"):
+        fit_output_error([long_run(5000)], structure, start=start)

@@ -110,23 +110,13 @@ def test_block_pulse_rule_is_the_oracles_matrix(order):
 
 
 def test_absurd_numbers_of_points_are_refused():
-    for call in (
-        lambda m: _core.grunwald_letnikov_weights(0.5, m),
-        lambda m: _core.block_pulse_kernels(np.array([0.5]), m, 0.1),
-    ):
-        with pytest.raises(ftlm.ModelError, match=r"m = 1e\+?15|m = 10{15} is outside \[0, 134217728\]; ask for"):
-            call(10**15)
+    with pytest.raises(ftlm.ModelError, match=r"m = 1e\+?15|m = 10{15} is outside \[0, 134217728\]; ask for"):
+        _core.block_pulse_kernels(np.array([0.5]), 10**15, 0.1)
 
 
 def test_figures_of_nothing_are_refused():
     with pytest.raises(ftlm.DataError, match="measured has length 0, but 1 is needed"):
         _core.metrics(np.zeros(0), np.zeros(0))
-
-
-def test_grunwald_letnikov_weights_are_exact(reference):
-    for known in reference("grunwald_letnikov")["records"]:
-        found = _core.grunwald_letnikov_weights(known["alpha"], max(known["j"]) + 1)[known["j"]]
-        np.testing.assert_allclose(found, known["w"], rtol=1e-13, atol=0, err_msg=str(known["alpha"]))
 
 
 @pytest.mark.parametrize("order", [0.3, 0.5, 1.2, 1.8, 2.4])

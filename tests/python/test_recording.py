@@ -233,4 +233,4 @@ def test_the_core_refuses_runs_that_are_none():
 def test_a_fit_refuses_runs_of_another_structure():
     problem = FreeProblem.of(structure_of("one equation"))
     with pytest.raises(ftlm.DataError, match="signals of a run has length 2, but 3"):
-        _core.refine_candidates(problem.core, [_core.Recording(told())], [1.0], 1, [], 1)
+        _core.joint_multistart(problem.core, [_core.Recording(told())], (1, 1 << 30))

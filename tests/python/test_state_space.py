@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from scipy.signal import cont2discrete, dlsim, lfilter
 
 import ftlm
-from ftlm import _core
-from ftlm.simulation import state_space, step_refinement
+from ftlm.simulation import step_refinement
+from ftlm.simulation.output_samples import output_simulation
 from ftlm.simulation.step_refinement import simulate_refined
 
 STEP = 0.05
@@ -37,8 +37,14 @@ def record(rows: int = 400, *, kind: str = "zoh", outputs: Any = ("y",), step: f
 def on_grids(model: ftlm.Model, run: ftlm.Run, monkeypatch: pytest.MonkeyPatch, **more: Any) -> Any:
     """Simulation of the same run on refined pulse grids."""
     with monkeypatch.context() as changed:
-        changed.setattr(step_refinement, "simulate_state_space", lambda *_: None)
+        changed.setattr(step_refinement, "exact_samples", lambda *_: None)
         return simulate_refined(model, run, **{"initial": {}, "tolerance": 1e-8, "max_m": 1 << 18, **more})
+
+
+def exact(model: ftlm.Model, run: ftlm.Run, initial: dict) -> Any:
+    """Exact samples with these initial terms, or None."""
+    core, terms = output_simulation(model, run, initial, None, 1)
+    return core.exact_samples(terms)
 
 
 def apart(found: np.ndarray, truth: np.ndarray) -> float:
@@ -237,15 +243,15 @@ def test_fractional_orders_filters_and_friction_use_the_grid():
         ftlm.equation("D^2 y = -9 y + D^0.5 u"),
         ftlm.equation("D y = -y + u", sensor_filter=ftlm.SensorFilter.low_pass(["y"], 3.0, 0.7)),
     ):
-        assert state_space.simulate_state_space(ftlm.Model(item), run, {}) is None
+        assert exact(ftlm.Model(item), run, {}) is None
     lag = ftlm.Model(ftlm.equation("D y = -y + u"))
-    assert state_space.simulate_state_space(lag, run, {"y": {0.5: 1.0}}) is None
-    assert state_space.simulate_state_space(lag, run, {"y": {0.0: 1.0}}) is not None
+    assert exact(lag, run, {"y": {0.5: 1.0}}) is None
+    assert exact(lag, run, {"y": {0.0: 1.0}}) is not None
 
 
 def test_singular_equations_are_refused():
     model = ftlm.Model(ftlm.equation("D y = D z - y + u\nD z = D y - z", coupling="simulated"))
-    assert state_space.simulate_state_space(model, record(outputs=("y", "z")), {}) is None
+    assert exact(model, record(outputs=("y", "z")), {}) is None
     with pytest.raises(ftlm.ModelError, match="singular"):
         model.simulate(record(outputs=("y", "z")))
 
@@ -258,42 +264,15 @@ def test_an_unstable_model_names_the_time_of_its_overflow():
         ftlm.Model(ftlm.equation("D^2 y = 1e9 y + u")).simulate(run)
 
 
-LAG: Any = ((0, 1.0, [(0, 0.0), (1, 0.0)]), [-1.0, 1.0])
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"model": [((0, 0.5, [(1, 0.0)]), [1.0])]}, ftlm.ModelError, r"0\.5 that no chain of integrators has"),
-        ({"terms": [[(0.5, 1.0)]]}, ftlm.ModelError, r"0\.5 that no chain of integrators has"),
-        ({"terms": [[(-1.0, 1.0)]]}, ftlm.ModelError, "-1 that no chain of integrators has"),
-        ({"terms": [[], []]}, ftlm.DataError, "initial terms has length 2, but 1 is needed"),
-        ({"driving": [(1, np.ones(4), True, 0.0, 0.0)]}, ftlm.DataError, "input has length 4, but 3 is needed"),
-        ({"driving": [(1, np.full(3, np.nan), True, 0.0, 0.0)]}, ftlm.DataError, "input is not finite at index 0"),
-        ({"driving": [(1, np.ones(3), True, np.inf, 0.0)]}, ftlm.DataError, "delay is not finite"),
-        ({"rows": 1 << 40}, ftlm.ModelError, "samples of all outputs = 1099511627776 is outside"),
-        ({"step": 0.0}, ftlm.ModelError, "step = 0 is outside"),
-    ],
-)
-def test_the_core_refuses_what_it_cannot_simulate(change, error, message):
-    arguments: dict[str, Any] = {
-        "model": [LAG],
-        "inputs": [False, True],
-        "driving": [(1, np.ones(3), True, 0.0, 0.0)],
-        "terms": [[]],
-        "step": 0.5,
-        "rows": 3,
-    }
-    assert _core.state_space_respond(*arguments.values()) is not None
-    with pytest.raises(error, match=message):
-        _core.state_space_respond(*(arguments | change).values())
+def test_terms_of_another_number_of_equations_are_refused():
+    core, _ = output_simulation(ftlm.Model(ftlm.equation("D y = -y + u")), record(), {}, None, 1)
+    with pytest.raises(ftlm.DataError, match="initial terms has length 2, but 1 is needed"):
+        core.exact_samples((False, [[], []], False))
 
 
 @pytest.mark.parametrize("exponent", [200.0, 1e300])
 def test_exponents_of_more_states_than_are_simulated_are_left_to_the_series(exponent):
-    model = [((0, 2.0, [(0, 0.0), (1, 0.0)]), [-1.0, 1.0])]
-    inputs = [(1, np.ones(8), True, 0.0, 0.0)]
-    assert _core.state_space_respond(model, [False, True], inputs, [[(exponent, 1.0)]], 0.1, 8) is None
+    assert exact(ftlm.Model(ftlm.equation("D^2 y = -y + u")), record(), {"y": {exponent: 1.0}}) is None
 
 
 @pytest.mark.parametrize("order", [4e-10, 1e-9, 1.1e-9])

@@ -10,8 +10,8 @@ from scipy.special import erf
 
 import friction
 import ftlm
-from ftlm import _core
 from ftlm.errors import DataError, ModelError
+from numbered_problem import NumberedProblem
 from test_friction import level_and_rate, motion, run_of
 
 NEAR = "- fs*exp(-(D y/vs)^2)*sign(D y)"
@@ -166,21 +166,11 @@ def test_of_several_ends_of_a_long_pulse_the_first_on_the_way_is_taken(v: float,
 def test_derivatives_are_those_of_finite_differences(orders) -> None:
     runs, law = friction.two_records()
 
+    friction_law = [(1.0, [(i, 1)]) for i in (2, 3, 4)]
+    problem = NumberedProblem([law], [(0, friction_law)], [(1.05, 2.0), (0.0, 1.5)], (True, [], 1))
+
     def at(point):
-        return _core.friction_error(
-            runs,
-            [law],
-            [(0, [(1.0, [(i, 1)]) for i in (2, 3, 4)])],
-            [(1.05, 2.0), (0.0, 1.5)],
-            ["plain"] * 5,
-            (True, [], 1),
-            list(point[:2]),
-            list(point[2:7]),
-            [],
-            [list(point[7:10]), list(point[10:])],
-            1,
-            1e-9,
-        )
+        return problem.evaluate(runs, point[:7], [point[7:10], point[10:]])
 
     point = np.array([*orders, 0.7, 1.1, 0.6, 0.3, 0.15, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])
     assert max(friction.slope_errors(at, point, 7)) < 1e-6

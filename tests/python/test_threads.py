@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 
 import numpy as np
@@ -9,19 +10,20 @@ import pytest
 
 import ftlm
 from ftlm import _core
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.output_error import fit_output_error
+from ftlm.simulation.discretization import recording
 from ftlm.simulation.output_samples import output_simulation
 from ftlm.utils.resources import interruptible_pool, stop_flag
 
 
-def step_response(m: int) -> list:
-    """y' = -y + u sampled, as the core compares it."""
-    u = np.ones(m)
-    y = 1.0 - np.exp(-0.01 * np.arange(m + 1))
+def compared(samples: np.ndarray, inputs: np.ndarray) -> list:
+    """Samples and pulses of an input, as the core compares them."""
     return [
         {
-            "record": (0.01, np.stack([np.zeros(m), u]), None),
+            "record": (0.01, np.stack([np.zeros(inputs.size), inputs]), None),
             "pulses_per_sample": 1,
-            "samples": y[None],
+            "samples": samples[None],
             "filter": None,
             "weights": [1.0],
             "signals": [],
@@ -31,14 +33,11 @@ def step_response(m: int) -> list:
     ]
 
 
-LAW = (0, (1.0, []), [(0, (0.0, []), (1.0, [(0, 1)])), (1, (0.0, []), (1.0, [(1, 1)]))])
-
-
 def fitted(m: int, flag: _core.Stop | None, evaluations: int = 60) -> dict:
-    start = [-0.3, 2.0]
-    return _core.output_error(
-        step_response(m), [LAW], [], ["plain"] * 2, False, (True, []), [], start, [], evaluations, 1e-12, False, flag
-    )
+    """y' = -y + u."""
+    runs = compared(1.0 - np.exp(-0.01 * np.arange(m + 1)), np.ones(m))
+    problem = FreeProblem.of(ftlm.equation("D y = a y + b u", initial="caputo"))
+    return problem.core.minimize(runs, ([-0.3, 2.0], []), True, [], evaluations, 1e-12, False, flag)
 
 
 @pytest.mark.parametrize("m", [200, 4000])
@@ -47,8 +46,8 @@ def test_a_flag_that_is_set_ends_a_fit_and_one_that_is_not_changes_nothing(m: in
     assert (60 * m >= 1 << 17) == (m == 4000)
     flag = _core.Stop()
     plain, watched = fitted(m, None), fitted(m, flag)
-    assert plain["coefficients"] == pytest.approx([-1.0, 1.0], rel=1e-4)
-    assert watched["coefficients"] == plain["coefficients"]
+    assert plain["values"] == pytest.approx([-1.0, 1.0], rel=1e-4)
+    assert watched["values"] == plain["values"]
     flag.set()
     assert flag.is_set
     with pytest.raises(KeyboardInterrupt):
@@ -56,26 +55,11 @@ def test_a_flag_that_is_set_ends_a_fit_and_one_that_is_not_changes_nothing(m: in
 
 
 def test_friction_is_ended_as_well() -> None:
-    m = 200
-    runs = [
-        {
-            "record": (0.01, np.stack([np.zeros(m), np.ones(m)]), None),
-            "pulses_per_sample": 1,
-            "samples": np.zeros((1, m + 1)),
-            "filter": None,
-            "weights": [1.0],
-            "signals": [],
-            "robust_weights": None,
-            "sample_times": None,
-        }
-    ]
-    law = (0, (2.0, []), [(1, (0.0, []), (1.0, [(0, 1)]))])
-    strength = [(1.0, [(1, 1)]), (0.0, []), (1.0, [])]
+    runs = compared(np.zeros(201), np.ones(200))
+    problem = FreeProblem.of(ftlm.equation("D^2 y = b u - fc*sign(D y)", initial="caputo"))
 
     def fit(flag: _core.Stop | None) -> dict:
-        return _core.friction_error(
-            runs, [law], [(0, strength)], [], ["plain"] * 2, (True, []), [], [1.0, 0.2], [], [], 3, 1e-9, flag
-        )
+        return problem.core.minimize(runs, ([1.0, 0.2], []), True, [], 3, 1e-9, False, flag)
 
     assert fit(None)["evaluations"] > 1
     flag = _core.Stop()
@@ -153,7 +137,7 @@ def test_a_simulation_on_another_thread_is_ended_within_its_grids() -> None:
 
     def work() -> None:
         try:
-            core.refine(terms, 0.0, pulses, 1 << 60, flag)
+            core.refine(terms, 0.0, pulses, 1 << 60, 1 << 40, flag)
         except KeyboardInterrupt:
             ends.append("ended")
 
@@ -164,3 +148,64 @@ def test_a_simulation_on_another_thread_is_ended_within_its_grids() -> None:
     for thread in threads:
         thread.join()
     assert ends == ["ended"] * 2
+
+
+def test_two_fits_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No thread is made to give up the interpreter, so that the second fit begins only if the first one lets go."""
+    core_fit, inside, most, begun = _core.joint_fit, [0], [0], threading.Barrier(2)
+
+    def watched(*arguments: object) -> object:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        try:
+            return core_fit(*arguments)
+        finally:
+            inside[0] -= 1
+
+    run = moving_run(400)
+    structure = ftlm.equation("D^alpha y = a y + b u", initial="rest")
+
+    def work() -> None:
+        begun.wait()
+        fit_output_error([run], structure, start={"alpha": 1.0, "a": -0.3, "b": 0.5})
+
+    monkeypatch.setattr(_core, "joint_fit", watched)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(60.0)
+    try:
+        threads = [threading.Thread(target=work) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert most == [2]
+
+
+def moving_run(rows: int, friction: float = 0.0) -> ftlm.Run:
+    """A body under random steps."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.choice([-1.0, 1.0], rows // 20 + 1), 20)[:rows]
+    words = f"D^2 y = -D y - 3 y + 2 u - {friction!r}*sign(D y)" if friction else "D y = -y + u"
+    plant = ftlm.Model(ftlm.equation(words))
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": np.zeros(rows)})
+    y = plant.simulate(run)["y"] + 1e-3 * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y})
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_a_multistart_is_ended_from_another_thread(friction: float) -> None:
+    """The first report comes from within the multistart, which the flag then ends."""
+    run = moving_run(600, friction)
+    words = "D^2 y = v D y + k y + b u - fc*sign(D y)" if friction else "D^alpha y = a D^nu y + c y + b u"
+    problem = FreeProblem.of(ftlm.equation(words, initial="rest"))
+    flag, reports = _core.Stop(), []
+
+    def report(done: int, _: int) -> None:
+        reports.append(done)
+        flag.set()
+
+    with pytest.raises(KeyboardInterrupt):
+        _core.joint_multistart(problem.core, [recording(run, problem.structure)], (1, 1 << 30), report, flag)
+    assert reports

@@ -9,6 +9,7 @@ import friction
 import ftlm
 from ftlm import _core
 from ftlm.errors import DataError, ModelError
+from numbered_problem import NumberedProblem
 
 #: D^2 x = - k (x - y) - c (Dx - Dy) + u - friction, D^2 y = r k (x - y) + r c (Dx - Dy) - p y - friction.
 SPRINGS, DAMPERS = ((-40.0, 40.0), (32.0, -50.0)), np.array(((-1.5, 1.0), (0.8, -1.2)))
@@ -246,21 +247,10 @@ def test_derivatives_are_those_of_finite_differences(leans) -> None:
     ]
     count, each = 9, 6
 
+    problem = NumberedProblem(laws, frictions, [(1.05, 2.0)] * 2, (True, [], 1))
+
     def at(point):
-        return _core.friction_error(
-            runs,
-            laws,
-            frictions,
-            [(1.05, 2.0)] * 2,
-            ["plain"] * 7,
-            (True, [], 1),
-            list(point[:2]),
-            list(point[2:count]),
-            [],
-            [list(point[count : count + each]), list(point[count + each :])],
-            1,
-            1e-9,
-        )
+        return problem.evaluate(runs, point[:count], [point[count : count + each], point[count + each :]])
 
     starts = [0.02, -0.3, 0.01, 0.2, 0.4, 0.1, -0.05, 0.1, 0.02, -0.3, 0.3, -0.1]
     point = np.array([1.9, 1.8, 40.0, 1.5, 1.2, 6.0, 3.0, 1.0, 0.2, *starts])

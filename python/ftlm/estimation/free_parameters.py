@@ -252,11 +252,6 @@ def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float
     return {n: v for n, v in found.items() if n in problem.names}
 
 
-def sampling_spans(runs: Sequence[Run]) -> list[tuple[float, float]]:
-    """Return sample interval and duration of each run [s]."""
-    return [(run.step, run.length * run.step) for run in runs]
-
-
 #: Relative difference up to which two signals are multiples of each other: rounding of files.
 COLLINEARITY_TOLERANCE = 1e-9
 

@@ -15,16 +15,8 @@ from ftlm.data.sampling import MAX_SAMPLE_VALUE
 from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance
-from ftlm.estimation.output_error import (
-    MULTISTART_END_FRACTION,
-    SWEEP_FRACTION,
-    Initialization,
-    JointFit,
-    Loss,
-    fit_output_error,
-)
+from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, run_multistart
 from ftlm.findings import Finding, make_finding
-from ftlm.progress import ShareTracker
 from ftlm.simulation.initial_conditions import (
     common_initial_conditions,
     has_memory,
@@ -291,12 +283,8 @@ def fit_with_initial_conditions(
     if not decided and isinstance(start, History):
         # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
         # for more terms, not for fewer.
-        outset = Initialization.of(runs, replace(structure, initial=start))
-        raced = (
-            None
-            if alone
-            else outset.run_multistart(threads, ShareTracker(progress).subtask(MULTISTART_END_FRACTION, SWEEP_FRACTION))
-        )
+        asked = replace(structure, initial=start)
+        raced = None if alone else run_multistart(runs, asked, threads, progress)
         many = fit_initial_terms(start, refine=False, raced=raced)
         kept = _simplify_initial_terms(many, runs, structure, loss, refine=False)
         if kept.unstable_optimum is None and many.unstable_optimum is None:

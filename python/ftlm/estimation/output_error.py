@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -16,10 +15,8 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inputs
-from ftlm.estimation.friction import run_friction_multistart, run_plain_multistart
-from ftlm.estimation.objective import Iterate, Objective, propagated_errors
+from ftlm.estimation.objective import Iterate, propagated_errors
 from ftlm.model.model import FitParameters, Model
-from ftlm.progress import TOTAL_PARTS, ShareTracker
 from ftlm.simulation.discretization import compared_values, recording
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
@@ -28,7 +25,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import memory_limit, stop_flag
-from ftlm.utils.statistics import NORMAL_95, estimate_noise
+from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
 
 Loss = Literal["squares", "huber"]
@@ -117,8 +114,6 @@ class RobustLossSummary:
     samples: int
 
 
-#: Fraction of the progress at which the multistart ends, and fraction of the remainder that each of its passes takes.
-MULTISTART_END_FRACTION, SWEEP_FRACTION = 0.5, 0.3
 #: Residual of cost 1 in a coarse fit, as a fraction of the standard deviation of the output.
 COARSE_SHARE = 0.01
 #: Largest relative difference of the costs of one and the same optimum.
@@ -255,43 +250,26 @@ class JointFit:
         return scaled
 
 
-@dataclass(frozen=True)
-class Initialization:
-    """Initialization of a joint fit: problem, runs and standard deviation of each output."""
+def run_multistart(
+    runs: Sequence[Run], structure: Structure, threads: int, progress: Callable[[int, int], None] | None
+) -> _core.JointMultistart:
+    """Run the multistart of a structure. Later fits of the same structure to the same runs may reuse it."""
+    problem = _check_sample_count(runs, structure)
+    recordings = [recording(run, structure) for run in runs]
+    return _core.joint_multistart(problem.core, recordings, (threads, memory_limit()), progress, stop_flag())
 
-    problem: FreeProblem
-    runs: Sequence[Run]
-    deviations: Sequence[float]
 
-    @classmethod
-    def of(cls, runs: Sequence[Run], structure: Structure) -> Initialization:
-        """Return the initialization; raises as :func:`fit_output_error` if the runs are too short."""
-        problem, outputs = FreeProblem.of(structure), structure.outputs
-        samples = sum(
-            max(drop_missing(compared_values(run, structure, o)).size - 2, 0) for run in runs for o in outputs
+def _check_sample_count(runs: Sequence[Run], structure: Structure) -> FreeProblem:
+    """Return the problem of a structure; raise DataError if the runs have too few samples for it."""
+    problem = FreeProblem.of(structure)
+    values = [compared_values(run, structure, output) for run in runs for output in structure.outputs]
+    samples = sum(max(drop_missing(known).size - 2, 0) for known in values)
+    if samples <= len(problem.names):
+        raise DataError(
+            f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
+            "longer runs, or fix orders or coefficients"
         )
-        if samples <= len(problem.names):
-            raise DataError(
-                f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
-                "longer runs, or fix orders or coefficients"
-            )
-        return cls(problem, runs, output_deviations(runs, structure))
-
-    @cached_property
-    def noise(self) -> list[float]:
-        """Initial guess of the noise standard deviation of each output."""
-        structure = self.problem.structure
-        outputs = zip(structure.outputs, self.deviations, strict=True)
-        return [first_noise(self.runs, structure, output, size) for output, size in outputs]
-
-    def run_multistart(self, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointMultistart:
-        """Run the multistart of this problem. Later fits of the same structure to the same runs may reuse it."""
-        shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.deviations, strict=True)]
-        floor = float(np.mean([share**2 for share in shares]))
-        weights = [1.0 / (COARSE_SHARE * size) for size in self.deviations]
-        start = Objective(self.problem, self.runs, weights)
-        run = run_friction_multistart if self.problem.structure.has_friction else run_plain_multistart
-        return run(start, floor, threads, progress)
+    return problem
 
 
 def output_deviations(runs: Sequence[Run], structure: Structure) -> list[float]:
@@ -327,18 +305,13 @@ def fit_output_error(
     ConvergenceError
         No initial guess has a finite simulation or a finite sum of squares.
     """
-    outset = Initialization.of(runs, structure)
-    problem, outputs = outset.problem, structure.outputs
-    course = ShareTracker(progress)
-    if problem.structure.has_friction and raced is None and start is None and near is None:
-        raced = outset.run_multistart(threads, course.subtask(MULTISTART_END_FRACTION, SWEEP_FRACTION))
+    problem, outputs = _check_sample_count(runs, structure), structure.outputs
     given_near = None
     if near is not None:
         given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
     found = _core.joint_fit(
         problem.core,
         [recording(run, structure) for run in runs],
-        list(zip(outset.deviations, outset.noise, strict=True)),
         [[v[n] for n in problem.names] for v in known],
         None if start is None else [start[n] for n in problem.names],
         given_near,
@@ -346,7 +319,7 @@ def fit_output_error(
         loss == "huber",
         refine,
         (threads, memory_limit()),
-        lambda done, _: course.advance_to(done / TOTAL_PARTS),
+        progress,
         stop_flag(),
     )
     if found is None:
@@ -397,11 +370,6 @@ def start_from_values(problem: FreeProblem, values: Mapping[str, float]) -> Iter
     """Return an initial guess from values by name."""
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     return Iterate(orders, coefficients, "given start", {}, inputs)
-
-
-def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:
-    """Return an initial noise level of an output from second differences, bounded below."""
-    return max(float(np.median([estimate_noise(compared_values(run, structure, output)) for run in runs])), 1e-3 * size)
 
 
 #: Distance of an order from its own bounds, so that derivatives exist there. Nothing is fitted.

@@ -34,15 +34,11 @@ DEFAULT_PULSES = 2048
 MAX_M = 1 << 24
 #: Largest relative excess of a negative delay over one sampling interval that is rounding.
 MAX_EARLY_ROUNDING = 1e-9
-#: Minimum peak of a nonzero signal. Squares of smaller signals underflow.
-MIN_SIGNAL_PEAK = 1e-140
 COULOMB_PREFIX = "coulomb_"
 #: Number of cached series of sensor filters: long ones, and those of at most this many pulses.
 CACHED_LONG_SERIES, SHORT_SERIES_PULSES, CACHED_SHORT_SERIES = 4, 1 << 13, 32
 #: Initial terms as the core takes them.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
-#: Which signals may have a filter transient, initial level of each signal, impulse responses of the filter.
-TransientTuple: TypeAlias = tuple[tuple[bool, ...], tuple[float, ...], Floats | None]
 
 
 @dataclass(frozen=True)
@@ -67,13 +63,6 @@ class Record:
         Unknown constant of each equation on this run.
     states
         Number of initial states of the sensor filter, estimated with the initial terms of every filtered output.
-    has_transient
-        Whether a signal may contain a transient of its sensor filter.
-    initial_levels
-        Initial level of each signal in a run with nonzero initial conditions, to which derivatives of improper terms
-        refer. 0 for signals from which the filter transient was removed.
-    filter_responses
-        Pulse means of the filter's impulse responses, one row per state; None if unavailable, and from rest.
     """
 
     signals: tuple[str, ...]
@@ -84,9 +73,6 @@ class Record:
     initial: Initial
     offset: Offset = "none"
     states: int = 0
-    has_transient: tuple[bool, ...] = ()
-    initial_levels: tuple[float, ...] = ()
-    filter_responses: Floats | None = None
 
     @property
     def start(self) -> InitialTuple:
@@ -101,14 +87,6 @@ class Record:
     def core(self) -> tuple[float, Floats, Floats | None]:
         """Return the record as an argument of the core."""
         return self.step, self.means, self.sensor
-
-    def core_with_transients(
-        self,
-    ) -> tuple[float, Floats, Floats | None] | tuple[float, Floats, Floats | None, TransientTuple]:
-        """Return the record with its filter transients as an argument of the core."""
-        if not any(self.has_transient) and not any(self.initial_levels):
-            return self.core()
-        return (*self.core(), (self.has_transient, self.initial_levels, self.filter_responses))
 
     def of(self, name: str) -> Floats:
         """Return the pulse means of a signal."""
@@ -154,7 +132,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     run, structure = without_level(run, structure)
     _check_known_inputs(structure)
     initial = resolve_initial_conditions(run, structure)
-    step, means, sensor, (transient, levels, responses) = recording(run, structure, initial).pulses(m, filtered)
+    step, means, sensor, _ = recording(run, structure, initial).pulses(m, filtered)
     return Record(
         structure.signals,
         step,
@@ -164,9 +142,6 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         initial,
         structure.offset,
         structure.filter_states(initial),
-        tuple(transient),
-        tuple(levels),
-        responses,
     )
 
 

@@ -29,11 +29,10 @@ from ftlm.simulation.output_samples import (
     measured_samples,
     output_simulation,
 )
-from ftlm.simulation.state_space import simulate_state_space
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.utils.linalg import column_norms, minimum_norm_solution, orthonormal, projections, thin_svd
-from ftlm.utils.resources import stop_flag
+from ftlm.utils.resources import memory_limit, stop_flag
 from ftlm.utils.statistics import variance_inflation
 from ftlm.utils.validation import Floats
 
@@ -73,7 +72,9 @@ def fit_history(
         if name is not None and name[1] == LEVEL_EXPONENT:
             return np.asarray(driven + np.eye(count)[name[0]][:, None])
         own: list[list[tuple[float, float]]] = [[(name[1], 1.0)] if name and name[0] == i else [] for i in range(count)]
-        return core.refine((False, own, False), RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, stop_flag())[0][0]
+        return core.refine(
+            (False, own, False), RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()
+        )[0][0]
 
     driven = respond(None)
     columns = [respond(name) - driven for name in names]
@@ -162,12 +163,14 @@ def _past_responses(model: Model, run: Run, times: Floats, max_m: int) -> list[F
         step_model = Model(replace(structure, input_nonlinearities=msgspec.UNSET, coefficient_law=()))
         none: dict[str, dict[float, float]] = {o: {} for o in outputs}
         try:
-            exact = simulate_state_space(step_model, longer, none)
+            core, terms = output_simulation(step_model, longer, none, None, FRICTION_REFINEMENT)
+            exact = core.exact_samples(terms, stop_flag())
             if exact is None:
-                core, terms = output_simulation(step_model, longer, none, None, FRICTION_REFINEMENT)
-                steps = core.refine(terms, RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, stop_flag())[0][0]
+                steps = core.refine(terms, RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag())[
+                    0
+                ][0]
             else:
-                steps = exact.outputs
+                steps = exact[0]
         except FtlmError:
             return None
         if not np.all(np.isfinite(steps)):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
@@ -13,6 +14,7 @@ from ftlm.simulation.initial_conditions import deviations, resolve_initial_condi
 from ftlm.simulation.output_samples import (
     FRICTION_REFINEMENT,
     LEVEL_EXPONENT,
+    InitialTermsTuple,
     OutputSamples,
     Terms,
     add_levels,
@@ -23,9 +25,9 @@ from ftlm.simulation.output_samples import (
     with_initial_conditions,
 )
 from ftlm.simulation.past_inputs import LONG_RECORD_INTERVALS, fit_history
-from ftlm.simulation.state_space import simulate_state_space
 from ftlm.structure.structure import History
-from ftlm.utils.resources import stop_flag
+from ftlm.utils.resources import memory_limit, stop_flag
+from ftlm.utils.validation import Floats
 
 
 def simulate_refined(
@@ -39,7 +41,7 @@ def simulate_refined(
 ) -> OutputSamples:
     """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
 
-    Integer orders on uniform samples need no grid (:func:`ftlm.simulation.state_space.simulate_state_space`). A long
+    Integer orders on uniform samples need no grid (:func:`exact_samples`). A long
     record is refined only as far as that moves it by superposition of responses.
 
     Parameters
@@ -84,22 +86,31 @@ def _simulate_refined(
     model: Model, run: Run, initial: Terms | None, tolerance: float, max_m: int, on_grid: bool
 ) -> OutputSamples:
     """Simulate as :func:`simulate_refined`, with a start that is resolved, and deviations for a level."""
-    exact = simulate_state_space(model, run, initial)
-    if exact is not None:
-        return exact
     if initial is None and not model.structure.has_friction:
         model = with_initial_conditions(model, run)
     times = (
         run.time if on_grid and has_nonuniform_samples(run, model.structure) else nonuniform_sample_times(model, run)
     )
     core, terms = output_simulation(model, run, initial, times, FRICTION_REFINEMENT)
+    exact = exact_samples(core, terms)
+    if exact is not None:
+        return OutputSamples(exact[0], named_terms(model, exact[1]), 1, np.zeros(len(model.outputs)))
     if initial is None and isinstance(resolve_initial_conditions(run, model.structure), History):
         terms = fit_history(core, model, run, terms, run.time if times is None else times, max_m) or terms
     # Given to the core, initial terms are powers of time alone.
     levels = {o: dict(own).get(LEVEL_EXPONENT, 0.0) for o, own in zip(model.outputs, terms[1], strict=True)}
     powers = (terms[0], [[term for term in own if term[0] != LEVEL_EXPONENT] for own in terms[1]], terms[2])
-    (outputs, found), refinement, change = core.refine(powers, tolerance, max_m, LONG_RECORD_INTERVALS, stop_flag())
+    (outputs, found), refinement, change = core.refine(
+        powers, tolerance, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()
+    )
     if not any(levels.values()):
         return OutputSamples(outputs, named_terms(model, found), refinement, change)
     fitted = {o: {**own, LEVEL_EXPONENT: 0.0} for o, own in named_terms(model, found).items()}
     return OutputSamples(*add_levels(model, levels, outputs, fitted), refinement, change)
+
+
+def exact_samples(
+    core: _core.OutputSimulation, terms: InitialTermsTuple
+) -> tuple[Floats, list[list[tuple[float, float]]]] | None:
+    """Return samples and initial terms of a model with integer orders; None if it needs a grid."""
+    return core.exact_samples(terms, stop_flag())

@@ -401,10 +401,6 @@ class Structure:
         return self._of((single,), "measured")
 
     @check_arguments
-    def with_measured_inputs(self, output: str) -> Structure:
-        """Return one equation as a structure with measured coupling; its orders keep their expressions."""
-        return self._of(tuple(e for e in self.equations if e.output == output), "measured")
-
     @check_arguments
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
         """Fix free orders (a number) or set their grid values (see :func:`parse_values`).

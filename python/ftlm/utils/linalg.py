@@ -6,15 +6,10 @@ than most computations here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ftlm import _core
 from ftlm.utils.validation import Floats
-
-#: Rows that are stacked at a time.
-BLOCK_ROWS = 1 << 12
 
 
 def dot(one: Floats, other: Floats) -> float:
@@ -45,15 +40,6 @@ def triangular_factor(tall: Floats) -> Floats:
     Orthogonal transformations preserve the inner products of the columns, and with them all least-squares problems.
     """
     return _core.triangular_factor(np.ascontiguousarray(tall.T))
-
-
-def blockwise_triangular_factor(columns: Sequence[Floats]) -> Floats:
-    """Return the triangular factor of a matrix given by columns, without stacking all rows at once."""
-    whole = np.zeros((0, len(columns)))
-    for first in range(0, len(columns[0]), BLOCK_ROWS):
-        part = np.stack([column[first : first + BLOCK_ROWS] for column in columns])
-        whole = _core.triangular_factor(np.hstack([whole.T, part]))
-    return whole
 
 
 def thin_svd(tall: Floats) -> tuple[Floats, Floats, Floats]:

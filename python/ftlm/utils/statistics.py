@@ -168,11 +168,6 @@ def fit_whitening_filter(series: Sequence[Floats], most: int) -> tuple[Floats, f
     return _core.whitening_filter(series, most)
 
 
-def colored_noise_covariances(through: Floats, power: float, count: int) -> Floats:
-    """Autocovariances at lags 0 to ``count`` - 1 of noise that a filter turns into white noise of this power."""
-    return _core.filter_autocovariances(through, power, count)
-
-
 def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:
     """Return mean-free series after a whitening filter, without the samples of its start-up.
 

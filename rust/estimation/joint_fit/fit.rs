@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 
 use super::initial_guesses::OrderGrids;
-use super::multistart::{run_multistart, select_survivors, InitialGuessSource, MultistartContext};
+use super::multistart::{
+    run_friction_multistart, run_multistart, select_survivors, InitialGuessSource, MultistartContext,
+};
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::ParameterSet;
 use super::problem::{Candidate, Iterate, OptimizationResult};
@@ -17,7 +19,7 @@ use crate::error::{Error, Result};
 use crate::parallel::Stop;
 use crate::recording::{Recording, Recordings, Sampling};
 use crate::regressors::BANK_LIMIT;
-use crate::signal::statistics::{mean, median, robust_deviation};
+use crate::signal::statistics::{mean, median, white_noise_deviation};
 
 /// Share of the progress of a fit that belongs to the multistart. Each sweep takes [`SWEEP_PROGRESS_SHARE`] of the
 /// rest.
@@ -53,6 +55,21 @@ impl OutputScale {
         Self::from_deviation(size, runs)
     }
 
+    /// Scale of each output of the runs.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] for an output that does not exist.
+    pub fn of_recordings(source: &Recordings) -> Result<Vec<Self>> {
+        let compared: Vec<Vec<Vec<f64>>> = source.runs().iter().map(Recording::recorded_rows).collect();
+        let outputs = source.runs().first().map_or(&[][..], Recording::outputs);
+        let of = |(k, &output): (usize, &usize)| {
+            let uniform: Vec<Vec<f64>> = source.samples(output)?.into_iter().map(<[f64]>::to_vec).collect();
+            let compared: Vec<Vec<f64>> = compared.iter().map(|rows| rows[k].clone()).collect();
+            Ok(Self::from_deviation(Self::from_runs(&uniform).deviation, &compared))
+        };
+        outputs.iter().enumerate().map(of).collect()
+    }
+
     /// Scale of an output from its standard deviation and its samples by run.
     ///
     /// The noise is estimated from second differences, with a lower limit relative to the standard deviation.
@@ -61,21 +78,6 @@ impl OutputScale {
         let noise = median(runs.iter().map(|samples| white_noise_deviation(samples)).collect());
         Self { deviation, noise: noise.max(MIN_NOISE_RATIO * deviation) }
     }
-}
-
-/// Standard deviation of white noise on a smooth signal, from the median of its second differences.
-#[must_use]
-pub fn white_noise_deviation(samples: &[f64]) -> f64 {
-    let bends = |samples: &[f64]| -> Vec<f64> {
-        let second = samples.windows(3).map(|w| (w[2] - w[1]) - (w[1] - w[0]));
-        second.filter(|bend| !bend.is_nan()).collect()
-    };
-    let mut found = bends(samples);
-    if found.is_empty() {
-        // No three neighboring samples are present: use the samples that are, in order.
-        found = bends(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
-    }
-    robust_deviation(&found) / 6.0_f64.sqrt()
 }
 
 /// Initialization of a fit.
@@ -158,17 +160,21 @@ impl<'a> FitProblem<'a> {
         self.grid(self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect(), every)
     }
 
-    /// Run the multistart; return its candidates, best first. Progress is (starts done, all starts).
+    /// Run the multistart; return its candidates, best first.
     ///
     /// # Errors
     /// As the source, the initial guesses and the listener; [`Error::Interrupted`].
-    pub fn run_multistart(&self, threads: usize, told: &ProgressListener<'_>) -> Result<Vec<Candidate>> {
+    pub fn run_multistart(&self, threads: usize, pace: &mut FitProgress<'_>) -> Result<Vec<Candidate>> {
         let share = |size: &OutputScale| (size.noise / (COARSE_RESIDUAL_RATIO * size.deviation)).powi(2);
         let floor = mean(&self.sizes.iter().map(share).collect::<Vec<_>>());
         let weights: Vec<f64> = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
+        let shared = std::cell::RefCell::new(pace);
+        let told =
+            |done, of| shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, done, of);
         let Self { source, starts, stop, .. } = *self;
-        let course = MultistartContext { source, starts, stop, weights: &weights, floor, threads, told: Some(told) };
-        run_multistart(self.free, course)
+        let course = MultistartContext { source, starts, stop, weights: &weights, floor, threads, told: Some(&told) };
+        let run = if self.free.has_friction() { run_friction_multistart } else { run_multistart };
+        run(self.free, course)
     }
 
     fn start(&self, values: &[f64], origin: &str) -> Result<Candidate> {
@@ -276,14 +282,8 @@ pub fn fit(
         }
         Initialization::InitialGuess(values) => (Vec::new(), vec![sought.start(&values, GIVEN_START_ORIGIN)?]),
         Initialization::Multistart { known, candidates: raced } => {
-            let reached = if let Some(raced) = raced {
-                raced
-            } else {
-                let shared = std::cell::RefCell::new(&mut pace);
-                sought.run_multistart(settings.threads, &|done, of| {
-                    shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, done, of)
-                })?
-            };
+            let reached =
+                if let Some(raced) = raced { raced } else { sought.run_multistart(settings.threads, &mut pace)? };
             let mut contenders = select_survivors(&reached);
             for values in &known {
                 contenders.push(sought.start(values, GIVEN_START_ORIGIN)?);

@@ -343,3 +343,68 @@ impl TimeScaling {
         (0..n).map(of).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::joint_fit::structure::{Order, Term};
+
+    #[test]
+    fn time_scaling_converts_values_steps_and_errors() -> Result<()> {
+        let term = |signal, order, name: &str| Term {
+            signal,
+            order,
+            coefficient: Coefficient::Free(name.into()),
+            factor: 1.0,
+        };
+        let terms = vec![
+            term(0, Order::free("mu"), "d"),
+            term(0, Order::number(0.0), "a"),
+            term(1, Order::free("gamma"), "b0"),
+            term(1, Order::number(0.0), "b1"),
+        ];
+        let equation = Equation { output: 0, order: Order::free("alpha"), terms, friction: None };
+        let structure = Structure::new(vec!["y".into(), "u".into()], vec![equation], Initial::Rest);
+        let problem = ParameterSet::from_structure(structure)?.problem;
+        let (clock, minutes) =
+            (TimeScaling::from_runs(&problem, &[(0.02, 4.8)]), TimeScaling::from_runs(&problem, &[(1.2, 288.0)]));
+        let unit = libm::exp(minutes.unit());
+        assert!((unit / libm::exp(clock.unit()) / 60.0 - 1.0).abs() < 1e-12);
+        let values = [1.9, 0.7, 0.4, -2.0, -30.0, 4.0, 0.0];
+        let powers = [0.0, 0.0, 0.0, 1.2, 1.9, 1.5, 1.9];
+        let scaled = minutes.to_scaled(&values);
+        for ((value, power), scaled) in values.iter().zip(powers).zip(&scaled) {
+            assert!((value * libm::pow(unit, power) - scaled).abs() <= 1e-12 * scaled.abs());
+        }
+        let back = minutes.to_unscaled(&scaled);
+        assert!(back.iter().zip(values).all(|(a, b)| (a - b).abs() <= 1e-12 * b.abs()));
+        let tiny = [1e-7, -2e-7, 3e-7, 4e-7, -5e-7, 6e-7, 7e-7];
+        let moved: Vec<f64> = values.iter().zip(tiny).map(|(v, by)| v + by).collect();
+        let change: Vec<f64> = minutes.to_scaled(&moved).iter().zip(&scaled).map(|(a, b)| a - b).collect();
+        let step = minutes.step(&values, &change);
+        assert!(step.iter().zip(tiny).all(|(a, b)| (a - b).abs() < 1e-9));
+        // Slopes by differences give the errors of independent parameters.
+        let n = values.len();
+        let deviations = [0.1, 0.2, 0.05, 0.3, 2.0, 0.5, 0.4];
+        let covariance: Vec<f64> =
+            (0..n * n).map(|k| if k % (n + 1) == 0 { deviations[k / n] * deviations[k / n] } else { 0.0 }).collect();
+        let slope = |i: usize, j: usize| {
+            let mut near = values;
+            near[j] += 1e-6;
+            (minutes.to_scaled(&near)[i] - scaled[i]) / 1e-6
+        };
+        for (i, error) in minutes.standard_errors(&values, &covariance).into_iter().enumerate() {
+            let expected = (0..n).map(|j| (slope(i, j) * deviations[j]).powi(2)).sum::<f64>().sqrt();
+            assert!((error - expected).abs() <= 1e-3 * expected);
+        }
+        // An order that is not identifiable leaves its coefficient without an error, too.
+        let mut unseen = covariance;
+        unseen[2 * n + 2] = f64::INFINITY;
+        let errors = minutes.standard_errors(&values, &unseen);
+        assert_eq!(
+            errors.iter().map(|e| e.is_infinite()).collect::<Vec<_>>(),
+            [false, false, true, false, false, true, false]
+        );
+        Ok(())
+    }
+}

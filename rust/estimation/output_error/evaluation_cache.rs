@@ -13,6 +13,7 @@ use super::system_inverse::{
     SPECTRUM_FACTORS,
 };
 use crate::error::Result;
+use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::Kernel;
 
@@ -57,6 +58,8 @@ impl GridCache {
 
 /// Cache of one experiment across evaluations.
 pub(crate) struct EvaluationCache {
+    /// Cancellation flag, checked within an evaluation.
+    pub(crate) stop: Stop,
     grid: Rc<RefCell<GridCache>>,
     /// Length of the spectra.
     pub(crate) total: usize,
@@ -71,7 +74,7 @@ impl EvaluationCache {
     ///
     /// # Errors
     /// As [`Record::new`].
-    pub(crate) fn of(experiments: &[Experiment]) -> Result<Vec<Self>> {
+    pub(crate) fn of(experiments: &[Experiment], stop: &Stop) -> Result<Vec<Self>> {
         let mut longest: Vec<usize> = (0..experiments.len()).collect();
         longest.sort_by_key(|&k| std::cmp::Reverse(experiments[k].record.m()));
         let mut grids: Vec<Rc<RefCell<GridCache>>> = Vec::new();
@@ -97,7 +100,7 @@ impl EvaluationCache {
         places.sort_by_key(|(k, _)| *k);
         let shelf = |(_, grid): (usize, Rc<RefCell<GridCache>>)| {
             let total = SPECTRUM_FACTORS * grid.borrow().bare.m();
-            Self { grid, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
+            Self { stop: stop.clone(), grid, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
         };
         Ok(places.into_iter().map(shelf).collect())
     }

@@ -312,7 +312,7 @@ pub fn fit_until(
     };
     let experiments = passed.as_deref().unwrap_or(experiments);
     let exact = IntegerOrders::of(&model, experiments, &point);
-    let shelves = RefCell::new(if exact.is_some() { Vec::new() } else { EvaluationCache::of(experiments)? });
+    let shelves = RefCell::new(if exact.is_some() { Vec::new() } else { EvaluationCache::of(experiments, stop)? });
     let clock = TimeUnit::from_experiments(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
     let problem = OutputErrorProblem {

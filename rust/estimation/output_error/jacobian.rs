@@ -61,6 +61,7 @@ impl FreeModel {
             (n, m),
             open.len(),
             |place, rights| {
+                shelf.stop.check()?;
                 let parameter = open[place];
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, _)) in equation.terms.iter().enumerate() {

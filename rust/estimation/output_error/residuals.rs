@@ -92,6 +92,7 @@ impl FreeModel {
         linear: &[usize],
         out: &mut Evaluation<Linearization>,
     ) -> Result<RestSimulation> {
+        shelf.stop.check()?;
         let record = &experiment.record;
         let acted = (self.inputs.iter().zip(&point.inputs))
             .map(|(&input, &value)| self.apply_input_law(record, input, value))
@@ -101,6 +102,7 @@ impl FreeModel {
         let has_level = self.initial.has_level();
         let asked = has_level || out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
         let (response, solved) = self.rest_response(experiment, shelf, &operators, point, &acted)?;
+        shelf.stop.check()?;
         let mut residuals = experiment.measured_samples();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.weighted_samples(&response);
@@ -377,6 +379,7 @@ impl FreeModel {
             (n, record.m()),
             coefficients.len(),
             |place, rights| {
+                shelf.stop.check()?;
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
                         let weight = monomial.slope(&point.coefficients, coefficients[place]);

@@ -10,18 +10,17 @@ use super::problem::JointProblem;
 use crate::error::Result;
 use crate::estimation::joint_fit::fit;
 use crate::estimation::joint_fit::initial_guesses::OrderGrids;
-use crate::estimation::joint_fit::multistart::{self, select_survivors, MultistartContext};
+use crate::estimation::joint_fit::multistart::select_survivors;
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
+use crate::estimation::joint_fit::progress::FitProgress;
 use crate::estimation::joint_fit::{
-    Candidate, FitProblem, Initialization, Iterate, JointFit, Loss, Objective, OptimizationResult, OptimumStatistics,
-    OutputScale, Settings, Weights,
+    Candidate, FitProblem, Initialization, JointFit, Loss, OptimizationResult, OptimumStatistics, OutputScale, Settings,
 };
 use crate::python::convert::{matrix, stack_rows, List};
-use crate::python::errors::run_attached;
 use crate::python::estimation::status;
 use crate::python::order_search::watch::{run_with_progress, Stop};
 use crate::python::recording::{recordings, Recording};
-use crate::recording::{Recordings, Sampling};
+use crate::recording::Recordings;
 
 type Table<'py> = Bound<'py, PyArray2<f64>>;
 /// Resources: (threads, bytes of memory of one order grid).
@@ -33,92 +32,33 @@ pub struct JointMultistart {
     inner: Arc<Vec<Candidate>>,
 }
 
-#[pymethods]
-impl JointMultistart {
-    fn __len__(&self) -> PyResult<usize> {
-        run_attached(|| Ok(self.inner.len()))
-    }
-
-    /// Values of the free parameters of each candidate.
-    #[getter]
-    fn values(&self) -> PyResult<Vec<Vec<f64>>> {
-        run_attached(|| Ok(self.inner.iter().map(|runner| runner.result.values()).collect()))
-    }
-
-    /// Description of the start of each candidate.
-    #[getter]
-    fn origins(&self) -> PyResult<Vec<String>> {
-        run_attached(|| Ok(self.inner.iter().map(|runner| runner.origin.clone()).collect()))
-    }
-}
-
 /// Runs as source of a fit.
 pub(super) fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
     let outputs: Vec<usize> = free.structure.equations.iter().map(|e| e.output).collect();
     recordings(runs, free.structure.signals.len(), &outputs, free.structure.inputs.len())
 }
 
-/// Multistart of a problem with these output weights. `floor` is the cost of pure noise per residual.
+/// Multistart of a problem.
 #[pyfunction]
-#[pyo3(signature = (problem, runs, weights, floor, means, progress=None, stop=None))]
-#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+#[pyo3(signature = (problem, runs, means, progress=None, stop=None))]
+#[allow(clippy::needless_pass_by_value)]
 pub fn joint_multistart(
     py: Python<'_>,
     problem: &JointProblem,
     runs: List<Py<Recording>>,
-    weights: List<f64>,
-    floor: f64,
     means: Means,
     progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<JointMultistart> {
     let (free, (threads, memory)) = (Arc::clone(&problem.inner), means);
-    let source = source(&free, &runs)?;
+    let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
     let reached = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let starts = OrderGrids::new(&source, threads, memory, stop);
-        let course = MultistartContext {
-            source: &source,
-            starts: &starts,
-            stop,
-            weights: &weights,
-            floor,
-            threads,
-            told: Some(&report),
-        };
-        multistart::run_multistart(&free, course)
+        let sizes = OutputScale::of_recordings(&source)?;
+        let sought = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
+        sought.run_multistart(threads, &mut FitProgress::new(&report))
     })?;
     Ok(JointMultistart { inner: Arc::new(reached) })
-}
-
-/// Refine candidates, each (values of the free parameters, description), on coarse grids.
-#[pyfunction]
-#[pyo3(signature = (problem, runs, weights, decimation, starts, threads, stop=None))]
-#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
-pub fn refine_candidates(
-    py: Python<'_>,
-    problem: &JointProblem,
-    runs: List<Py<Recording>>,
-    weights: List<f64>,
-    decimation: usize,
-    starts: List<(List<f64>, String)>,
-    threads: usize,
-    stop: Option<&Stop>,
-) -> PyResult<JointMultistart> {
-    let free = Arc::clone(&problem.inner);
-    let starts =
-        starts.into_iter().map(|(values, origin)| candidate_at(&free, &values, origin)).collect::<Result<Vec<_>>>()?;
-    let source = source(&free, &runs)?;
-    let reached = run_with_progress(py, stop, None, move |stop, _| {
-        let weights = Weights { outputs: weights.into(), robust_weights: None };
-        let sampling = Sampling { decimation, ..Sampling::default() };
-        let grid = Objective::new((&free.problem, &source, stop), weights, sampling, false)?;
-        multistart::optimize_on_coarse_grids(&free, &grid, &starts, threads)
-    })?;
-    Ok(JointMultistart { inner: Arc::new(reached) })
-}
-
-fn candidate_at(free: &ParameterSet, values: &[f64], origin: String) -> Result<Candidate> {
-    Ok(Candidate::at(Iterate { point: free.problem.point(values)?, states: Vec::new() }, origin))
 }
 
 /// Initial guess near an earlier fit: (values of the free parameters, noise of each output, pulses per sampling
@@ -127,13 +67,12 @@ type NearArg = (List<f64>, List<f64>, usize);
 
 /// Fit a structure to its runs. None if every start has a simulation that overflows.
 #[pyfunction]
-#[pyo3(signature = (problem, runs, sizes, known, start, near, candidates, huber, refine, means, progress=None, stop=None))]
+#[pyo3(signature = (problem, runs, known, start, near, candidates, huber, refine, means, progress=None, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn joint_fit<'py>(
     py: Python<'py>,
     problem: &JointProblem,
     runs: List<Py<Recording>>,
-    sizes: List<(f64, f64)>,
     known: List<List<f64>>,
     start: Option<List<f64>>,
     near: Option<NearArg>,
@@ -158,13 +97,11 @@ pub fn joint_fit<'py>(
     };
     let loss = if huber { Loss::Huber } else { Loss::Squares };
     let settings = Settings { loss, refine, threads };
-    let sizes: Vec<OutputScale> = sizes.iter().map(|&(deviation, noise)| OutputScale { deviation, noise }).collect();
-    let outputs = free.problem.outputs.len();
-    crate::error::check_length("sizes of outputs", outputs, sizes.len())?;
     let size = free.problem.size();
-    let source = source(&free, &runs)?;
+    let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
     let found = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let starts = OrderGrids::new(&source, threads, memory, stop);
+        let sizes = OutputScale::of_recordings(&source)?;
         let sought = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
         fit::fit(sought, initialization, settings, report)
     })?;

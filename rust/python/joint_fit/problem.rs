@@ -1,26 +1,23 @@
-//! Bindings of the parameter set of a joint fit and of its time scaling.
+//! Bindings of the parameter set of a joint fit.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use numpy::{PyArray1, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::structure::{parse_structure, StructureArg};
-use crate::error::{check_length, Error};
+use crate::error::Error;
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::structure::Law;
-use crate::estimation::joint_fit::{Iterate, TimeScaling};
+use crate::estimation::joint_fit::Iterate;
 use crate::estimation::output_error::Settings;
-use crate::python::convert::{copy_vector, rows, stack_rows, to_vectors, vector, List};
+use crate::python::convert::{stack_rows, to_vectors, vector, List};
 use crate::python::errors::{run_attached, run_detached};
 use crate::python::estimation::{count_evaluated_pulses, experiment, status, ExperimentArg};
 use crate::python::order_search::watch::{run_interruptible, Stop};
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
-/// Sampling interval and duration of each run \[s\].
-type Spans = List<(f64, f64)>;
 
 /// Parameter set of a joint fit.
 #[pyclass(module = "ftlm._core", frozen)]
@@ -53,18 +50,6 @@ impl JointProblem {
     fn products(&self) -> PyResult<Vec<(String, f64, Vec<String>)>> {
         let told = |law: &Law| (law.name.clone(), law.sign, law.factors.clone());
         run_attached(|| Ok(self.inner.products.iter().map(told).collect()))
-    }
-
-    /// Integer-order start: second order with one derivative of the output, others unchanged, within the bounds.
-    #[getter]
-    fn whole_orders(&self) -> PyResult<Vec<f64>> {
-        run_attached(|| Ok(self.inner.integer_orders()))
-    }
-
-    /// Free coefficients from independent estimates by name. Ratios are the median over the equations.
-    #[allow(clippy::needless_pass_by_value)]
-    fn free_from(&self, estimated: BTreeMap<String, f64>) -> PyResult<Vec<f64>> {
-        run_attached(|| Ok(self.inner.free_from(&estimated)))
     }
 
     /// Bounds of all free parameters.
@@ -126,80 +111,5 @@ impl JointProblem {
         dict.set_item("evaluations", found.evaluations)?;
         dict.set_item("status", status(found.status))?;
         Ok(dict)
-    }
-
-    /// Time scaling of runs, each given by its sampling interval and its duration.
-    #[allow(clippy::needless_pass_by_value)]
-    fn time_scaling(&self, spans: Spans) -> PyResult<JointTimeScaling> {
-        run_attached(|| {
-            spans.iter().try_for_each(|&(step, duration)| {
-                crate::error::check_step(step)?;
-                crate::error::check_step(duration)
-            })?;
-            Ok(JointTimeScaling {
-                inner: TimeScaling::from_runs(&self.inner.problem, &spans),
-                size: self.inner.problem.size(),
-            })
-        })
-    }
-}
-
-/// Parameters of a fit in the time scaling of its runs.
-#[pyclass(module = "ftlm._core", frozen)]
-pub struct JointTimeScaling {
-    inner: TimeScaling,
-    size: usize,
-}
-
-impl JointTimeScaling {
-    fn values(&self, name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
-        let values = copy_vector(name, array)?;
-        check_length(name, self.size, values.len())?;
-        Ok(values)
-    }
-}
-
-#[pymethods]
-impl JointTimeScaling {
-    /// Logarithm of the time unit.
-    #[getter]
-    fn unit(&self) -> PyResult<f64> {
-        run_attached(|| Ok(self.inner.unit()))
-    }
-
-    /// Parameters in scaled time.
-    fn to_scaled<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
-        let values = self.values("values", &values)?;
-        Ok(PyArray1::from_vec(py, run_attached(|| Ok(self.inner.to_scaled(&values)))?))
-    }
-
-    /// Parameters from those in scaled time.
-    fn to_unscaled<'py>(&self, py: Python<'py>, values: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
-        let values = self.values("values", &values)?;
-        Ok(PyArray1::from_vec(py, run_attached(|| Ok(self.inner.to_unscaled(&values)))?))
-    }
-
-    /// Small step of the parameters at some values, from the step in scaled time.
-    fn step<'py>(
-        &self,
-        py: Python<'py>,
-        values: PyReadonlyArray1<'py, f64>,
-        moved: PyReadonlyArray1<'py, f64>,
-    ) -> PyResult<Array<'py>> {
-        let (values, moved) = (self.values("values", &values)?, self.values("step", &moved)?);
-        Ok(PyArray1::from_vec(py, run_attached(|| Ok(self.inner.step(&values, &moved)))?))
-    }
-
-    /// Standard errors in scaled time. Infinite if a parameter is not identifiable.
-    fn errors<'py>(
-        &self,
-        py: Python<'py>,
-        values: PyReadonlyArray1<'py, f64>,
-        covariance: PyReadonlyArray2<'py, f64>,
-    ) -> PyResult<Array<'py>> {
-        let (values, spread) = (self.values("values", &values)?, rows(&covariance)?);
-        check_length("rows of a covariance", self.size, spread.len())?;
-        spread.iter().try_for_each(|row| check_length("a row of a covariance", self.size, row.len()))?;
-        Ok(PyArray1::from_vec(py, run_attached(|| Ok(self.inner.standard_errors(&values, &spread.concat())))?))
     }
 }

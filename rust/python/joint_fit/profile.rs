@@ -8,7 +8,7 @@ use pyo3::types::PyDict;
 
 use super::fit::source;
 use super::problem::JointProblem;
-use crate::error::{check_finite, check_points, Error};
+use crate::error::{check_finite, Error};
 use crate::estimation::joint_fit::profile::{
     profile_intervals as search_intervals, CostSurface, FitState, ProfileLikelihood, ProfileSettings,
 };
@@ -99,6 +99,19 @@ pub fn profile_intervals<'py>(
     Ok(dict)
 }
 
+/// Most points of a cost surface on each axis. Each pair is a simulation.
+const MAX_SURFACE_POINTS: usize = 64;
+
+#[allow(clippy::cast_precision_loss)]
+fn check_surface_points(points: usize) -> Result<(), Error> {
+    if points <= MAX_SURFACE_POINTS {
+        return Ok(());
+    }
+    let (name, value) = ("points of a cost surface".into(), points as f64);
+    let (range, remedy) = (format!("[0, {MAX_SURFACE_POINTS}]"), "take fewer, over a part of it".into());
+    Err(Error::OutOfRange { name, value, range, remedy })
+}
+
 /// Sums of squares of a fit over two parameters: at the optimum, the values of both, and at each pair of values.
 ///
 /// Rows are values of the second parameter. `halves` are the distances of the outermost values from the optimum.
@@ -118,7 +131,7 @@ pub fn cost_surface<'py>(
     stop: Option<&Stop>,
 ) -> PyResult<SurfaceTuple<'py>> {
     check_parameters(problem, &pair)?;
-    check_points("points of a cost surface", points.saturating_mul(points))?;
+    check_surface_points(points)?;
     let (free, fit) = (Arc::clone(&problem.inner), state(fit)?);
     let source = source(&free, &runs)?;
     let (least, [first, second], scores) = run_with_progress(py, stop, None, move |stop, _| {

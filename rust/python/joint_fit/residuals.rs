@@ -79,24 +79,6 @@ pub fn whitening_filter<'py>(
     Ok((PyArray1::from_vec(py, filter), power))
 }
 
-/// Autocovariances of noise that a filter whitens.
-#[pyfunction]
-#[allow(clippy::needless_pass_by_value)]
-pub fn filter_autocovariances<'py>(
-    py: Python<'py>,
-    through: PyReadonlyArray1<'py, f64>,
-    power: f64,
-    count: usize,
-) -> PyResult<Array<'py>> {
-    let through = vector("filter", &through)?;
-    let found = run_interruptible(py, count, None, move |_| {
-        // The circulant has many times as many points.
-        crate::error::check_points("points for autocovariances", count.saturating_mul(16))?;
-        Ok(statistics::filter_autocovariances(&through, power, count))
-    })?;
-    Ok(PyArray1::from_vec(py, found))
-}
-
 /// Autocovariances of series at lags from 0, and the number of pairs in each mean.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]

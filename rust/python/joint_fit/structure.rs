@@ -6,8 +6,9 @@ use crate::error::Error;
 use crate::estimation::joint_fit::structure::{
     Coefficient, Equation, FrictionParameters, Hints, Input, Law, Order, Structure, Term,
 };
+use crate::estimation::output_error::FreeInput;
 use crate::python::convert::{initial, InitialArg, List};
-use crate::python::estimation::free_inputs;
+use crate::python::recording::input_law;
 
 /// Order: (constant, weight of each free order by name).
 type OrderArg = (f64, List<(String, f64)>);
@@ -86,8 +87,7 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<Structure> {
     };
     let mut inputs = Vec::new();
     for (name, signal, law, bounds) in argument.inputs {
-        let free = free_inputs(&[(signal, law, bounds, 0.0)])?;
-        inputs.extend(free.into_iter().map(|free| Input { name: name.clone(), free }));
+        inputs.push(Input { name, free: FreeInput { signal, law: input_law(&law)?, bounds } });
     }
     let hints = argument.hints;
     let law = |(name, sign, factors): (String, f64, List<String>)| Law { name, sign, factors: factors.into() };

@@ -178,6 +178,10 @@ impl InitialGuessSource for OrderGrids<'_> {
         self.candidates(free)
     }
 
+    fn for_recordings<'b>(&'b self, source: &'b Recordings) -> Box<dyn InitialGuessSource + 'b> {
+        Box::new(OrderGrids::new(source, self.threads, self.memory, self.stop))
+    }
+
     fn integer_order_optima(&self, free: &ParameterSet, grid: &Objective<'_>) -> Result<Option<Vec<Candidate>>> {
         let fastest = self.frequencies(free)?.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
         let delays = input_points(free, self.source, fastest)?.into_iter().map(|(point, _)| point).collect::<Vec<_>>();

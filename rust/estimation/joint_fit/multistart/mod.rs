@@ -3,17 +3,20 @@
 //! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
 //! samples. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
 //! term less ([`ReducedProblem`]), a lower order ([`LowerOrderProblem`]), one fixed order ([`FixedOrderProblem`]) or
-//! integer orders ([`IntegerOrderProblem`]).
+//! integer orders ([`IntegerOrderProblem`]). Bodies with friction start from linear fits ([`run_friction_multistart`]).
 
 mod coarse_grid;
+mod friction;
 mod halving;
 mod nested_models;
 mod search;
+mod sliding_body;
 
 pub use coarse_grid::coarse_sampling;
+pub use friction::run_friction_multistart;
 pub use halving::{competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors};
 pub use nested_models::{
     distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
     FixedOrderProblem, IntegerOrderProblem, LowerOrderProblem, ReducedProblem,
 };
-pub use search::{optimize_on_coarse_grids, run_multistart, InitialGuessSource, MultistartContext};
+pub use search::{run_multistart, InitialGuessSource, MultistartContext};

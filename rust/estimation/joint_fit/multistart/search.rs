@@ -33,6 +33,9 @@ pub trait InitialGuessSource {
     /// If its equations cannot be searched; [`Error::Interrupted`].
     fn initial_guesses(&self, free: &ParameterSet) -> Result<Vec<Candidate>>;
 
+    /// Source of initial guesses on other recordings.
+    fn for_recordings<'b>(&'b self, source: &'b Recordings) -> Box<dyn InitialGuessSource + 'b>;
+
     /// Optima of a problem of integer orders on all samples; None for other problems.
     ///
     /// # Errors
@@ -430,7 +433,7 @@ pub(super) fn promote_improving(
 ///
 /// # Errors
 /// As the source, [`crate::error::Error::Interrupted`].
-pub fn optimize_on_coarse_grids(
+pub(super) fn optimize_on_coarse_grids(
     free: &ParameterSet,
     coarse: &Objective<'_>,
     starts: &[Candidate],

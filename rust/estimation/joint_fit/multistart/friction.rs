@@ -1,0 +1,528 @@
+//! Multistart of bodies with friction: linear fits with the measured sign of the velocity supply the initial guesses.
+//!
+//! With the measured sign of the velocity the equation is linear. Where the body rests, the sign is noise, but the
+//! estimates are close enough. Fits without friction add guesses with several amounts of friction. Stribeck friction
+//! starts from the best fits with Coulomb friction.
+
+use std::collections::BTreeMap;
+
+use super::halving::{FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS};
+use super::search::{optimize_on_coarse_grids, run_multistart, MultistartContext};
+use super::sliding_body::fit_sliding_body;
+use crate::equation::Initial;
+use crate::error::{Error, Result};
+use crate::estimation::joint_fit::format::format_general;
+use crate::estimation::joint_fit::objective::{Objective, Weights};
+use crate::estimation::joint_fit::parameter_set::ParameterSet;
+use crate::estimation::joint_fit::problem::{Candidate, Iterate};
+use crate::estimation::joint_fit::structure::{Coefficient, Equation, FrictionParameters, Order, Structure, Term};
+use crate::recording::{Channel, Recording, Recordings, Role, Sampling};
+use crate::signal::nonuniform::interpolate_gaps;
+use crate::signal::statistics::{root_mean_square, white_noise_deviation};
+
+/// Samples of the coarse fits.
+const COARSE_SAMPLES: usize = 1200;
+/// Highest order of a body with friction.
+const MAX_BODY_ORDER: f64 = 2.0;
+/// Initial Coulomb friction relative to the largest input force on the body.
+const COULOMB_FORCE_RATIOS: [f64; 4] = [0.01, 0.05, 0.2, 0.5];
+/// Initial Coulomb friction relative to the estimate with the measured sign of the velocity.
+const MEASURED_SIGN_RATIOS: [f64; 2] = [1.0, 0.3];
+/// Initial Stribeck friction relative to Coulomb friction, and its speed relative to the speed of the body.
+const STRIBECK_COULOMB_RATIOS: [f64; 3] = [0.02, 0.2, 1.0];
+const STRIBECK_SPEED_RATIOS: [f64; 3] = [0.05, 0.2, 0.6];
+/// Initial inertia of the attached bodies relative to the inertia of the body.
+const LOAD_INERTIA_RATIOS: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
+/// Largest number of initial guesses in which each body carries a load of its own.
+const MAX_LOAD_COMBINATIONS: usize = 64;
+/// Largest difference of two orders that are action and reaction of two coupled equations.
+const MAX_REACTION_ORDER_GAP: f64 = 0.5;
+/// Smallest peak-to-peak motion of a body, in standard deviations of its noise.
+const MIN_MOTION_NOISE_RATIO: f64 = 10.0;
+/// Prefix of the signal of the measured sign of a velocity.
+const SIGN_PREFIX: &str = "coulomb_";
+
+/// Values by name: orders, coefficients and input parameters.
+type Values = BTreeMap<String, f64>;
+
+/// Run the multistart of a problem with friction; return the candidates best first.
+///
+/// # Errors
+/// [`Error::Recording`] if a body moves in no run; as [`run_multistart`]; [`Error::Interrupted`].
+pub fn run_friction_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    let structure = &free.structure;
+    if !structure.has_friction() {
+        return run_multistart(free, course);
+    }
+    check_motion(structure, course.source)?;
+    let shortest = course.source.runs().iter().map(Recording::len).min().unwrap_or(1);
+    let sampling = Sampling { decimation: ((shortest - 1) / COARSE_SAMPLES).max(1), ..Sampling::default() };
+    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
+    let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
+    let starts = initial_guesses(free, course, &grid)?;
+    optimize_on_coarse_grids(free, &grid, &starts, course.threads)
+}
+
+fn initial_guesses(free: &ParameterSet, course: MultistartContext<'_>, grid: &Objective<'_>) -> Result<Vec<Candidate>> {
+    let structure = &free.structure;
+    let bodies = bodies(structure).count();
+    if self::bodies(structure).any(|(_, friction)| has_stribeck(friction)) {
+        let less = ParameterSet::from_structure(with_friction(structure, |friction| Some(without_stribeck(friction))))?;
+        let reached = run_friction_multistart(&less, course)?;
+        let best = reached.iter().take(MAX_FINAL_SURVIVORS);
+        let starts = best.map(|runner| stribeck_guesses(free, grid, &less, runner)).collect::<Result<Vec<_>>>()?;
+        return Ok(starts.concat());
+    }
+    let mut starts = Vec::new();
+    if 1 < bodies && bodies < structure.equations.len() {
+        // Attached equations are fitted by themselves. That of a body, which all attached ones act on, may be explained
+        // by their measured motion.
+        for orders in order_sets(free) {
+            let values = fit_frictionless_equations(structure, course, &orders)?;
+            starts.extend(loaded_body_guesses(free, course, &values, false)?);
+        }
+        return Ok(starts);
+    }
+    // With measured signals as inputs, the equation of each of several bodies does not depend on the others.
+    let (signed, source) = with_measured_sign(structure, course.source)?;
+    let signed = ParameterSet::from_structure(signed)?;
+    let reached = run_on(&signed, &source, course)?;
+    for runner in reached.iter().take(MAX_FINAL_SURVIVORS) {
+        starts.extend(coulomb_guesses(free, grid, &signed, runner)?);
+    }
+    if let Some(best) = reached.first().filter(|_| structure.equations.len() > 1) {
+        starts.extend(loaded_body_guesses(free, course, &values_of(&signed, best), true)?);
+    }
+    Ok(starts)
+}
+
+/// Run the multistart of a problem without friction on other recordings.
+fn run_on(free: &ParameterSet, source: &Recordings, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    let starts = course.starts.for_recordings(source);
+    run_multistart(free, MultistartContext { source, starts: starts.as_ref(), ..course })
+}
+
+/// Equations with friction.
+fn bodies(structure: &Structure) -> impl Iterator<Item = (&Equation, &FrictionParameters)> {
+    structure.equations.iter().filter_map(|item| Some((item, item.friction.as_ref()?)))
+}
+
+/// Return an error if a body with friction moves in no run.
+fn check_motion(structure: &Structure, source: &Recordings) -> Result<()> {
+    for (item, _) in bodies(structure) {
+        let still = |samples: &&[f64]| {
+            let known = samples.iter().filter(|v| !v.is_nan());
+            let (low, high) =
+                known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+            high - low <= MIN_MOTION_NOISE_RATIO * white_noise_deviation(samples)
+        };
+        if source.samples(item.output)?.iter().all(still) {
+            let names: Vec<&str> = source.runs().iter().map(Recording::name).collect();
+            let (output, names) = (&structure.signals[item.output], names.join(", "));
+            let what = format!(
+                "{output} never moves beyond its noise in {names}, and a body that only rests tells nothing but that \
+                 its friction is not exceeded"
+            );
+            return Err(Error::Recording { what, remedy: "add a run in which it slides".into() });
+        }
+    }
+    Ok(())
+}
+
+/// Structure with other friction.
+fn with_friction(
+    structure: &Structure,
+    other: impl Fn(&FrictionParameters) -> Option<FrictionParameters>,
+) -> Structure {
+    let of = |item: &Equation| Equation { friction: item.friction.as_ref().and_then(&other), ..item.clone() };
+    Structure { equations: structure.equations.iter().map(of).collect(), ..structure.clone() }
+}
+
+fn has_stribeck(friction: &FrictionParameters) -> bool {
+    friction.stribeck.1 != Coefficient::Known(0.0)
+}
+
+fn without_stribeck(friction: &FrictionParameters) -> FrictionParameters {
+    let known = |value| (1.0, Coefficient::Known(value));
+    FrictionParameters { stribeck: known(0.0), speed: known(1.0), ..friction.clone() }
+}
+
+/// Values of all parameters of a candidate, with the coefficients that a law determines.
+fn values_of(free: &ParameterSet, runner: &Candidate) -> Values {
+    let mut values: Values = free.names().cloned().zip(runner.result.values()).collect();
+    values.extend(free.coefficients_by_name(&runner.result.iterate.point.coefficients));
+    values
+}
+
+/// Initial guess at values by name. A parameter without a value is in the middle of its bounds.
+fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> Result<Candidate> {
+    let of = |(name, (low, high)): (&String, (f64, f64))| {
+        let middle = 0.5 * (low + high);
+        values.get(name).copied().unwrap_or(if middle.is_finite() { middle } else { 0.0 })
+    };
+    let at: Vec<f64> = free.names().zip(free.problem.bounds()).map(of).collect();
+    Ok(Candidate::at(Iterate { point: free.problem.point(&at)?, states: Vec::new() }, origin))
+}
+
+/// Structure and recordings of some equations alone, with measured signals as inputs.
+fn with_measured_inputs(
+    structure: &Structure,
+    source: &Recordings,
+    equations: Vec<Equation>,
+) -> Result<(Structure, Recordings)> {
+    let mut used: Vec<usize> = equations.iter().map(|item| item.output).collect();
+    let outputs = used.len();
+    let others = equations.iter().flat_map(|item| &item.terms).map(|term| term.signal);
+    let mut others: Vec<usize> = others.filter(|signal| !used.contains(signal)).collect();
+    others.sort_by(|&i, &j| structure.signals[i].cmp(&structure.signals[j]));
+    others.dedup();
+    used.extend(others);
+    let place = |signal: usize| used.iter().position(|&of| of == signal).unwrap_or_default();
+    let equation = |item: Equation| {
+        let output = place(item.output);
+        let mut terms: Vec<Term> =
+            item.terms.into_iter().map(|term| Term { signal: place(term.signal), ..term }).collect();
+        terms.sort_by_key(|term| (term.signal != output, term.signal));
+        Equation { output, terms, ..item }
+    };
+    let equations: Vec<Equation> = equations.into_iter().map(equation).collect();
+    let channel = |run: &Recording, signal: usize| -> Result<Channel> {
+        let place = place(signal);
+        let enters = |item: &Equation| item.output != place && item.terms.iter().any(|term| term.signal == place);
+        Ok(Channel { enters_others: equations.iter().any(enters), ..run.channel(signal)?.clone() })
+    };
+    let is_filtered = source.runs().iter().any(|run| used.iter().any(|&signal| run.channels()[signal].is_filtered));
+    let mut runs = Vec::new();
+    for run in source.runs() {
+        let channels = used.iter().map(|&signal| channel(run, signal)).collect::<Result<Vec<_>>>()?;
+        let mut alone = run.with_channels(channels, (0..outputs).collect())?;
+        (alone.is_coupled, alone.has_friction) = (false, false);
+        if !is_filtered {
+            (alone.filter, alone.filter_states) = (None, 0);
+        }
+        let free = run.free_inputs.iter().filter(|(signal, _)| used.contains(signal));
+        alone.free_inputs = free.map(|&(signal, law)| (place(signal), law)).collect();
+        runs.push(alone);
+    }
+    let mut alone = structure.clone();
+    alone.inputs.retain(|input| used.contains(&input.free.signal));
+    alone.inputs.iter_mut().for_each(|input| input.free.signal = place(input.free.signal));
+    if let Initial::Filtered { under, .. } = alone.initial.clone()
+        && !is_filtered
+    {
+        alone.initial = *under;
+    }
+    alone.signals = used.iter().map(|&signal| structure.signals[signal].clone()).collect();
+    Ok((Structure { equations, coupled: false, ..alone }, Recordings::new(runs)?))
+}
+
+/// Structure and recordings with the sign of the measured velocity of each body as an input in place of its friction.
+fn with_measured_sign(structure: &Structure, source: &Recordings) -> Result<(Structure, Recordings)> {
+    let (mut signed, first) = (structure.clone(), structure.signals.len());
+    let moving: Vec<usize> = bodies(structure).map(|(item, _)| item.output).collect();
+    let mut next = first;
+    for item in &mut signed.equations {
+        let Some(FrictionParameters { coulomb: (factor, coefficient), .. }) = item.friction.take() else { continue };
+        signed.signals.push(format!("{SIGN_PREFIX}{}", signed.signals[item.output]));
+        item.terms.push(Term { signal: next, order: Order::number(0.0), coefficient, factor: -factor });
+        next += 1;
+    }
+    let mut runs = Vec::new();
+    for run in source.runs() {
+        let mut channels = run.channels().to_vec();
+        for (&output, name) in moving.iter().zip(&signed.signals[first..]) {
+            let samples = interpolate_gaps(&channels[output].samples);
+            let sign = |w: &[f64]| if w[1] == w[0] { 0.0 } else { (w[1] - w[0]).signum() };
+            let mut signs: Vec<f64> = samples.windows(2).map(sign).collect();
+            // The sign of the last interval repeats, so that there are as many samples.
+            signs.extend(signs.last().copied());
+            channels.push(Channel::new(name, signs, Role::Derived));
+        }
+        let outputs = run.outputs().to_vec();
+        let mut run_with_signs = run.with_channels(channels, outputs)?;
+        run_with_signs.free_inputs.clone_from(&run.free_inputs);
+        runs.push(run_with_signs);
+    }
+    let equations = signed.equations.clone();
+    with_measured_inputs(&signed, &Recordings::new(runs)?, equations)
+}
+
+/// Order sets of the linear fits: integer orders, and natural orders of the hints.
+///
+/// Equations that share orders determine each of them poorly. An overdamped body has another optimum at every order.
+fn order_sets(free: &ParameterSet) -> Vec<Values> {
+    let natural = |name: &String| free.structure.hints.natural.get(name).filter(|values| !values.is_empty());
+    let (mut whole, mut other) = (Values::new(), Values::new());
+    for ((name, usual), &(low, high)) in free.orders.iter().zip(free.integer_orders()).zip(free.bounds()) {
+        let values = natural(name).map_or(&[][..], Vec::as_slice);
+        let integer = values.iter().rfind(|v| **v == v.round()).copied().unwrap_or(usual);
+        let within = |value: f64| value.max(low).min(high);
+        whole.insert(name.clone(), within(integer));
+        if let Some(value) = values.iter().rfind(|v| **v != integer) {
+            other.insert(name.clone(), within(*value));
+        }
+    }
+    if other.is_empty() {
+        return vec![whole];
+    }
+    let mut mixed = whole.clone();
+    mixed.extend(other);
+    vec![whole, mixed]
+}
+
+/// Orders, and coefficients of each equation without friction fitted by itself; 0 for those of the other equations.
+fn fit_frictionless_equations(structure: &Structure, course: MultistartContext<'_>, orders: &Values) -> Result<Values> {
+    let mut values = orders.clone();
+    values.extend(structure.coefficient_names().into_iter().map(|name| (name, 0.0)));
+    for (item, &weight) in structure.equations.iter().zip(course.weights) {
+        if item.friction.is_some() {
+            continue;
+        }
+        let (alone, source) = with_measured_inputs(structure, course.source, vec![item.clone()])?;
+        let alone = Structure { laws: Vec::new(), ..alone };
+        let alone = ParameterSet::from_structure(alone.with_orders(orders)?)?;
+        let reached = run_on(&alone, &source, MultistartContext { weights: &[weight], told: None, ..course })?;
+        if let Some(best) = reached.first() {
+            values.extend(alone.coefficients_by_name(&best.result.iterate.point.coefficients));
+        }
+    }
+    Ok(values)
+}
+
+/// Initial guesses of isolated bodies with the coupling forces of the attached bodies added.
+///
+/// Coupling forces follow from action and reaction. A body driven by measured neighbors may be explained by their
+/// motion alone, without its input and its friction, so each body is fitted in isolation first. All bodies carry the
+/// same fraction of their inertia if `together`, or each its own.
+fn loaded_body_guesses(
+    free: &ParameterSet,
+    course: MultistartContext<'_>,
+    values: &Values,
+    together: bool,
+) -> Result<Vec<Candidate>> {
+    let structure = &free.structure;
+    let mut fitted = Vec::new();
+    for (item, _) in bodies(structure) {
+        let (orders, numbers) = fit_isolated_body(free, course, item, values)?;
+        if !numbers.is_empty() {
+            fitted.push((item, orders, numbers));
+        }
+    }
+    if fitted.is_empty() {
+        return Ok(Vec::new());
+    }
+    let combinations = u32::try_from(fitted.len()).ok().and_then(|n| LOAD_INERTIA_RATIOS.len().checked_pow(n));
+    let together = together || combinations.is_none_or(|n| n > MAX_LOAD_COMBINATIONS);
+    let mut shares: Vec<Vec<f64>> = LOAD_INERTIA_RATIOS.map(|share| vec![share; fitted.len()]).to_vec();
+    if !together {
+        shares = vec![Vec::new()];
+        for _ in &fitted {
+            let longer = |some: Vec<f64>| LOAD_INERTIA_RATIOS.map(|share| [some.as_slice(), &[share]].concat());
+            shares = shares.into_iter().flat_map(longer).collect();
+        }
+    }
+    let outputs: Vec<&str> = fitted.iter().map(|(item, ..)| structure.signals[item.output].as_str()).collect();
+    let each = if fitted.len() > 1 { ", each" } else { "" };
+    let guess = |shares: Vec<f64>| {
+        // Forces on a body act on the others, too.
+        let (mut found, mut at) = (values.clone(), values.clone());
+        for ((item, orders, numbers), share) in fitted.iter().zip(&shares) {
+            found.extend(reaction_coefficients(structure, item, values, *share));
+            found.extend(numbers.iter().map(|(name, value)| (name.clone(), (1.0 + share) * value)));
+            at.extend(orders.clone());
+        }
+        at.extend(free.coefficients.iter().cloned().zip(free.free_from(&found)));
+        let named: Vec<String> = shares.iter().map(|share| format_general(*share, 6)).collect();
+        let carried = if together { named[0].clone() } else { named.join(" and ") };
+        let words = format!("{}{each} by itself, carrying {carried} of its inertia", outputs.join(" and "));
+        guess_at(free, &at, words)
+    };
+    shares.into_iter().map(guess).collect()
+}
+
+/// Orders and coefficients of an isolated body with friction, fitted to its inputs; none if there is no solution.
+fn fit_isolated_body(
+    free: &ParameterSet,
+    MultistartContext { source, stop, .. }: MultistartContext<'_>,
+    item: &Equation,
+    values: &Values,
+) -> Result<(Values, Values)> {
+    let structure = &free.structure;
+    let is_output = |signal: usize| structure.equations.iter().any(|e| e.output == signal);
+    let mut alone = item.clone();
+    alone.terms.retain(|term| term.signal == item.output || !is_output(term.signal));
+    // Orders that depend on several free orders are those of the usual derivatives.
+    for term in alone.terms.iter_mut().filter(|term| term.order.is_free() && !term.order.is_single()) {
+        term.order = Order::number(if term.signal == item.output { 1.0 } else { 0.0 });
+    }
+    let mut usual = Values::new();
+    for term in alone.input_terms() {
+        usual.extend(term.order.names().map(|name| (name.clone(), 0.0)));
+    }
+    for term in alone.autoregressive_terms() {
+        usual.extend(term.order.names().map(|name| (name.clone(), 1.0)));
+    }
+    usual.extend(item.order.names().map(|name| (name.clone(), MAX_BODY_ORDER)));
+    let others = || structure.equations.iter().filter(|e| e.output != item.output).flat_map(Equation::orders);
+    for (name, value) in &mut usual {
+        let shared = others().any(|order| order.names().any(|of| of == name));
+        if shared && !item.order.names().any(|of| of == name) {
+            *value = values.get(name).copied().unwrap_or(*value);
+        }
+        if let Some(place) = free.orders.iter().position(|of| of == name) {
+            let (low, high) = free.bounds()[place];
+            *value = value.max(low).min(high);
+        }
+    }
+    alone.order = alone.order.substitute(&usual);
+    alone.terms.iter_mut().for_each(|term| term.order = term.order.substitute(&usual));
+    let inputs = guess_at(free, values, String::new())?.result.iterate.point.inputs;
+    let mut runs = source.runs().iter().map(|run| run.with_free_inputs(&inputs)).collect::<Result<Vec<_>>>()?;
+    runs.iter_mut().for_each(|run| run.filter = None);
+    let numbers = fit_sliding_body(&runs, &alone, stop)?;
+    Ok((usual, numbers))
+}
+
+fn value_at(values: &Values, name: &str) -> f64 {
+    values.get(name).copied().unwrap_or(0.0)
+}
+
+/// Coefficients by which attached bodies act on a body, scaled by the inertia ratio.
+fn reaction_coefficients(structure: &Structure, item: &Equation, values: &Values, share: f64) -> Values {
+    let order = |term: &Term| term.order.at(|name| value_at(values, name));
+    let sorted = |of: &Equation, signal: usize| {
+        let mut terms: Vec<Term> = of.terms.iter().filter(|term| term.signal == signal).cloned().collect();
+        terms.sort_by(|a, b| order(a).total_cmp(&order(b)));
+        terms
+    };
+    let mut out = Values::new();
+    for other in structure.equations.iter().filter(|e| e.output != item.output) {
+        for (there, here) in sorted(other, other.output).iter().zip(sorted(item, other.output)) {
+            if let Some(name) =
+                here.coefficient.name().filter(|_| (order(&here) - order(there)).abs() <= MAX_REACTION_ORDER_GAP)
+            {
+                out.insert(name.clone(), -share * value_of(there, values) / here.factor);
+            }
+        }
+    }
+    out
+}
+
+/// Coefficient of a term, multiplied by its factor.
+fn value_of(term: &Term, values: &Values) -> f64 {
+    number((term.factor, &term.coefficient), values)
+}
+
+fn number((factor, coefficient): (f64, &Coefficient), values: &Values) -> f64 {
+    factor
+        * match coefficient {
+            Coefficient::Known(value) => *value,
+            Coefficient::Free(name) => value_at(values, name),
+        }
+}
+
+/// Initial guesses of Coulomb friction from a linear fit, and from fractions of the input force.
+fn coulomb_guesses(
+    free: &ParameterSet,
+    grid: &Objective<'_>,
+    signed: &ParameterSet,
+    runner: &Candidate,
+) -> Result<Vec<Candidate>> {
+    let (mut values, origin) = (values_of(signed, runner), &runner.origin);
+    let named: Vec<(&Equation, f64, &String)> = bodies(&free.structure)
+        .filter_map(|(item, friction)| Some((item, friction.coulomb.0, friction.coulomb.1.name()?)))
+        .collect();
+    if named.is_empty() {
+        return Ok(vec![guess_at(free, &values, origin.clone())?]);
+    }
+    let with_forces = |values: &Values, forces: &[f64], ratio: f64, of: &str| {
+        let mut values = values.clone();
+        values.extend(named.iter().zip(forces).map(|((.., name), force)| ((*name).clone(), ratio * force)));
+        guess_at(free, &values, format!("{origin}, friction {} of {of}", format_general(ratio, 6)))
+    };
+    let mut out = Vec::new();
+    let measured: Vec<f64> = named.iter().map(|(.., name)| value_at(&values, name).max(0.0)).collect();
+    if measured.iter().any(|value| *value > 0.0) {
+        for ratio in MEASURED_SIGN_RATIOS {
+            out.push(with_forces(&values, &measured, ratio, "the measured sign")?);
+        }
+    }
+    let linear = ParameterSet::from_structure(with_friction(&free.structure, |_| None))?;
+    let mut runs = grid.source().runs().to_vec();
+    runs.iter_mut().for_each(|run| run.has_friction = false);
+    let source = Recordings::new(runs)?;
+    let coarse = Objective::new((&linear.problem, &source, grid.stop()), grid.weights.clone(), grid.sampling, false)?;
+    let start = guess_at(&linear, &values, String::new())?.result.iterate;
+    let found = match coarse.minimize_in(&linear.problem_at(&start, false, &[]), &start, FIRST_BUDGET_EVALUATIONS) {
+        Err(Error::Interrupted) => return Err(Error::Interrupted),
+        // Without any friction the simulation diverges.
+        Err(_) => return Ok(out),
+        Ok(found) => Candidate { result: found, origin: String::new(), duplicates: Vec::new() },
+    };
+    values.extend(values_of(&linear, &found));
+    let largest =
+        |(item, factor, _): &(&Equation, f64, _)| Ok(largest_input_force(grid.source(), item, &values)? / factor);
+    let forces = named.iter().map(largest).collect::<Result<Vec<f64>>>()?;
+    if forces.iter().any(|force| *force > 0.0) {
+        for ratio in COULOMB_FORCE_RATIOS {
+            out.push(with_forces(&values, &forces, ratio, "what drives")?);
+        }
+    }
+    Ok(out)
+}
+
+/// Initial guesses of Stribeck friction from a fit with Coulomb friction alone.
+fn stribeck_guesses(
+    free: &ParameterSet,
+    grid: &Objective<'_>,
+    less: &ParameterSet,
+    runner: &Candidate,
+) -> Result<Vec<Candidate>> {
+    let (values, origin) = (values_of(less, runner), &runner.origin);
+    let (mut forces, mut speeds) = (Values::new(), Values::new());
+    for (item, friction) in bodies(&free.structure).filter(|(_, friction)| has_stribeck(friction)) {
+        if let (factor, Coefficient::Free(name)) = &friction.stribeck {
+            let coulomb = number((friction.coulomb.0.abs(), &friction.coulomb.1), &values);
+            let force = if coulomb == 0.0 { largest_input_force(grid.source(), item, &values)? } else { coulomb };
+            forces.insert(name.clone(), force / factor);
+        }
+        if let (_, Coefficient::Free(name)) = &friction.speed {
+            speeds.insert(name.clone(), rms_speed(grid, item.output)?);
+        }
+    }
+    let some = |known: &Values, ratios: [f64; 3]| if known.is_empty() { ratios[..1].to_vec() } else { ratios.to_vec() };
+    let mut out = Vec::new();
+    for near in some(&forces, STRIBECK_COULOMB_RATIOS) {
+        for fall in some(&speeds, STRIBECK_SPEED_RATIOS) {
+            let mut guess = values.clone();
+            guess.extend(forces.iter().map(|(name, force)| (name.clone(), near * force)));
+            guess.extend(speeds.iter().map(|(name, speed)| (name.clone(), fall * speed)));
+            let (near, fall) = (format_general(near, 6), format_general(fall, 6));
+            let words = format!("{origin}, Stribeck {near} of Coulomb below {fall} of the speed");
+            out.push(guess_at(free, &guess, words)?);
+        }
+    }
+    Ok(out)
+}
+
+/// Root-mean-square speed of an output, over sample intervals long enough to exceed the noise.
+#[allow(clippy::cast_precision_loss)]
+fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
+    let every = grid.sampling.decimation;
+    let mut speeds = Vec::new();
+    for (samples, (step, _)) in grid.source().samples(output)?.iter().zip(grid.source().spans()) {
+        let kept: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).step_by(every).collect();
+        speeds.extend(kept.windows(2).map(|w| (w[1] - w[0]) / (step * every as f64)));
+    }
+    Ok(root_mean_square(&speeds))
+}
+
+/// Largest root-mean-square force of one input of a body, in the unit of D^α y.
+fn largest_input_force(source: &Recordings, item: &Equation, values: &Values) -> Result<f64> {
+    let mut largest: f64 = 0.0;
+    for term in item.input_terms().filter(|term| !term.order.is_free() && term.order.constant == 0.0) {
+        let known: Vec<f64> = source.samples(term.signal)?.concat().into_iter().filter(|v| !v.is_nan()).collect();
+        largest = largest.max(value_of(term, values).abs() * root_mean_square(&known));
+    }
+    Ok(largest)
+}

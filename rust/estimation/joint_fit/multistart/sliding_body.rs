@@ -1,0 +1,205 @@
+//! Linear least squares for one body with friction, under sign constraints on the coefficients.
+
+use std::collections::BTreeMap;
+
+use crate::error::Result;
+use crate::estimation::joint_fit::structure::{Coefficient, Equation};
+use crate::fractional::kernels::{kernel, power_means};
+use crate::linalg::dense::triangular_factor;
+use crate::linalg::orthogonal::norm;
+use crate::linalg::small::nonnegative_solution;
+use crate::parallel::Stop;
+use crate::recording::Recording;
+use crate::regressors::Record;
+use crate::series;
+use crate::signal::statistics::white_noise_deviation;
+
+/// Span over which the velocity is measured, as a fraction of the run, and its smallest size in noise standard
+/// deviations.
+const VELOCITY_SPAN_FRACTION: f64 = 0.01;
+const VELOCITY_NOISE_RATIO: f64 = 5.0;
+/// Iterations in which the friction force at rest is recomputed from the input forces.
+const MAX_REST_ITERATIONS: usize = 4;
+
+/// One run: its pulse means, and the sign of the measured velocity, 0 at rest.
+struct Part {
+    record: Record,
+    sign: Vec<f64>,
+}
+
+/// Coefficients of one equation with friction and given orders, fitted to its integrals on all runs.
+///
+/// Own terms restore and friction dissipates; inputs may have any sign. The friction sign is that of the measured
+/// velocity where it exceeds the noise. Elsewhere the body rests and friction balances the input forces. Each run has
+/// its own level, velocity and constant. Empty if friction is known, or no finite solution exists.
+///
+/// # Errors
+/// As [`Recording::pulses`]; [`Error::Interrupted`](crate::error::Error::Interrupted).
+pub(super) fn fit_sliding_body(runs: &[Recording], item: &Equation, stop: &Stop) -> Result<BTreeMap<String, f64>> {
+    let Some((factor, Coefficient::Free(strength))) = item.friction.as_ref().map(|friction| &friction.coulomb) else {
+        return Ok(BTreeMap::new());
+    };
+    let alpha = item.order.constant;
+    if item.terms.is_empty() || item.terms.iter().any(|term| alpha < term.order.constant) {
+        return Ok(BTreeMap::new());
+    }
+    let mut parts = runs.iter().map(|run| Part::of(run, item.output)).collect::<Result<Vec<_>>>()?;
+    let rest: Vec<Vec<bool>> = parts.iter().map(|part| part.sign.iter().map(|v| *v == 0.0).collect()).collect();
+    let mut found = BTreeMap::new();
+    for _ in 0..MAX_REST_ITERATIONS {
+        stop.check()?;
+        found = signed_least_squares(item, &parts);
+        let Some(holds) = found.get(strength).map(|value| factor * value).filter(|holds| *holds > 0.0) else { break };
+        for (part, still) in parts.iter_mut().zip(&rest) {
+            let mut push = vec![0.0; part.sign.len()];
+            for term in item.input_terms().filter(|term| term.order.constant == 0.0) {
+                let free = || {
+                    term.coefficient.name().map_or(0.0, |name| term.factor * found.get(name).copied().unwrap_or(0.0))
+                };
+                let value = term.fixed_coefficient().unwrap_or_else(free);
+                push.iter_mut().zip(part.record.signal(term.signal)).for_each(|(p, v)| *p += value * v);
+            }
+            for ((sign, push), _) in part.sign.iter_mut().zip(push).zip(still).filter(|(_, still)| **still) {
+                *sign = (push / holds).clamp(-1.0, 1.0);
+            }
+        }
+    }
+    Ok(found)
+}
+
+impl Part {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    fn of(run: &Recording, output: usize) -> Result<Self> {
+        let m = run.len() - 1;
+        let record = run.pulses(m, false)?.into_record()?;
+        let known: Vec<f64> = run.channel(output)?.samples.iter().copied().filter(|v| !v.is_nan()).collect();
+        let least = VELOCITY_NOISE_RATIO * white_noise_deviation(&known);
+        let span = ((VELOCITY_SPAN_FRACTION * m as f64).round() as usize).max(1);
+        let means = record.signal(output);
+        let sign = (0..m).map(|i| {
+            let first = i.saturating_sub(span / 2).min(m - span - 1);
+            let moved = means[first + span] - means[first];
+            if moved.abs() > least {
+                moved.signum()
+            } else {
+                0.0
+            }
+        });
+        let sign = sign.collect();
+        Ok(Self { record, sign })
+    }
+}
+
+/// Least-squares solution with correct signs; empty if it is not finite.
+fn signed_least_squares(item: &Equation, parts: &[Part]) -> BTreeMap<String, f64> {
+    let (alpha, rows) = (item.order.constant, parts.iter().map(|part| part.sign.len()).sum());
+    let stacked = |of: &dyn Fn(&Part) -> Vec<f64>| parts.iter().flat_map(of).collect::<Vec<f64>>();
+    let mut target = stacked(&|part| part.record.signal(item.output).to_vec());
+    // Columns, each with the name of its coefficient. Columns of any sign occur with both.
+    let (mut names, mut columns) = (Vec::new(), Vec::new());
+    let mut add = |name: Option<&String>, sides: &[f64], column: &[f64]| {
+        for side in sides {
+            names.push((name.cloned(), *side));
+            columns.push(column.iter().map(|v| side * v).collect::<Vec<f64>>());
+        }
+    };
+    for term in &item.terms {
+        let column = stacked(&|part| part.record.integral(term.signal, alpha - term.order.constant));
+        match term.fixed_coefficient() {
+            Some(value) => target.iter_mut().zip(&column).for_each(|(t, c)| *t -= value * c),
+            // A coefficient times its factor is negative of an own term.
+            None if term.signal == item.output => {
+                let column: Vec<f64> = column.iter().map(|v| term.factor * v).collect();
+                add(term.coefficient.name(), &[-term.factor.signum()], &column);
+            }
+            None => {
+                let column: Vec<f64> = column.iter().map(|v| term.factor * v).collect();
+                add(term.coefficient.name(), &[1.0, -1.0], &column);
+            }
+        }
+    }
+    if let Some((factor, coefficient)) = item.friction.as_ref().map(|friction| &friction.coulomb) {
+        let force = |part: &Part| {
+            let m = part.sign.len();
+            let integral = series::multiply(&kernel(alpha, m, part.record.step()), &part.sign, m);
+            integral.into_iter().map(|v| -factor * v).collect()
+        };
+        add(coefficient.name(), &[1.0], &stacked(&force));
+    }
+    let mut first = 0;
+    for part in parts {
+        let m = part.sign.len();
+        for exponent in [0.0, 1.0, alpha] {
+            let mut column = vec![0.0; rows];
+            column[first..first + m].copy_from_slice(&power_means(exponent, m, part.record.step()));
+            add(None, &[1.0, -1.0], &column);
+        }
+        first += m;
+    }
+    let sizes: Vec<f64> = columns.iter().map(|column| norm(column)).collect();
+    if !sizes.iter().all(|size| size.is_finite()) {
+        return BTreeMap::new();
+    }
+    for (column, size) in columns.iter_mut().zip(&sizes).filter(|(_, size)| **size > 0.0) {
+        column.iter_mut().for_each(|v| *v /= size);
+    }
+    // Inner products are those of the triangular factor, which is small.
+    columns.push(target);
+    let (k, factor) = (columns.len(), triangular_factor(&columns));
+    let mut small: Vec<Vec<f64>> = (0..k).map(|j| (0..k).map(|i| factor[i * k + j]).collect()).collect();
+    let wanted = small.pop().unwrap_or_default();
+    let solved = nonnegative_solution(&small, &wanted);
+    let mut found = BTreeMap::new();
+    for (((name, side), size), x) in names.into_iter().zip(sizes).zip(solved) {
+        if let Some(name) = name {
+            *found.entry(name).or_insert(0.0) += if size > 0.0 { side * x / size } else { 0.0 };
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::equation;
+    use crate::estimation::joint_fit::structure::{FrictionParameters, Order, Term};
+    use crate::friction::{Body, FrictionLaw};
+    use crate::recording::{Channel, Role};
+    use crate::signal::block_pulse::Intersample;
+
+    #[test]
+    fn coefficients_of_a_sliding_body_are_found_with_their_signs() -> Result<()> {
+        // D² y = −2 D y + 3 u − 0.5 sgn(D y).
+        let (rows, step) = (801, 0.01);
+        let u: Vec<f64> = (0..rows).map(|k| if (k / 130) % 2 == 0 { 1.0 } else { -1.0 }).collect();
+        let terms = vec![equation::Term { signal: 0, order: 1.0 }, equation::Term { signal: 1, order: 0.0 }];
+        let linear = equation::Structure { output: 0, order: 2.0, terms };
+        let body = Body::single(equation::Equation::new(linear, vec![-2.0, 3.0])?, FrictionLaw::coulomb(0.5));
+        let record = Record::new(step, vec![vec![0.0; rows - 1], u[..rows - 1].to_vec()], None)?;
+        let means = body.run(&record, &[Vec::new()])?.outputs.remove(0);
+        let y: Vec<f64> = std::iter::once(0.0).chain(means.windows(2).map(|w| 0.5 * (w[0] + w[1]))).collect();
+        let y = [y.as_slice(), &means[rows - 2..]].concat();
+        let (y, u) = (Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold)));
+        let run = Recording::new("run", step, None, vec![y, u], vec![0])?;
+        let free = |name: &str| Coefficient::Free(name.into());
+        let term =
+            |signal, order, name| Term { signal, order: Order::number(order), coefficient: free(name), factor: 1.0 };
+        let item = Equation {
+            output: 0,
+            order: Order::number(2.0),
+            terms: vec![term(0, 1.0, "v"), term(1, 0.0, "b"), term(0, 0.0, "k")],
+            friction: Some(FrictionParameters {
+                coulomb: (1.0, free("fc")),
+                stribeck: (1.0, Coefficient::Known(0.0)),
+                speed: (1.0, Coefficient::Known(1.0)),
+            }),
+        };
+        let found = fit_sliding_body(&[run], &item, &Stop::default())?;
+        for (name, truth) in [("v", -2.0), ("b", 3.0), ("fc", 0.5)] {
+            assert!((found[name] / truth - 1.0).abs() < 0.1, "{name}: {found:?}");
+        }
+        // There is no spring, and one that does not restore is excluded.
+        assert!(found["k"] <= 0.0 && found["k"] > -0.2, "{found:?}");
+        Ok(())
+    }
+}

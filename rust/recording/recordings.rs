@@ -1,0 +1,168 @@
+//! Recordings of one structure, as source of a joint fit.
+
+use super::channel::{Channel, Role};
+use super::run::{Recording, Sampling};
+use crate::error::{check_length, check_memory, Error, Result};
+use crate::estimation::output_error::Experiment;
+use crate::regressors::Record;
+use crate::signal::block_pulse::Intersample;
+
+/// Recordings of one structure: the runs of a joint fit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recordings {
+    runs: Vec<Recording>,
+    memory: usize,
+}
+
+impl Recordings {
+    /// Recordings with the same signals.
+    ///
+    /// # Errors
+    /// [`Error::Length`] for other numbers of signals or free inputs, [`Error::Structure`] for other outputs.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
+    /// use ftlm::signal::block_pulse::Intersample;
+    /// let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// let u = Channel::new("u", vec![1.0, 2.0, 2.0, 2.0], Role::Input(Intersample::Hold));
+    /// let runs = Recordings::new(vec![Recording::new("run", 0.1, None, vec![y, u], vec![0])?])?;
+    /// let fine = runs.experiments(Sampling { pulses_per_sample: 2, ..Sampling::default() })?;
+    /// assert_eq!(fine[0].record.signal(1), [1.0, 1.0, 2.0, 2.0, 2.0, 2.0]);
+    /// # Ok(())
+    /// # }
+    /// ```
+    pub fn new(runs: Vec<Recording>) -> Result<Self> {
+        for pair in runs.windows(2) {
+            check_length("signals of a run", pair[0].channels().len(), pair[1].channels().len())?;
+            check_length("free numbers of inputs of a run", pair[0].free_inputs.len(), pair[1].free_inputs.len())?;
+            if pair[0].outputs() != pair[1].outputs() {
+                let what = format!("outputs {:?} of a run after {:?}", pair[1].outputs(), pair[0].outputs());
+                return Err(Error::Structure { what, remedy: "make both from one structure".into() });
+            }
+        }
+        Ok(Self { runs, memory: usize::MAX })
+    }
+
+    /// Recordings whose experiments may take so many bytes at once.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// # let runs = Recordings::new(vec![run])?;
+    /// assert!(runs.with_memory_limit(100).experiments(Sampling::default()).is_err());
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn with_memory_limit(self, bytes: usize) -> Self {
+        Self { memory: bytes, ..self }
+    }
+
+    /// The runs.
+    #[must_use]
+    pub fn runs(&self) -> &[Recording] {
+        &self.runs
+    }
+
+    /// Sampling interval and duration of each run \[s\].
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn spans(&self) -> Vec<(f64, f64)> {
+        self.runs.iter().map(|run| (run.step(), run.len() as f64 * run.step())).collect()
+    }
+
+    /// The runs on a grid.
+    ///
+    /// # Errors
+    /// [`Error::Memory`] for a grid above the memory limit; as [`Recording::experiment`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// # let runs = Recordings::new(vec![run])?;
+    /// assert_eq!(runs.experiments(Sampling::default())?[0].compared_count(), 2);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>> {
+        sampling.check()?;
+        let bytes: usize = self.runs.iter().map(|run| run.bytes(sampling)).fold(0, usize::saturating_add);
+        let names = || self.runs.iter().map(|run| format!("'{}'", run.name())).collect::<Vec<_>>().join(", ");
+        let every = sampling.pulses_per_sample;
+        check_memory(|| format!("grids of {every} pulses a sample of run {}", names()), bytes, self.memory)?;
+        self.runs.iter().map(|run| run.experiment(sampling)).collect()
+    }
+
+    /// Intersample behavior of the signals that are inputs, a hold if it is one in any run; None for other signals.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Recordings, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// # let runs = Recordings::new(vec![run])?;
+    /// assert_eq!(runs.inputs(), [None, Some(Intersample::Hold)]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn inputs(&self) -> Vec<Option<Intersample>> {
+        let held = |signal: usize| self.runs.iter().any(|run| run.channels()[signal].is_held_input());
+        let of = |(signal, channel): (usize, &Channel)| match channel.role {
+            Role::Input(_) if held(signal) => Some(Intersample::Hold),
+            Role::Input(_) => Some(Intersample::Linear),
+            _ => None,
+        };
+        self.runs.first().into_iter().flat_map(|run| run.channels().iter().enumerate()).map(of).collect()
+    }
+
+    /// Uniform samples of a signal by run; NaN for missing samples.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] for a signal that does not exist.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Recordings, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// # let runs = Recordings::new(vec![run])?;
+    /// assert_eq!(runs.samples(1)?, [[1.0, 2.0, 2.0, 3.0]]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn samples(&self, signal: usize) -> Result<Vec<&[f64]>> {
+        let of = |run| Recording::channel(run, signal).map(|channel| channel.samples.as_slice());
+        self.runs.iter().map(of).collect()
+    }
+
+    /// Records of the measured signals with `m` block pulses, all behind the sensor filter, at these values of the free
+    /// input parameters. Missing samples are interpolated.
+    ///
+    /// # Errors
+    /// As [`Recording::pulses`] and [`Recording::with_free_inputs`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Recordings, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// # let runs = Recordings::new(vec![run])?;
+    /// assert_eq!(runs.records(3, &[])?[0].signal(1), [1.0, 2.0, 2.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
+        let of = |run: &Recording| {
+            let mut known = run.with_free_inputs(inputs)?;
+            known.is_coupled = false;
+            known.pulses(m, true)?.into_record()
+        };
+        self.runs.iter().map(of).collect()
+    }
+}

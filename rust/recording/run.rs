@@ -1,0 +1,857 @@
+//! One run that is sampled on any grid: pulse means of its signals, and samples to compare a simulation with.
+
+use std::borrow::Cow;
+
+use super::channel::{Channel, Role};
+use super::sensor_filter::FilterStates;
+use crate::equation::Filter;
+use crate::error::{check_length, check_points, check_step, Error, Result};
+use crate::estimation::joint_fit::format::format_general;
+use crate::estimation::output_error::{Experiment, InputLaw, NonuniformSamples, PointValues};
+use crate::regressors::Record;
+use crate::series;
+use crate::signal::block_pulse::{
+    check_pulses, delay_samples, point_samples, pulse_means, Intersample, SampleInterpolation,
+};
+use crate::signal::nonuniform::{check_times, interpolate, interpolate_gaps, NonuniformSignal, TIME_TOLERANCE};
+
+/// Fewest samples of a recording.
+const MIN_SAMPLES: usize = 3;
+/// Smallest peak of a signal that is not zero. Squares of smaller signals underflow.
+pub(crate) const MIN_SIGNAL_PEAK: f64 = 1e-140;
+
+/// Sampling of the runs: step, decimation and length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Sampling {
+    /// Block pulses per sampling interval.
+    pub pulses_per_sample: usize,
+    /// Decimation factor of the samples.
+    pub decimation: usize,
+    /// Number of leading sampling intervals of each run to use; None for all.
+    pub leading_intervals: Option<usize>,
+}
+
+impl Sampling {
+    /// Check that pulses and decimation are positive and not excessive.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`].
+    ///
+    /// ```
+    /// # use ftlm::recording::Sampling;
+    /// assert!(Sampling::default().check().is_ok());
+    /// assert!(Sampling { decimation: 0, ..Sampling::default() }.check().is_err());
+    /// ```
+    pub fn check(self) -> Result<()> {
+        for (name, number) in
+            [("pulses a sample interval", self.pulses_per_sample), ("samples that become one", self.decimation)]
+        {
+            check_points(name, number)?;
+            if number == 0 {
+                let (value, range) = (0.0, "[1, ∞)".into());
+                return Err(Error::OutOfRange { name: name.into(), value, range, remedy: "give 1 or more".into() });
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Default for Sampling {
+    fn default() -> Self {
+        Self { pulses_per_sample: 1, decimation: 1, leading_intervals: None }
+    }
+}
+
+/// One run with what a structure says of its signals.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::recording::{Channel, Recording, Role};
+/// use ftlm::signal::block_pulse::Intersample;
+/// let y = Channel::new("y", vec![0.0, 1.0, f64::NAN, 9.0], Role::Output);
+/// let u = Channel { delay: Some(0.1), ..Channel::new("u", vec![1.0, 2.0, 3.0, 4.0], Role::Input(Intersample::Hold)) };
+/// let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+/// assert_eq!(run.pulses(3, false)?.means[1], [0.0, 1.0, 2.0]);
+/// assert_eq!(run.experiment(Default::default())?.sample_weights, [[1.0, 0.0]]);
+/// # Ok(())
+/// # }
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recording {
+    name: String,
+    step: f64,
+    times: Option<Vec<f64>>,
+    channels: Vec<Channel>,
+    outputs: Vec<usize>,
+    /// Sensor filter that some signals passed.
+    pub filter: Option<Filter>,
+    /// Number of initial states of the sensor filter that are unknown: 0 from rest.
+    pub filter_states: usize,
+    /// Whether all signals were zero before the first sample.
+    pub is_at_rest: bool,
+    /// Whether each equation is driven by the simulated other outputs, not by the measured ones.
+    pub is_coupled: bool,
+    /// Whether a body has friction, so that outputs are simulated before the filter.
+    pub has_friction: bool,
+    /// Signal and law of each delay, saturation and dead zone that is to be estimated.
+    pub free_inputs: Vec<(usize, InputLaw)>,
+}
+
+/// Pulse means of a recording.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pulses {
+    /// Pulse width \[s\].
+    pub step: f64,
+    /// Means of each signal.
+    pub means: Vec<Vec<f64>>,
+    /// Series of the sensor filter, if all signals have passed it.
+    pub filter: Option<Vec<f64>>,
+    /// Signals that may contain an initial transient of their sensor filter.
+    pub has_transient: Vec<bool>,
+    /// Initial level of each signal, to which derivatives of improper terms refer; 0 from rest.
+    pub initial_levels: Vec<f64>,
+    /// Means of the filter's responses to an impulse and its derivatives, as far as they are known.
+    pub impulse_responses: Vec<Vec<f64>>,
+}
+
+impl Pulses {
+    /// Record without initial state.
+    ///
+    /// # Errors
+    /// As [`Record::new`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(run.pulses(3, false)?.into_record()?.signal(1), [1.0, 2.0, 2.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn into_record(self) -> Result<Record> {
+        Record::new(self.step, self.means, self.filter)
+    }
+
+    /// Record with the filter transients and initial levels, if there are any.
+    ///
+    /// # Errors
+    /// As [`Record::new`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(run.pulses(3, false)?.into_record_with_initial_state()?.m(), 3);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn into_record_with_initial_state(mut self) -> Result<Record> {
+        let transient = std::mem::take(&mut self.has_transient);
+        let (levels, responses) =
+            (std::mem::take(&mut self.initial_levels), std::mem::take(&mut self.impulse_responses));
+        let begun = transient.contains(&true) || levels.iter().any(|v| *v != 0.0);
+        let record = self.into_record()?;
+        if begun {
+            record.with_initial_state(transient, &levels, responses)
+        } else {
+            Ok(record)
+        }
+    }
+}
+
+impl Recording {
+    /// Recording of signals with a uniform sampling interval, or uniform and nonuniform samples at these times \[s\].
+    ///
+    /// `outputs` are the signals that equations simulate, in the sequence of the equations.
+    ///
+    /// # Errors
+    /// [`Error::Length`] for unequal or too few samples; as [`Channel::check`]; times that do not ascend from 0.
+    pub fn new(
+        name: &str,
+        step: f64,
+        times: Option<Vec<f64>>,
+        channels: Vec<Channel>,
+        outputs: Vec<usize>,
+    ) -> Result<Self> {
+        check_step(step)?;
+        let rows = channels.first().map_or(0, |channel| channel.samples.len());
+        check_length("samples of a run", rows.max(MIN_SAMPLES), rows)?;
+        check_points("samples of a run", rows)?;
+        if let Some(times) = &times {
+            check_times(times)?;
+        }
+        for channel in &channels {
+            check_length(&format!("signal {}", channel.name), rows, channel.samples.len())?;
+            if channel.role != Role::Derived {
+                let (expected, found) = (times.as_ref().map(Vec::len), channel.nonuniform.as_ref().map(Vec::len));
+                check_length("samples at their own times", expected.unwrap_or(0), found.unwrap_or(0))?;
+            }
+            channel.check()?;
+        }
+        if let Some(output) = outputs.iter().find(|output| **output >= channels.len()) {
+            let what = format!("output {output} of {} signals", channels.len());
+            return Err(Error::Structure { what, remedy: "number them from 0".into() });
+        }
+        Ok(Self {
+            name: name.into(),
+            step,
+            times,
+            channels,
+            outputs,
+            filter: None,
+            filter_states: 0,
+            is_at_rest: true,
+            is_coupled: true,
+            has_friction: false,
+            free_inputs: Vec::new(),
+        })
+    }
+
+    /// Recording of other signals with the same sample times, sensor filter and initial state.
+    ///
+    /// # Errors
+    /// As [`Recording::new`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// let output = run.with_channels(run.channels()[..1].to_vec(), vec![0])?;
+    /// assert_eq!(output.channels().len(), 1);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn with_channels(&self, channels: Vec<Channel>, outputs: Vec<usize>) -> Result<Self> {
+        let new = Self::new(&self.name, self.step, self.times.clone(), channels, outputs)?;
+        Ok(Self {
+            filter: self.filter.clone(),
+            filter_states: self.filter_states,
+            is_at_rest: self.is_at_rest,
+            is_coupled: self.is_coupled,
+            has_friction: self.has_friction,
+            ..new
+        })
+    }
+
+    /// Name for messages.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Recording of uniform samples whose outputs are the channels of that role, in their sequence.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn from_channels(step: f64, channels: Vec<Channel>) -> Result<Self> {
+        let outputs = (0..channels.len()).filter(|&signal| channels[signal].role == Role::Output).collect();
+        Self::new("run", step, None, channels, outputs)
+    }
+
+    /// Signals of the recording.
+    #[must_use]
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    /// Signal by its number.
+    ///
+    /// # Errors
+    /// [`Error::Structure`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert!(run.channel(1)?.name == "u" && run.channel(2).is_err());
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn channel(&self, signal: usize) -> Result<&Channel> {
+        self.channels.get(signal).ok_or_else(|| Error::Structure {
+            what: format!("signal {signal} of {}", self.channels.len()),
+            remedy: "number them from 0".into(),
+        })
+    }
+
+    /// Signals that equations simulate.
+    #[must_use]
+    pub fn outputs(&self) -> &[usize] {
+        &self.outputs
+    }
+
+    /// Number of uniform samples.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.channels.first().map_or(0, |channel| channel.samples.len())
+    }
+
+    /// Whether the recording has no samples. None has.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Sampling interval \[s\].
+    #[must_use]
+    pub fn step(&self) -> f64 {
+        self.step
+    }
+
+    /// Time from the first uniform sample to the last \[s\].
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn duration(&self) -> f64 {
+        (self.len() - 1) as f64 * self.step
+    }
+
+    /// Recording with these values of the delays and limits that are to be estimated.
+    ///
+    /// # Errors
+    /// [`Error::Length`]; as [`Channel::check`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// use ftlm::estimation::output_error::InputLaw;
+    /// let mut run = run;
+    /// run.free_inputs = vec![(1, InputLaw::Delay)];
+    /// assert_eq!(run.with_free_inputs(&[0.1])?.pulse_means(1, 3)?, [0.0, 1.0, 2.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn with_free_inputs(&self, values: &[f64]) -> Result<Self> {
+        check_length("free numbers of inputs", self.free_inputs.len(), values.len())?;
+        let mut known = self.clone();
+        self.free_inputs.iter().try_for_each(|(signal, _)| self.channel(*signal).map(drop))?;
+        for (&(signal, law), &value) in self.free_inputs.iter().zip(values) {
+            let channel = &mut known.channels[signal];
+            if law == InputLaw::Delay {
+                channel.delay = Some(value);
+            }
+            for (_, limit) in channel.nonlinearities.iter_mut().filter(|(of, limit)| *of == law && limit.is_none()) {
+                *limit = Some(value);
+            }
+            channel.check()?;
+        }
+        known.free_inputs.clear();
+        Ok(known)
+    }
+
+    /// Recording of the leading samples.
+    ///
+    /// # Errors
+    /// [`Error::Recording`] for fewer than three samples.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(run.leading_part(3)?.len(), 3);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[allow(clippy::cast_precision_loss)]
+    pub fn leading_part(&self, rows: usize) -> Result<Cow<'_, Self>> {
+        if rows >= self.len() {
+            return Ok(Cow::Borrowed(self));
+        }
+        if rows < MIN_SAMPLES {
+            let what = format!("window: {rows} rows remain, {MIN_SAMPLES} are needed");
+            return Err(Error::Recording { what, remedy: "widen the limits".into() });
+        }
+        // The next sample after the last uniform one belongs to the line between both.
+        let end = (rows - 1) as f64 * self.step + self.step;
+        let nonuniform = self.times.as_ref().map_or(0, |times| times.partition_point(|time| *time <= end));
+        let of = |channel: &Channel| channel.leading_part(rows, nonuniform);
+        Ok(Cow::Owned(Self {
+            name: self.name.clone(),
+            times: self.times.as_ref().map(|times| times[..nonuniform].to_vec()),
+            channels: self.channels.iter().map(of).collect(),
+            outputs: self.outputs.clone(),
+            filter: self.filter.clone(),
+            free_inputs: self.free_inputs.clone(),
+            ..*self
+        }))
+    }
+
+    /// Whether the equations hold for filtered signals: if one that is measured, not simulated, enters them.
+    #[must_use]
+    pub fn is_all_filtered(&self) -> bool {
+        let simulated = |signal| (self.is_coupled || self.has_friction) && self.outputs.contains(&signal);
+        self.channels.iter().enumerate().any(|(signal, channel)| channel.is_filtered && !simulated(signal))
+    }
+
+    /// Whether the samples have times of their own.
+    #[must_use]
+    pub fn has_nonuniform_samples(&self) -> bool {
+        self.times.is_some()
+    }
+
+    /// Whether outputs are compared at nonuniform sample times.
+    fn compares_nonuniform_samples(&self) -> bool {
+        self.times.is_some() && self.free_inputs.is_empty() && !self.is_all_filtered()
+    }
+
+    /// States of the sensor filter if its transient is to be removed from a signal, which enters equations as measured.
+    fn removed_transient(&self, signal: usize) -> Option<FilterStates> {
+        let channel = &self.channels[signal];
+        let simulated = self.is_coupled && self.outputs.contains(&signal);
+        let commanded = channel.is_held_input() || (channel.delay.is_some() && channel.role != Role::Output);
+        let enters = channel.is_filtered && channel.enters_others && !simulated && !commanded;
+        if !enters || self.filter_states == 0 || channel.role == Role::Derived || !self.is_all_filtered() {
+            return None;
+        }
+        FilterStates::of(self.filter.as_ref()?).filter(|states| states.lasts(self.step))
+    }
+
+    /// Samples of a signal as they act: behind its limits, without the transient of its sensor filter.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// use ftlm::estimation::output_error::InputLaw;
+    /// let u = Channel { nonlinearities: vec![(InputLaw::Saturation, Some(1.5))], ..u };
+    /// let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(*run.acting_samples(1), [1.0, 1.5, 1.5, 1.5]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn acting_samples(&self, signal: usize) -> Cow<'_, [f64]> {
+        let channel = &self.channels[signal];
+        let limited = channel.behind_limits(&channel.samples);
+        match self.transient(signal, &limited) {
+            Some(transient) => limited.iter().zip(transient).map(|(v, held)| v - held).collect(),
+            None => limited,
+        }
+    }
+
+    /// Nonuniform samples of a signal as they act; the uniform ones if there are no others.
+    fn acting_nonuniform_samples(&self, signal: usize) -> Option<Cow<'_, [f64]>> {
+        let (channel, times) = (&self.channels[signal], self.times.as_ref()?);
+        let limited = channel.behind_limits(channel.nonuniform.as_ref()?);
+        let uniform = channel.behind_limits(&channel.samples);
+        let Some(transient) = self.transient(signal, &uniform) else { return Some(limited) };
+        let held: Vec<f64> = uniform.iter().zip(transient).map(|(v, held)| v - (v - held)).collect();
+        let grid = self.uniform_times();
+        Some(limited.iter().zip(times).map(|(v, &time)| v - interpolate(time, &grid, &held)).collect())
+    }
+
+    fn transient(&self, signal: usize, samples: &[f64]) -> Option<Vec<f64>> {
+        self.removed_transient(signal)?.transient(samples, self.step, self.filter_states)
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn uniform_times(&self) -> Vec<f64> {
+        (0..self.len()).map(|row| row as f64 * self.step).collect()
+    }
+
+    /// Value of a delayed signal before its first sample.
+    pub(crate) fn value_before(&self, samples: &[f64]) -> f64 {
+        if self.is_at_rest {
+            0.0
+        } else {
+            samples[0]
+        }
+    }
+
+    /// Means of a signal over `m` pulses, as it acts: exact integrals of what was recorded.
+    ///
+    /// # Errors
+    /// No pulse or too many, a sample that is not finite.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(run.pulse_means(1, 3)?, [1.0, 2.0, 2.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[allow(clippy::cast_precision_loss)]
+    pub fn pulse_means(&self, signal: usize, m: usize) -> Result<Vec<f64>> {
+        check_pulses(m)?;
+        let channel = &self.channels[signal];
+        let held = channel.intersample();
+        if channel.role == Role::Derived {
+            return pulse_means(&channel.samples, m, held);
+        }
+        if let (Some(times), Some(samples)) = (&self.times, self.acting_nonuniform_samples(signal))
+            && (channel.role != Role::Output || !channel.nonuniform.iter().flatten().any(|v| v.is_nan()))
+        {
+            let before = self.value_before(&self.acting_samples(signal));
+            let line = NonuniformSignal::new_unchecked(times, &samples, held);
+            return line.with_delay(channel.lag(), before).means(m, self.duration() / m as f64);
+        }
+        let acting = self.acting_samples(signal);
+        let mut samples = interpolate_gaps(&acting);
+        if channel.lag() != 0.0 {
+            let intervals = self.len() - 1;
+            // On a finer grid the delayed command switches within an interval, so it is held on that grid before the
+            // delay.
+            let every =
+                if held == Intersample::Hold && m.is_multiple_of(intervals) { (m / intervals).max(1) } else { 1 };
+            let before = self.value_before(&samples);
+            let repeated: Vec<f64> =
+                samples.iter().flat_map(|v| std::iter::repeat_n(*v, every)).take(intervals * every + 1).collect();
+            samples = delay_samples(&repeated, channel.lag() / self.step * every as f64, before)?.into();
+        }
+        pulse_means(&samples, m, held)
+    }
+
+    /// Pulse means of every signal as it acts on the equations.
+    ///
+    /// `filtered` passes signals that were not measured through the sensor filter through it: the equations then hold
+    /// for filtered signals.
+    ///
+    /// # Errors
+    /// As [`Recording::pulse_means`] and [`Filter::series`]; [`Error::Recording`] for a signal whose squares underflow.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(run.pulses(3, false)?.means[1], [1.0, 2.0, 2.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[allow(clippy::cast_precision_loss)]
+    pub fn pulses(&self, m: usize, filtered: bool) -> Result<Pulses> {
+        check_pulses(m)?;
+        let step = self.duration() / m as f64;
+        let filter = self.filter.as_ref().filter(|_| filtered);
+        let series = filter.map(|filter| filter.series(m, step)).transpose()?;
+        let mut means = Vec::with_capacity(self.channels.len());
+        for (signal, channel) in self.channels.iter().enumerate() {
+            let mut row = self.pulse_means(signal, m)?;
+            if let Some(series) = series.as_ref().filter(|_| !channel.is_filtered) {
+                row = series::multiply(series, &row, m);
+            }
+            let peak = row.iter().fold(0.0, |peak: f64, v| peak.max(v.abs()));
+            if 0.0 < peak && peak < MIN_SIGNAL_PEAK {
+                let what = format!(
+                    "signal '{}' of run '{}': no mean is larger than {}, and squares below {MIN_SIGNAL_PEAK:e} lose \
+                     their digits",
+                    channel.name,
+                    self.name,
+                    format_general(peak, 3),
+                );
+                return Err(Error::Recording { what, remedy: "scale the signal".into() });
+            }
+            means.push(row);
+        }
+        let impulse_responses = match filter.and_then(FilterStates::of) {
+            Some(states) => states.impulse_responses(self.filter_states, m, step)?,
+            None => Vec::new(),
+        };
+        let transient = self.filter_states > 0 && series.is_some();
+        Ok(Pulses {
+            step,
+            means,
+            filter: series,
+            has_transient: self.channels.iter().map(|channel| transient && channel.is_filtered).collect(),
+            initial_levels: (0..self.channels.len()).map(|signal| self.initial_level(signal)).collect(),
+            impulse_responses,
+        })
+    }
+
+    /// Initial level of a signal; 0 from rest, for filtered inputs, and for a missing first sample.
+    fn initial_level(&self, signal: usize) -> f64 {
+        let channel = &self.channels[signal];
+        if self.is_at_rest || channel.role == Role::Derived || (channel.is_filtered && self.is_all_filtered()) {
+            return 0.0;
+        }
+        let first = channel.behind_limits(&channel.samples[..1])[0];
+        if first.is_finite() {
+            first
+        } else {
+            0.0
+        }
+    }
+
+    /// The run on a grid, with the samples to compare a simulation with.
+    ///
+    /// Free delays and limits are left to the fit. Weights of outputs are 1; missing samples have weight 0.
+    ///
+    /// # Errors
+    /// As [`Recording::pulses`], [`Recording::leading_part`] and [`Experiment::check`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role, Sampling};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// let fine = run.experiment(Sampling { pulses_per_sample: 2, ..Sampling::default() })?;
+    /// assert_eq!(fine.record.m(), 6);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn experiment(&self, sampling: Sampling) -> Result<Experiment> {
+        sampling.check()?;
+        let Sampling { pulses_per_sample: every, decimation, leading_intervals } = sampling;
+        let run = match leading_intervals {
+            Some(intervals) => self.leading_part(intervals.saturating_add(1))?,
+            None => Cow::Borrowed(self),
+        };
+        let intervals = (run.len() - 1) / decimation;
+        let run = run.leading_part(intervals * decimation + 1)?;
+        let filtered = run.is_all_filtered();
+        let pulses = run.pulses(intervals.saturating_mul(every), filtered)?;
+        let (m, step) = (pulses.means[0].len(), pulses.step);
+        let filter = if filtered { None } else { run.filter.as_ref() };
+        let filter = filter.map(|filter| filter.series(m, step)).transpose()?;
+        let weights = vec![1.0; run.outputs.len()];
+        let nonuniform = run.compares_nonuniform_samples();
+        let (experiment, unread, point_values) = if nonuniform {
+            run.nonuniform_experiment(pulses, decimation, weights)?
+        } else {
+            let point_values = (0..run.channels.len())
+                .map(|signal| run.point_values(signal, &pulses, every, decimation))
+                .collect::<Result<_>>()?;
+            let samples = run.outputs.iter().map(|&output| run.compared_samples(output, &pulses, every, decimation));
+            let (samples, unread) = without_gaps(samples.collect());
+            let record = pulses.into_record_with_initial_state()?;
+            (Experiment::new(record, every, samples, weights)?, unread, point_values)
+        };
+        let experiment = match unread {
+            None => experiment,
+            Some(known) if nonuniform => experiment.with_sample_weights(known)?,
+            // The first and the last sample are not compared.
+            Some(known) => {
+                let inner = known.into_iter().map(|row| row[1..row.len() - 1].to_vec()).collect();
+                experiment.with_sample_weights(inner)?
+            }
+        };
+        let experiment = experiment.with_point_values(point_values)?;
+        match filter {
+            None => Ok(experiment),
+            Some(series) => {
+                let passed = run.outputs.iter().map(|&output| run.channels[output].is_filtered).collect();
+                experiment.with_filter(series, passed)
+            }
+        }
+    }
+
+    /// Samples of each output as recorded, at the times at which it is compared; NaN for missing ones.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(run.recorded_rows(), [[0.0, 1.0, 4.0, 9.0]]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn recorded_rows(&self) -> Vec<Vec<f64>> {
+        let outputs = self.outputs.iter().map(|&output| &self.channels[output]);
+        let Some(times) = self.times.as_ref().filter(|_| self.compares_nonuniform_samples()) else {
+            return outputs.map(|channel| channel.samples.clone()).collect();
+        };
+        let known = times.partition_point(|time| *time <= self.duration() * (1.0 + TIME_TOLERANCE));
+        outputs.map(|channel| channel.leading_part(0, known).nonuniform.unwrap_or_default()).collect()
+    }
+
+    /// Memory of an experiment \[bytes\]: pulse means and values of the signals, samples and weights of the outputs.
+    pub(super) fn bytes(&self, sampling: Sampling) -> usize {
+        let rows = self.len().min(sampling.leading_intervals.unwrap_or(usize::MAX)) / sampling.decimation;
+        let pulses = rows.saturating_mul(sampling.pulses_per_sample);
+        let signals = pulses.saturating_add(rows).saturating_mul(self.channels.len());
+        signals.saturating_add(2 * rows * self.outputs.len()).saturating_mul(size_of::<f64>())
+    }
+
+    /// All samples of each output to compare with, of a grid of `every` pulses per sampling interval; NaN for missing
+    /// samples.
+    ///
+    /// # Errors
+    /// As [`Recording::pulses`].
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert_eq!(run.compared_rows(1)?, [[0.0, 1.0, 4.0, 9.0]]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn compared_rows(&self, every: usize) -> Result<Vec<Vec<f64>>> {
+        let mut outputs = self.outputs.iter().map(|&output| &self.channels[output]);
+        let passed = !self.is_all_filtered() || outputs.all(|channel| channel.is_filtered);
+        if passed || self.compares_nonuniform_samples() {
+            return Ok(self.recorded_rows());
+        }
+        let pulses = self.pulses((self.len() - 1).saturating_mul(every), true)?;
+        Ok(self.outputs.iter().map(|&output| self.compared_samples(output, &pulses, every, 1)).collect())
+    }
+
+    /// Recording of so many rows from rest, with a single unit sample of a signal (signal, row), or none.
+    pub(crate) fn unit_recording(&self, rows: usize, sample: Option<(usize, usize)>) -> Self {
+        let of = |(signal, channel): (usize, &Channel)| {
+            let mut samples = vec![0.0; rows];
+            if let Some((_, row)) = sample.filter(|(of, _)| *of == signal) {
+                samples[row] = 1.0;
+            }
+            Channel { samples, ..channel.leading_part(0, 0) }
+        };
+        let mut channels: Vec<Channel> = self.channels.iter().enumerate().map(of).collect();
+        channels.iter_mut().for_each(|channel| {
+            channel.nonlinearities.clear();
+            channel.nonuniform = None;
+        });
+        Self {
+            name: self.name.clone(),
+            times: None,
+            channels,
+            outputs: self.outputs.clone(),
+            filter: self.filter.clone(),
+            filter_states: 0,
+            is_at_rest: true,
+            free_inputs: Vec::new(),
+            ..*self
+        }
+    }
+
+    /// Samples of an output to compare with; filtered if the equation is.
+    fn compared_samples(&self, output: usize, pulses: &Pulses, every: usize, decimation: usize) -> Vec<f64> {
+        let channel = &self.channels[output];
+        if pulses.filter.is_none() || channel.is_filtered {
+            return channel.samples.iter().copied().step_by(decimation).collect();
+        }
+        point_samples(&pulses.means[output]).into_iter().step_by(every).collect()
+    }
+
+    /// Values of a signal at the samples, after any jump there.
+    ///
+    /// None if the signal has no jump or slope discontinuity at the samples (behind a sensor filter, or computed from
+    /// other signals), and if it has missing samples.
+    fn point_values(&self, signal: usize, pulses: &Pulses, every: usize, decimation: usize) -> Result<PointValues> {
+        let channel = &self.channels[signal];
+        let smooth = pulses.filter.is_some() && !channel.is_filtered;
+        let read = channel.nonuniform.as_ref().unwrap_or(&channel.samples);
+        let missing = channel.role == Role::Output && read.iter().any(|v| v.is_nan());
+        if channel.role == Role::Derived || missing || smooth {
+            return Ok(PointValues::default());
+        }
+        let is_zero_order_hold = channel.is_held_input();
+        if channel.lag() != 0.0 && is_zero_order_hold {
+            // A command switches between samples after a delay: what it is then is the pulse that follows.
+            let mut values: Vec<f64> = pulses.means[signal].iter().copied().step_by(every).collect();
+            values.extend(values.last().copied());
+            return Ok(PointValues { values: Some(values), is_zero_order_hold });
+        }
+        let mut samples = self.acting_samples(signal);
+        if channel.lag() != 0.0 {
+            samples = delay_samples(&samples, channel.lag() / self.step, self.value_before(&samples))?.into();
+        }
+        Ok(PointValues { values: Some(samples.iter().copied().step_by(decimation).collect()), is_zero_order_hold })
+    }
+
+    /// Experiment at nonuniform sample times, known samples and point values. The first sample gives initial levels.
+    #[allow(clippy::cast_precision_loss, clippy::type_complexity)]
+    fn nonuniform_experiment(
+        &self,
+        pulses: Pulses,
+        decimation: usize,
+        weights: Vec<f64>,
+    ) -> Result<(Experiment, Option<Vec<Vec<f64>>>, Vec<PointValues>)> {
+        let times = self.times.as_deref().unwrap_or_default();
+        let last = self.duration() * (1.0 + TIME_TOLERANCE);
+        let kept: Vec<usize> =
+            (0..times.len()).filter(|&row| times[row] > 0.0 && times[row] <= last).step_by(decimation).collect();
+        let at: Vec<f64> = kept.iter().map(|&row| times[row]).collect();
+        let (m, step) = (pulses.means[0].len(), pulses.step);
+        let readings = SampleInterpolation::new(at.iter().map(|time| (time / step).min(m as f64)).collect(), m)?;
+        let of = |&output: &usize| {
+            let read = self.channels[output].nonuniform.as_deref().unwrap_or_default();
+            kept.iter().map(|&row| read[row]).collect()
+        };
+        let (samples, unread) = without_gaps(self.outputs.iter().map(of).collect());
+        let mut jumps = Vec::with_capacity(self.channels.len());
+        let mut point_values = Vec::with_capacity(self.channels.len());
+        for signal in 0..self.channels.len() {
+            jumps.push(self.jumps(signal).map(|(times, sizes)| {
+                let places: Vec<f64> = times.iter().map(|time| time / step).collect();
+                readings.jumps(&places, &sizes)
+            }));
+            // What was not read everywhere drives nothing.
+            let values = self.values_at(signal, &at).filter(|values| !values.iter().any(|v| v.is_nan()));
+            point_values.push(PointValues { values, is_zero_order_hold: false });
+        }
+        let record = pulses.into_record_with_initial_state()?;
+        let own = NonuniformSamples { readings, jumps };
+        Ok((Experiment::with_nonuniform_samples(record, samples, weights, own)?, unread, point_values))
+    }
+
+    /// Times \[s\] and sizes of the jumps of a held input after its delay; None for other signals.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert!(run.jumps(0).is_none() && run.jumps(1).is_some());
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn jumps(&self, signal: usize) -> Option<(Vec<f64>, Vec<f64>)> {
+        if !self.channels[signal].is_held_input() {
+            return None;
+        }
+        self.with_signal(signal, |line| line.jumps()).flatten()
+    }
+
+    /// Values of a signal just after given times \[s\]; None for a derived signal.
+    ///
+    /// ```
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
+    /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
+    /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
+    /// assert!(run.values_at(0, &[0.15]).is_some_and(|values| (values[0] - 2.5).abs() < 1e-12));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn values_at(&self, signal: usize, times: &[f64]) -> Option<Vec<f64>> {
+        self.with_signal(signal, |line| line.at(times))
+    }
+
+    /// Evaluate a signal after limits and delay, at its own times; None for a derived signal.
+    fn with_signal<T>(&self, signal: usize, of: impl FnOnce(NonuniformSignal<'_>) -> T) -> Option<T> {
+        let channel = &self.channels[signal];
+        if channel.role == Role::Derived {
+            return None;
+        }
+        let (times, read) = match (&self.times, &channel.nonuniform) {
+            (Some(times), Some(read)) => (Cow::Borrowed(times.as_slice()), read),
+            _ => (Cow::Owned(self.uniform_times()), &channel.samples),
+        };
+        let samples = channel.behind_limits(read);
+        let line = NonuniformSignal::new_unchecked(&times, &samples, channel.intersample());
+        Some(of(line.with_delay(channel.lag(), self.value_before(&samples))))
+    }
+}
+
+/// Samples with 0 in place of missing ones, and the weight of each sample; None if none is missing.
+fn without_gaps(samples: Vec<Vec<f64>>) -> (Vec<Vec<f64>>, Option<Vec<Vec<f64>>>) {
+    if !samples.iter().flatten().any(|v| v.is_nan()) {
+        return (samples, None);
+    }
+    let known = samples.iter().map(|row| row.iter().map(|v| f64::from(u8::from(!v.is_nan()))).collect()).collect();
+    let zeroed = |row: Vec<f64>| row.into_iter().map(|v| if v.is_nan() { 0.0 } else { v }).collect();
+    (samples.into_iter().map(zeroed).collect(), Some(known))
+}
