@@ -23,6 +23,9 @@ const FILTER_POLE_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
 const MAX_ERROR_RATIO: f64 = 1.2;
 const MAX_STEP_HALVINGS: usize = 4;
 
+/// Relative difference of coefficients below which two solutions are the same.
+const SAME_SOLUTION_TOLERANCE: f64 = 1e-4;
+
 /// Coefficient estimates of one equation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate {
@@ -99,34 +102,34 @@ pub fn fit(
     let clean: Vec<Record> = records.iter().map(Record::clean_record).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
     let problem = Problem::new(records, &clean, structures, (fixed, initial), &exponents)?;
-    let mut best: Option<RefinementResult> = None;
+    let mut ends: Vec<(Vec<Solution>, RefinementResult)> = Vec::new();
     let mut failure = None;
-    // Best refinement of all equations together. Whether the separate estimates are stable depends on the initial
-    // guess.
-    let mut together: Option<coupled::CoupledEstimate> = None;
     for ratio in FILTER_POLE_RATIOS {
         // An initial guess that fails does not affect the others.
-        match problem.start(ratio).and_then(|solutions| {
-            let ended = problem.iterate(solutions.clone(), settings)?;
-            Ok((solutions, ended))
-        }) {
-            Ok((start, ended)) => {
-                if structures.len() > 1 {
-                    for from in [&ended.solutions, &start] {
-                        let Some(found) = problem.refine_together(from, settings)? else { continue };
-                        if together.as_ref().is_none_or(|t| found.cost < t.cost) {
-                            together = Some(found);
-                        }
-                        break;
-                    }
-                }
-                if best.as_ref().is_none_or(|b| ended.error < b.error) {
-                    best = Some(ended);
-                }
-            }
+        match problem.start(ratio).and_then(|start| Ok((start.clone(), problem.iterate(start, settings)?))) {
+            Ok(end) => ends.push(end),
             Err(error) => failure = failure.or(Some(error)),
         }
     }
+    // Best refinement of all equations together. Whether the separate estimates are stable depends on the initial
+    // guess.
+    let mut together: Option<coupled::CoupledEstimate> = None;
+    let mut refined: Vec<&[Solution]> = Vec::new();
+    for (start, ended) in ends.iter().filter(|_| structures.len() > 1) {
+        // Most initial guesses end at the same estimates, which have one refinement.
+        if refined.iter().any(|known| problem.agree(known, &ended.solutions, SAME_SOLUTION_TOLERANCE)) {
+            continue;
+        }
+        refined.push(&ended.solutions);
+        for from in [&ended.solutions, start] {
+            let Some(found) = problem.refine_together(from, settings)? else { continue };
+            if together.as_ref().is_none_or(|t| found.cost < t.cost) {
+                together = Some(found);
+            }
+            break;
+        }
+    }
+    let best = ends.into_iter().map(|(_, ended)| ended).min_by(|a, b| a.error.total_cmp(&b.error));
     let Some(mut ended) = best else {
         return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
     };
@@ -252,13 +255,15 @@ impl<'a> Problem<'a> {
                 return Ok(RefinementResult { error, solutions, covariances, iterations, converged, damped });
             }
             iterations += 1;
-            converged = solutions
-                .iter()
-                .zip(&next)
-                .zip(self.structures)
-                .all(|((a, b), s)| has_converged(a, b, s.terms.len(), settings.tolerance));
+            converged = self.agree(&solutions, &next, settings.tolerance);
             solutions = next;
         }
+    }
+
+    /// True if the coefficients of two solutions agree within a relative tolerance.
+    fn agree(&self, before: &[Solution], after: &[Solution], tolerance: f64) -> bool {
+        let mut pairs = before.iter().zip(after).zip(self.structures);
+        pairs.all(|((a, b), s)| has_converged(a, b, s.terms.len(), tolerance))
     }
 
     /// Refine all equations together; None if they cannot be refined together.
