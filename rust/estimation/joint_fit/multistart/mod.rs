@@ -10,7 +10,7 @@ mod halving;
 mod nested_models;
 mod search;
 
-pub use coarse_grid::coarse_sampling;
+pub use coarse_grid::{coarse_sampling, leading_part};
 pub use halving::{competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors};
 pub use nested_models::{
     distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
