@@ -17,7 +17,7 @@ use crate::estimation::multi_innovation::{self as stepwise, Innovation, RowBasis
 use crate::estimation::output_error as joint;
 use crate::estimation::resonance_scan;
 use crate::estimation::streaming::{Streaming as StreamingFit, StreamingOptions};
-use crate::python::order_search::watch::{run_interruptible, Stop};
+use crate::python::order_search::watch::run_interruptible;
 use crate::regressors::Record;
 use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 

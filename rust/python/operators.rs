@@ -8,7 +8,6 @@ use super::errors::run_detached;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, Error};
 use crate::fractional::integral::{self, Derivative, IntegralRule};
-use crate::fractional::kernels;
 use crate::fractional::operational_matrices;
 use crate::linalg::dense;
 use crate::python::order_search::watch::run_interruptible;
@@ -20,9 +19,6 @@ type Matrix<'py> = Bound<'py, PyArray2<f64>>;
 
 fn choice(name: &str, given: &str, known: &str) -> Error {
     Error::Structure { what: format!("{name} '{given}' is not known"), remedy: format!("use one of {known}") }
-}
-
-#[pyfunction]
 }
 
 #[pyfunction]

@@ -107,7 +107,7 @@ impl Channel {
     }
 
     /// Delay \[s\].
-    pub(super) fn lag(&self) -> f64 {
+    pub(crate) fn lag(&self) -> f64 {
         self.delay.unwrap_or(0.0)
     }
 

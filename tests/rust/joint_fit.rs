@@ -4,7 +4,7 @@ use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::joint_fit::covariance::long_run_covariance;
 use ftlm::estimation::joint_fit::{
-    best_alternative, fit_reweighted, refine_step, Iterate, Loss, Objective, Optimum, Problem, Weights,
+    best_alternative, correct_step, fit_reweighted, refine_step, Iterate, Loss, Objective, Optimum, Problem, Weights,
 };
 use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
 use ftlm::parallel::Stop;
@@ -145,6 +145,42 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
         let sums = long_run_covariance(&[inner(&inputs), inner(&outputs)], &series).unwrap();
         close(&format!("{name}: sums"), &sums, &table(&case["sums"]).concat(), 1e-7);
     }
+}
+
+#[test]
+fn the_correction_of_a_long_record_for_its_step_ends_where_finer_grids_do() {
+    let (step, decay, rows) = (0.05, (-0.1_f64).exp(), 33_000);
+    let mut random = Random::new(3);
+    let u = random.steps(rows, 15);
+    let mut state = 0.0;
+    let y: Vec<f64> = (u.iter().zip(random.signal(rows)))
+        .map(|(u, noise)| {
+            let here = state;
+            state = decay * state + (1.0 - decay) * u;
+            here + 0.01 * noise
+        })
+        .collect();
+    let none = || order(0.0, &[0.0]);
+    let terms = vec![(0, none(), alone(0)), (1, none(), alone(1))];
+    let equation = FreeEquation { output: 0, order: order(0.0, &[1.0]), terms };
+    let problem = problem(equation, &[(0.05, 3.0)], 2, Initial::Rest);
+    let (source, stop) = (sampled(step, &[y], &[u]), Stop::default());
+    let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
+    let (best, grid) = fit_reweighted(&place(&[1.1], &[-2.2, 2.2]), grid, Loss::Squares).unwrap();
+    let corrected = correct_step(&best, &grid, Loss::Squares).unwrap().unwrap().into_statistics();
+    let refined = refine_step(best.clone(), grid, Loss::Squares, &[]).unwrap().into_statistics();
+    assert!(corrected.step_converged && corrected.pulses_per_sample == 1 && refined.pulses_per_sample > 1);
+    assert_eq!(corrected.attempt.values(), best.values());
+    // On the grid itself the order is off by far more than its error.
+    assert!((best.values()[0] - 1.0).abs() > 4.0 * corrected.covariance[0].sqrt(), "{:?}", best.values());
+    for (k, truth) in [1.0, -2.0, 2.0].into_iter().enumerate() {
+        let error = corrected.covariance[k * 4].sqrt();
+        let (found, expected) = (corrected.estimate[k], refined.estimate[k]);
+        assert!((found - expected).abs() < 0.15 * error, "{found} and {expected} ± {error}");
+        assert!((found - truth).abs() < 4.0 * error, "{found} ± {error}");
+        assert!((error / refined.covariance[k * 4].sqrt() - 1.0).abs() < 0.02);
+    }
+    close("noise", &corrected.noise, &refined.noise, 1e-3);
 }
 
 /// y′ = −2 y + 2 u with a little noise, in exact steps, and D y = −a y + b u, whatever the run starts from.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::initial_guesses::OrderGrids;
 use super::multistart::{
-    run_friction_multistart, run_multistart, select_survivors, InitialGuessSource, MultistartContext,
+    leading_part, run_friction_multistart, run_multistart, select_survivors, InitialGuessSource, MultistartContext,
 };
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::ParameterSet;
@@ -12,7 +12,7 @@ use super::problem::{Candidate, Iterate, OptimizationResult};
 use super::progress::{FitProgress, ProgressListener};
 use super::reweighting::{fit_reweighted, Loss, EVALUATIONS_PER_REWEIGHTING};
 use super::stability_preference::{prefer_stable, StabilityComparison};
-use super::step_refinement::{refine_step, Optimum, OptimumStatistics};
+use super::step_refinement::{correct_step, refine_step, Optimum, OptimumStatistics};
 use super::structure::{Equation, Structure};
 use crate::equation::Initial;
 use crate::error::{Error, Result};
@@ -30,8 +30,10 @@ const COARSE_RESIDUAL_RATIO: f64 = 0.01;
 /// Smallest noise standard deviation of an output relative to its standard deviation; smallest one of a warm start.
 const MIN_NOISE_RATIO: f64 = 1e-3;
 const MIN_NOISE_DEVIATION: f64 = 1e-300;
-/// Maximum evaluations of each survivor on all samples.
+/// Maximum evaluations of each survivor on all samples, or on the first part of a long record.
 const MAX_FINAL_EVALUATIONS: usize = 60;
+/// Number of intervals of the first part of long records, on which the best survivor is selected.
+const SELECTION_INTERVALS: usize = 6000;
 
 /// Standard deviation of an output, and an initial guess of its noise standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -143,8 +145,7 @@ pub struct FitProblem<'a> {
 }
 
 impl<'a> FitProblem<'a> {
-    fn grid(&self, outputs: Vec<f64>, every: usize) -> Result<Objective<'a>> {
-        let sampling = Sampling { pulses_per_sample: every, ..Sampling::default() };
+    fn grid(&self, outputs: Vec<f64>, sampling: Sampling) -> Result<Objective<'a>> {
         let weights = Weights { outputs, robust_weights: None };
         let source: &'a Recordings = self.source;
         Objective::new((&self.free.problem, source, self.stop), weights, sampling, false)
@@ -156,8 +157,8 @@ impl<'a> FitProblem<'a> {
     ///
     /// # Errors
     /// As the source.
-    pub fn equally_weighted_grid(&self, every: usize) -> Result<Objective<'a>> {
-        self.grid(self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect(), every)
+    pub fn equally_weighted_grid(&self, sampling: Sampling) -> Result<Objective<'a>> {
+        self.grid(self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect(), sampling)
     }
 
     /// Run the multistart; return its candidates, best first.
@@ -276,7 +277,9 @@ pub fn fit(
     let (reached, contenders) = match outset {
         Initialization::WarmStart { values, noise, pulses_per_sample: every, candidates: raced } => {
             let start = sought.start(&values, GIVEN_START_ORIGIN)?;
-            let grid = sought.grid(noise.iter().map(|noise| 1.0 / noise.max(MIN_NOISE_DEVIATION)).collect(), every)?;
+            let sampling = Sampling { pulses_per_sample: every, ..Sampling::default() };
+            let grid =
+                sought.grid(noise.iter().map(|noise| 1.0 / noise.max(MIN_NOISE_DEVIATION)).collect(), sampling)?;
             let (best, grid) = reweight_candidate(&start, grid, settings.loss)?;
             return finish_fit(free, best, grid, raced, settings).map(Some);
         }
@@ -293,7 +296,7 @@ pub fn fit(
     };
     let Some(first) = contenders.first() else { return Ok(None) };
     pace.advance_to(MULTISTART_PROGRESS_SHARE)?;
-    let mut grid = sought.grid(sought.sizes.iter().map(|size| 1.0 / size.noise).collect(), 1)?;
+    let mut grid = sought.grid(sought.sizes.iter().map(|size| 1.0 / size.noise).collect(), Sampling::default())?;
     // If a response is faster than the sampling interval, a grid of that step has a spurious optimum.
     while grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && !grid.is_exact(&first.result.iterate) {
         let finer = grid.finer()?;
@@ -302,8 +305,7 @@ pub fn fit(
         }
         grid = finer;
     }
-    let mut best =
-        select_best_candidate(free, &contenders, &sought.equally_weighted_grid(grid.sampling.pulses_per_sample)?)?;
+    let mut best = select_on_part(sought, &contenders, grid.sampling)?;
     if sought.sizes.len() > 1 {
         // With a single output the noise level does not move the optimum.
         let place = &best.result.iterate;
@@ -336,11 +338,13 @@ fn finish_fit(
     if growth.is_some_and(|growth| !growth.keeps_unstable) {
         (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
     }
-    let optimum = if settings.refine && !grid.is_exact(&best.result.iterate) {
+    let optimum = if !settings.refine || grid.is_exact(&best.result.iterate) {
+        Optimum::without_refinement(best.result, grid)?
+    } else if let Some(corrected) = correct_step(&best.result, &grid, settings.loss)? {
+        corrected
+    } else {
         let others: Vec<Iterate> = select_survivors(&reached).into_iter().map(|runner| runner.result.iterate).collect();
         refine_step(best.result, grid, settings.loss, &others)?
-    } else {
-        Optimum::without_refinement(best.result, grid)?
     };
     Ok(JointFit { finished: optimum.into_statistics(), reached, growth })
 }
@@ -351,7 +355,25 @@ fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -
     Ok((runner.with_result(attempt), grid))
 }
 
-/// Best survivor on all samples, with equal weights of all outputs.
+/// Best survivor on all samples; of long records the best one on their first part continues alone.
+fn select_on_part(sought: FitProblem<'_>, contenders: &[Candidate], sampling: Sampling) -> Result<Candidate> {
+    let whole = sought.equally_weighted_grid(sampling)?;
+    if let Some(intervals) = leading_part(sought.free, sought.source, SELECTION_INTERVALS)? {
+        let part = sought.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling })?;
+        let found = select_best_candidate(sought.free, contenders, &part).and_then(|best| {
+            let place = &best.result.iterate;
+            let problem = sought.free.problem_at(place, true, &[]);
+            Ok(best.with_result(whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?))
+        });
+        // The simulation may be finite on the first part only.
+        if !matches!(&found, Err(error) if *error != Error::Interrupted) {
+            return found;
+        }
+    }
+    select_best_candidate(sought.free, contenders, &whole)
+}
+
+/// Best survivor on a grid, with equal weights of all outputs.
 fn select_best_candidate(free: &ParameterSet, contenders: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
     let mut ends = Vec::new();
     let mut last = None;

@@ -29,4 +29,4 @@ pub use parameter_set::TimeScaling;
 pub use problem::{Candidate, Iterate, OptimizationResult, Problem};
 pub use reweighting::{fit_reweighted, Loss, RobustSummary};
 pub use stability_preference::StabilityComparison;
-pub use step_refinement::{best_alternative, refine_step, Optimum, OptimumStatistics};
+pub use step_refinement::{best_alternative, correct_step, refine_step, Optimum, OptimumStatistics};

@@ -13,7 +13,7 @@ use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 /// Relative cost decrease predicted for a full step below which an optimization has converged.
 pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
 /// Largest acceptable discretization error, in standard deviations of the noise.
-const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
+pub(super) const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
 /// Finest grid, in block pulses per sampling interval.
 pub const MAX_PULSES_PER_SAMPLE: usize = 16;
 
@@ -92,6 +92,16 @@ impl<'a> Objective<'a> {
             *experiment = experiment.clone().with_weights(&weights.outputs, shares)?;
         }
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
+    }
+
+    /// Objective with shifts of the residuals of all samples, by run and output, in units of the outputs.
+    #[must_use]
+    pub fn with_residual_shifts(&self, shifts: &[Vec<Vec<f64>>]) -> Self {
+        let mut experiments = Vec::clone(&self.experiments);
+        for (experiment, shifts) in experiments.iter_mut().zip(shifts) {
+            experiment.shift_samples(shifts);
+        }
+        Self { experiments: Arc::new(experiments), ..self.clone() }
     }
 
     /// Objective on half the step.

@@ -1,7 +1,7 @@
 //! Step refinement: the step is halved until the estimate changes by a small part of its standard error.
 
 use super::covariance::covariance;
-use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
+use super::objective::{Objective, Weights, MAX_DISCRETIZATION_NOISE_RATIO, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::TimeScaling;
 use super::problem::{Iterate, OptimizationResult};
 use super::reweighting::{fit_reweighted, Loss, RobustSummary};
@@ -13,6 +13,9 @@ use crate::signal::statistics::inner;
 const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
 /// Increase of the log residuals by halving the step above which other survivors are tried on the finer grid.
 const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
+
+/// Fewest block pulses of a grid whose optimum is corrected for its step without optimizations on finer grids.
+const MIN_CORRECTED_PULSES: usize = 1 << 15;
 
 /// Optimum on the finest grid, and its extrapolation to zero step.
 #[derive(Clone)]
@@ -95,24 +98,91 @@ pub fn refine_step<'a>(
         std::mem::swap(&mut grid, &mut fine);
         let (there, here) = (finer.values(), best.values());
         let found = covariance(&finer, &grid)?;
-        let errors = clock.standard_errors(&there, &found);
         // The scheme is of second order: Richardson extrapolation of two grids gives the limit, a third grid confirms
         // it. Optimizations that did not converge cannot be extrapolated.
         let mut limit = there.clone();
         if finer.has_converged() && best.has_converged() {
             limit = extrapolate(&grid, &clock, &there, &here, 3.0)?;
         }
-        let moved = |one: &[f64], other: &[f64]| {
-            let ways = clock.to_scaled(one).into_iter().zip(clock.to_scaled(other));
-            ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
-        };
-        still = moved(&limit, &estimate) || moved(&there, &here);
+        still = is_within_errors(&clock, &limit, &estimate, (&there, &found))
+            || is_within_errors(&clock, &there, &here, (&there, &found));
         estimate = limit;
         (before, best, spread) = (Some(best), finer, Some(found));
     }
     let spread = spread.map_or_else(|| covariance(&best, &grid), Ok)?;
     let estimate = select_limit_or_optimum(&best, &grid, estimate, &clock, still)?;
     Ok(Optimum { attempt: best, grid, estimate, step_converged: still, covariance: spread })
+}
+
+/// Optimum of a long record at the limit for zero step, by deferred correction; None if a finer grid is needed for it.
+///
+/// The residuals of two finer grids at the optimum, extrapolated to zero step, replace those of the grid: the difference
+/// depends on the parameters only slightly, so that it is added to the samples and the grid is fitted again (Stetter,
+/// doi:10.1007/BF01432879). The finer grids are simulated once each, without derivatives.
+///
+/// # Errors
+/// As [`covariance`] and the source; [`Error::Interrupted`].
+pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: Loss) -> Result<Option<Optimum<'a>>> {
+    let pulses: usize = grid.experiments().iter().map(|experiment| experiment.record.m()).sum();
+    if pulses < MIN_CORRECTED_PULSES || !best.has_converged() {
+        return Ok(None);
+    }
+    let clock = grid.time_scaling();
+    let (mut place, mut here, mut coarse) = (best.clone(), grid.clone(), grid.clone());
+    while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+        let fine = coarse.finer()?;
+        let Some(shifts) = limit_shifts(&place.iterate, grid, &coarse, &fine)? else { return Ok(None) };
+        let corrected = grid.with_weights(here.weights.clone())?.with_residual_shifts(&shifts);
+        let (next, next_grid) = match fit_reweighted(&place.iterate, corrected, loss) {
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            Ok(found) if found.0.has_converged() => found,
+            _ => return Ok(None),
+        };
+        let spread = covariance(&next, &next_grid)?;
+        if is_within_errors(&clock, &next.values(), &place.values(), (&next.values(), &spread)) {
+            let estimate = next.values();
+            let attempt = OptimizationResult { iterate: best.iterate.clone(), ..next };
+            let grid = next_grid;
+            return Ok(Some(Optimum { attempt, grid, estimate, step_converged: true, covariance: spread }));
+        }
+        (place, here, coarse) = (next, next_grid, fine);
+    }
+    Ok(None)
+}
+
+/// Differences of the residuals at the limit for zero step from those of a grid, by run and output, in units of the
+/// outputs; None where they are large relative to the noise or a simulation is not finite.
+fn limit_shifts(
+    place: &Iterate,
+    grid: &Objective<'_>,
+    coarse: &Objective<'_>,
+    fine: &Objective<'_>,
+) -> Result<Option<Vec<Vec<Vec<f64>>>>> {
+    let mut shifts: Vec<Vec<Vec<f64>>> = Vec::new();
+    let (mut power, mut noise) = (0.0, 0.0);
+    // The scheme is of second order.
+    for (objective, share) in [(fine, 4.0 / 3.0), (coarse, -1.0 / 3.0), (grid, -1.0)] {
+        let Some(found) = objective.evaluate(place)? else { return Ok(None) };
+        let residuals = objective.residuals(&found);
+        if shifts.is_empty() {
+            shifts = residuals.iter().map(|run| run.iter().map(|e| vec![0.0; e.len()]).collect()).collect();
+        }
+        for (shifts, run) in shifts.iter_mut().zip(&residuals) {
+            for ((shifts, residuals), weight) in shifts.iter_mut().zip(run).zip(&objective.weights.outputs) {
+                shifts.iter_mut().zip(residuals).for_each(|(sum, e)| *sum += share * e / weight);
+                noise = if share > 0.0 { noise + finite_squares(residuals, 1.0) } else { noise };
+            }
+        }
+    }
+    for run in &shifts {
+        power += run.iter().zip(&grid.weights.outputs).map(|(s, weight)| finite_squares(s, *weight)).sum::<f64>();
+    }
+    Ok((power <= MAX_DISCRETIZATION_NOISE_RATIO * MAX_DISCRETIZATION_NOISE_RATIO * noise).then_some(shifts))
+}
+
+/// Sum of the squares of the finite values times a weight.
+fn finite_squares(values: &[f64], weight: f64) -> f64 {
+    values.iter().map(|v| v * weight).filter(|v| v.is_finite()).map(|v| v * v).sum()
 }
 
 impl<'a> Optimum<'a> {
@@ -144,6 +214,13 @@ impl<'a> Optimum<'a> {
             covariance,
         }
     }
+}
+
+/// True if two estimates differ by a small part of the standard errors at an optimum with a covariance.
+fn is_within_errors(clock: &TimeScaling, one: &[f64], other: &[f64], (at, spread): (&[f64], &[f64])) -> bool {
+    let ways = clock.to_scaled(one).into_iter().zip(clock.to_scaled(other));
+    let errors = clock.standard_errors(at, spread);
+    ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
 }
 
 /// Extrapolate two grids beyond the finer one, by the difference divided by `share`.

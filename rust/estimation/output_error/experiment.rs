@@ -230,6 +230,15 @@ impl Experiment {
         &values[first..first + self.compared_count()]
     }
 
+    /// Shift the compared samples of each output; values that are not finite do not count.
+    pub(crate) fn shift_samples(&mut self, shifts: &[Vec<f64>]) {
+        let first = usize::from(self.nonuniform.is_none());
+        for (samples, shifts) in self.samples.iter_mut().zip(shifts) {
+            let pairs = samples[first..].iter_mut().zip(shifts).filter(|(_, shift)| shift.is_finite());
+            pairs.for_each(|(sample, shift)| *sample += shift);
+        }
+    }
+
     /// Weights of the compared samples of an output.
     pub(crate) fn weights_of(&self, output: usize) -> impl Iterator<Item = f64> + '_ {
         let (weight, shares) = (self.weights[output], self.sample_weights.get(output));

@@ -93,10 +93,11 @@ pub(super) fn choose_coarse_grid<'a>(
 const MAX_COARSE_SAMPLES: usize = 1200;
 const MIN_RUN_SAMPLES: usize = 400;
 /// Largest decimation without a check of the bandwidth. Above it, half a period of the frequency that contains 90 % of
-/// the power needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]. The first part of a record can represent it if its outputs
-/// have at least [`MIN_DEVIATION_RATIO`] of the standard deviation of the whole.
+/// the power needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]: with fewer, the grid is refined to the samples again. The
+/// first part of a record can represent it if its outputs have at least [`MIN_DEVIATION_RATIO`] of the standard
+/// deviation of the whole.
 const MAX_UNCHECKED_DECIMATION: usize = 10;
-const MIN_SAMPLES_PER_HALF_PERIOD: f64 = 1.0;
+const MIN_SAMPLES_PER_HALF_PERIOD: f64 = 6.0;
 const MIN_DEVIATION_RATIO: f64 = 0.7;
 
 /// Sampling of the runs for the multistart.
@@ -110,8 +111,7 @@ const MIN_DEVIATION_RATIO: f64 = 0.7;
 pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampling> {
     let spans = source.spans();
     let each = (MAX_COARSE_SAMPLES / spans.len().max(1)).max(MIN_RUN_SAMPLES);
-    let outputs = free.structure.equations.iter().map(|equation| source.samples(equation.output));
-    let outputs = outputs.collect::<Result<Vec<_>>>()?;
+    let outputs = output_samples(free, source)?;
     let shortest = outputs.iter().flatten().map(|samples| samples.len().saturating_sub(1)).min().unwrap_or(0);
     let decimation = ((shortest as f64 / each as f64).round_ties_even() as usize).max(1);
     let all = Sampling { decimation, ..Sampling::default() };
@@ -123,20 +123,35 @@ pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampl
         pairs.map(|(samples, &(step, _))| power_frequency(samples, step) * step).fold(f64::NEG_INFINITY, f64::max)
     };
     let fastest = outputs.iter().map(turns).fold(f64::NEG_INFINITY, f64::max);
-    let carried =
-        MAX_UNCHECKED_DECIMATION.max((std::f64::consts::PI / (MIN_SAMPLES_PER_HALF_PERIOD * fastest)) as usize);
-    if carried >= decimation {
-        return Ok(all);
-    }
+    let carried = ((std::f64::consts::PI / (MIN_SAMPLES_PER_HALF_PERIOD * fastest)) as usize).max(1);
     let first = each * carried;
-    let as_lively = |samples: &&[f64]| {
-        standard_deviation(&samples[..=first.min(samples.len() - 1)])
-            >= MIN_DEVIATION_RATIO * standard_deviation(samples)
-    };
-    if !outputs.iter().flatten().all(as_lively) {
+    if carried >= decimation || !varies_like_whole(&outputs, first) {
         return Ok(all);
     }
     Ok(Sampling { decimation: carried, leading_intervals: Some(first), ..all })
+}
+
+/// Leading intervals of each run that represent long records at `count` intervals in all; None for short records.
+///
+/// # Errors
+/// If an output of the structure is no signal of the runs.
+pub fn leading_part(free: &ParameterSet, source: &Recordings, count: usize) -> Result<Option<usize>> {
+    let (outputs, each) = (output_samples(free, source)?, (count / source.spans().len().max(1)).max(MIN_RUN_SAMPLES));
+    let is_long = outputs.iter().flatten().all(|samples| samples.len() > 2 * each);
+    Ok((is_long && varies_like_whole(&outputs, each)).then_some(each))
+}
+
+/// Samples of the outputs of all equations, by run.
+fn output_samples<'a>(free: &ParameterSet, source: &'a Recordings) -> Result<Vec<Vec<&'a [f64]>>> {
+    free.structure.equations.iter().map(|equation| source.samples(equation.output)).collect()
+}
+
+/// True if the outputs vary in the first intervals like in the whole record.
+fn varies_like_whole(outputs: &[Vec<&[f64]>], first: usize) -> bool {
+    outputs.iter().flatten().all(|samples| {
+        standard_deviation(&samples[..=first.min(samples.len() - 1)])
+            >= MIN_DEVIATION_RATIO * standard_deviation(samples)
+    })
 }
 
 /// Standard deviation of the present samples.
