@@ -25,8 +25,7 @@ mod _core {
     #[pymodule_export]
     use crate::python::operators::{
         block_pulse_matrix, delay_samples, filter_series, fractional_derivative, fractional_integral, haar_inverse,
-        haar_matrix, haar_transform, operational_matrix, point_samples,
-        series_divide, series_multiply,
+        haar_matrix, haar_transform, operational_matrix, point_samples, series_divide, series_multiply,
     };
 
     #[pymodule_export]

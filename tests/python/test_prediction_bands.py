@@ -5,7 +5,7 @@ import pytest
 
 import ftlm
 from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
-from ftlm.report.prediction_bands import prediction_bands
+from ftlm.plot.comparison_charts import prediction_bands
 
 
 def run(seed, samples=300):

@@ -386,7 +386,17 @@ def test_commands_speak_of_their_options(saved, tmp_path):
 #: Flags that belong to the command line alone: where results go, how they are shown, what is done around a call.
 COMMAND_LINE_FLAGS = {
     *("json", "verbose", "force", "out", "report", "help", "validation", "min-fit", "only", "detrend"),
-    *("plot", "trajectory", "save", "filtered-signals", "no-filtered", "not-negated", "no-browser", "kind"),
+    *(
+        "plot",
+        "trajectory",
+        "save",
+        "write-columns",
+        "filtered-signals",
+        "no-filtered",
+        "not-negated",
+        "no-browser",
+        "kind",
+    ),
 }
 
 

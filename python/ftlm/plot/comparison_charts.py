@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
+from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
 from ftlm.data.run import Run
-from ftlm.errors import DataError
+from ftlm.errors import DataError, FtlmError
+from ftlm.model.model import Model
 from ftlm.svg.bar_chart import bar_chart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
+from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, short_repr, whole_number
-from ftlm.validation.comparison import Comparison
+from ftlm.validation.comparison import Comparison, compare
 from ftlm.validation.residual_tests import CorrelationTest, Residuals
+
+#: Lower and upper end of a band.
+Band: TypeAlias = tuple[Floats, Floats]
+#: Step of the numerical derivatives in standard errors: small beside the curvature, large beside the tolerance of runs.
+DERIVATIVE_STEP_IN_ERRORS = 0.1
 
 
 def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
@@ -32,7 +41,7 @@ def comparison_charts(
     units: Mapping[str, str] | None = None,
     label: str = "",
     points: int = MAX_LINE_POINTS,
-    bands: Mapping[str, tuple[Floats, Floats]] | None = None,
+    bands: Mapping[str, Band] | None = None,
 ) -> list[Figure]:
     """Chart measured and simulated output, for every output of every run.
 
@@ -68,7 +77,7 @@ def comparison_charts(
     ]
 
 
-def _behind_measured(band: tuple[Floats, Floats]) -> list[tuple[Floats, Floats]]:
+def _behind_measured(band: Band) -> list[Band]:
     """Return the bands of a chart of the measured and the simulated output; the measured one has none."""
     none = np.full(band[0].size, np.nan)
     return [(none, none), band]
@@ -321,3 +330,52 @@ def picture(run: Run, *signals: str) -> Figures:
             )
         )
     return Figures(charts)
+
+
+def prediction_bands(model: Model, run: Run, comparison: Comparison) -> dict[str, Band]:
+    """Return the ends of the 95 % band of each simulated output on one run, by output.
+
+    The band holds what the covariance of orders and coefficients makes of the simulation, to first order; delays,
+    limits and noise of the measurement are not in it. It takes one simulation per parameter.
+
+    Parameters
+    ----------
+    model
+        Identified model.
+    run
+        Run that the model is compared with.
+    comparison
+        Comparison with this run alone.
+
+    Returns
+    -------
+    dict
+        Empty for a model without covariance, with friction, or whose simulation fails beside the estimate.
+    """
+    covariance = None if model.estimate is None else model.estimate.covariance
+    if covariance is None or model.structure.has_friction:
+        return {}
+    spread = np.asarray(covariance, dtype=np.float64)
+    errors, values = np.sqrt(np.diag(spread)), parameter_vector(model)
+    if not np.all(np.isfinite(spread)):
+        return {}
+    used = np.flatnonzero(errors)
+    derivatives: dict[str, list[Floats]] = {name: [] for name in comparison.simulated}
+    for k in used:
+        step = DERIVATIVE_STEP_IN_ERRORS * errors[k]
+        moved = values.copy()
+        moved[k] += step
+        try:
+            beside = compare(with_parameter_vector(model, moved), run)
+        except FtlmError:
+            return {}
+        for name, centre in comparison.simulated.items():
+            derivatives[name].append((beside.simulated[name][0] - centre[0]) / step)
+    bands = {}
+    for name, columns in derivatives.items():
+        matrix, middle = np.array(columns), comparison.simulated[name][0]
+        variance = np.einsum("kt,kl,lt->t", matrix, spread[np.ix_(used, used)], matrix)
+        half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+        if np.all(np.isfinite(half)):
+            bands[name] = (middle - half, middle + half)
+    return bands

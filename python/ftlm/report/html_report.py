@@ -36,9 +36,15 @@ from ftlm.model.model import Model
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.order_search.result import SearchResult, search_summary, search_top
 from ftlm.order_search.search import landscape
-from ftlm.plot.comparison_charts import comparison_charts, input_charts, residual_charts, residual_series
+from ftlm.plot.comparison_charts import (
+    Band,
+    comparison_charts,
+    input_charts,
+    prediction_bands,
+    residual_charts,
+    residual_series,
+)
 from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencies
-from ftlm.report.prediction_bands import Band, prediction_bands
 from ftlm.report.text_summary import describe_order, settings_rows
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
