@@ -142,6 +142,12 @@ CALLS = {
         (lambda x: kernels.multi_innovation(np.stack([U, T], axis=1), x, prior_covariance=1e6), T),
         (lambda x: kernels.multi_innovation(np.stack([U, T], axis=1), T, prior_covariance=x), np.array([1.0, 2.0])),
     ],
+    "kernels.Recursion.push": [
+        (
+            lambda x: kernels.Recursion([1.0, 0.0, 0.0], [0, 1], step=STEP, hold=[False, True]).push(x),
+            np.stack([U, T], axis=1),
+        )
+    ],
     "kernels.Candidates.coefficients": [
         (TUPLES.coefficients, ORDER_TUPLES),
         (lambda x: TUPLES.coefficients(ORDER_TUPLES, p=3, prior_covariance=x, rows="time"), np.array([1.0, 2.0])),

@@ -80,7 +80,9 @@ def test_tables_4_and_5_follow_from_the_saved_run(saved, table, stage):
         found = ftlm.identify(
             run,
             structure,
-            method=ftlm.MultiInnovation(innovation_length=p, order_grid=ftlm.OrderGrid(increment=0.25), top=1),
+            method=ftlm.MultiInnovation(
+                innovation_length=p, prior_covariance=1.0, order_grid=ftlm.OrderGrid(increment=0.25), top=1
+            ),
         )
         row = written[f"p = {p}"]
         assert found.orders == row["orders"]

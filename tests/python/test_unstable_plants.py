@@ -52,7 +52,7 @@ def test_the_way_that_is_named_leads_to_the_truth(seed, noise):
         assert abs(found.coefficients[name] - truth) < 4 * found.standard_errors[name] + 0.01 * truth
     assert "plant_unstable" in codes(found)
     assert found.verdict.level == "with care"
-    assert found.verdict(found.validate(pieces[:3])).level == "with care"
+    assert found.validate(pieces[:3]).verdict.level == "with care"
     # What the file keeps is judged alike.
     assert ftlm.compare(found.model, pieces).output_error["y"].nr < 0.5
 

@@ -179,7 +179,8 @@ def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]
     alike = [row for row, _ in distinct if row.score <= limit]
     if len(alike) < 2:
         return []
-    spans = {n: (min(r.orders[n] for r in alike), max(r.orders[n] for r in alike)) for n in best.orders}
+    values = {n: [row.orders[n] for row in alike] for n in best.orders}
+    spans = {n: (min(own), max(own)) for n, own in values.items()}
     moved = {n: ends for n, ends in spans.items() if ends[1] > ends[0]}
     decided = all(
         max(high - best.orders[n], best.orders[n] - low) <= MAX_ORDER_ERROR for n, (low, high) in spans.items()

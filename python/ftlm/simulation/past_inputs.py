@@ -31,7 +31,7 @@ from ftlm.simulation.output_samples import (
 )
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
-from ftlm.utils.linalg import column_norms, minimum_norm_solution, orthonormal, projections, thin_svd
+from ftlm.utils.linalg import column_norms, combinations, minimum_norm_solution, orthonormal, projections, thin_svd
 from ftlm.utils.resources import memory_limit, stop_flag
 from ftlm.utils.statistics import variance_inflation
 from ftlm.utils.validation import Floats
@@ -95,7 +95,7 @@ def fit_history(
     kept = spread > RESPONSE_TOLERANCE * spread.max(initial=0.0)
     fixed = [k for k, (i, e) in enumerate(names) if (i, e) in free or e == LEVEL_EXPONENT]
     basis = orthonormal(responses[:, fixed], RESPONSE_TOLERANCE)
-    target_left, forced_left = (rows - basis @ projections(basis, rows) for rows in (target, forced))
+    target_left, forced_left = (rows - combinations(basis, projections(basis, rows)) for rows in (target, forced))
     # Where no input moves, the past is all that moves an output.
     size = float(np.mean((forced_left if np.any(driven) else target_left) ** 2))
     mixed = []
@@ -105,10 +105,12 @@ def fit_history(
         along = np.stack([projections(left[:, kept], octave) for octave in octaves.T], axis=1)
         mixed.append((right[kept].T / spread[kept]) @ along * math.sqrt(size / start if start > 0.0 else 0.0))
     mixing = np.concatenate(mixed, axis=1)
-    shapes = responses @ mixing
-    shapes -= basis @ (basis.T @ shapes)
+    shapes = combinations(responses, mixing)
+    shapes -= combinations(basis, np.einsum("ij,ik->jk", basis, shapes))
     values = mixing @ _posterior_mean(shapes, target_left)
-    values[fixed] += minimum_norm_solution(responses[:, fixed], target - responses @ values, RESPONSE_TOLERANCE)
+    values[fixed] += minimum_norm_solution(
+        responses[:, fixed], target - combinations(responses, values), RESPONSE_TOLERANCE
+    )
     values /= norms[norms > 0.0]
     found: list[list[tuple[float, float]]] = [[] for _ in outputs]
     for (i, exponent), value in zip(names, values.tolist(), strict=True):
@@ -123,7 +125,7 @@ def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
     """
     left, spread, right = thin_svd(shapes)
     along = projections(left, target)
-    noise = target - left @ along
+    noise = target - combinations(left, along)
     variance = float(np.mean(noise**2)) * variance_inflation(noise)
     if not variance > 0.0:
         return right.T @ np.divide(along, spread, out=np.zeros_like(along), where=spread > 0.0)
