@@ -5,6 +5,7 @@ import pytest
 
 import ftlm
 from ftlm.order_search.result import search_summary
+from ftlm.order_search.search import rank_orders
 from ftlm.utils.formatting import number
 from test_store import EQUATION, bytes_of
 
@@ -141,3 +142,18 @@ def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tm
         closely(unruly, again, progress=stop)
     assert not ftlm.search_status(again)["y"].complete
     assert bytes_of(ftlm.resume_search(again)["y"]) == bytes_of(whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("p", [1, 7])
+@pytest.mark.parametrize("prior", [1.0, 1e6])
+def test_one_slab_of_the_paper_keeps_the_rows_of_brute_force(clean_a, p, prior):
+    equation = ftlm.flexible_link(form="published", stage=1).equation("theta12")
+    options = {"coefficients": "multi-innovation", "innovation_length": p, "prior_covariance": prior, "threads": 2}
+    grid = ftlm.order_grid(increment=0.02, alpha=(1.91, 1.91))
+    quick = rank_orders(clean_a, equation, grid, **options)
+    slow = rank_orders(clean_a, equation, grid, pruning=False, **options)
+    assert quick.candidates == slow.candidates == 437_760
+    assert len(quick.table) == 20
+    assert [row.orders for row in quick.table] == [row.orders for row in slow.table]
+    assert [row.score for row in quick.table] == pytest.approx([row.score for row in slow.table], rel=1e-12)

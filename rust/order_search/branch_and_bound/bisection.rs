@@ -371,6 +371,7 @@ mod tests {
     use crate::order_search::branch_and_bound::box_bound::{BoxQuantities, CornerValues};
     use crate::order_search::dual_bound::test_vectors::TestVectors;
     use crate::order_search::grid::TermAxis;
+    use crate::order_search::options::Norm;
 
     /// Two joint angles and a link deflection under steps, with closely and widely spaced orders.
     fn problem(case: u32) -> Result<(Record, OrderGrid)> {
@@ -415,8 +416,8 @@ mod tests {
         let mut nearest: Vec<[f64; 2]> = Vec::new();
         for case in 0..40 {
             let (record, lattice) = problem(case)?;
-            let kinds = (Criterion::OutputError, [Norm::L1, Norm::L2][case as usize / 4 % 2]);
-            let found = with_slice(&[record], &lattice, kinds, u64::from(case) * 7, |catalogue, boxes, slab| {
+            let options = Options { norm: [Norm::L1, Norm::L2][case as usize / 4 % 2], ..Options::default() };
+            let found = with_slice(&[record], &lattice, &options, u64::from(case) * 7, |catalogue, boxes, slab| {
                 let columns = first_columns(catalogue, slab);
                 let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
                 let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
