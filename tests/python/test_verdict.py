@@ -65,7 +65,8 @@ def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
     judged = verdict(found, checked)
     assert (judged.level, judged.reasons, judged.trusted) == ("trust", (), True)
     assert judged.reason.startswith("it predicts runs it was not fitted to (y 99")
-    assert checked.verdict == judged
+    assert checked.verdict == judged == found.verdict(checked)
+    assert found.verdict() == found.verdict
     assert str(checked).startswith("TRUST: ")
 
 
@@ -378,8 +379,9 @@ def test_what_may_not_be_used_comes_before_what_needs_care(found):
 
 @pytest.mark.parametrize("bad", [3, "chirp", [], {}])
 def test_what_is_no_validation_is_refused(found, bad):
-    with pytest.raises(ftlm.errors.ModelError, match=r"give what validate\(run\) returns"):
-        found.summary(bad)
+    for ask in (found.verdict, found.summary):
+        with pytest.raises(ftlm.errors.ModelError, match=r"give what validate\(run\) returns"):
+            ask(bad)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from ftlm.analysis.poles import modes
-from ftlm.errors import FtlmError
+from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.model_checks import join_names, stability_findings
 from ftlm.estimation.result import Identification
 from ftlm.findings import FINDING_TOPICS, LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding
@@ -69,6 +69,19 @@ class Verdict:
     def trusted(self) -> bool:
         """Whether the level is ``"trust"``."""
         return self.level == TRUST_LEVEL
+
+    def __call__(self, validation: Any = None) -> Verdict:
+        """Return the verdict that includes a validation, which is ``validation.verdict``; without one, this verdict.
+
+        Raises
+        ------
+        ModelError
+            The validation is not what ``validate(run)`` returns.
+        """
+        included = self if validation is None else getattr(validation, "verdict", None)
+        if not isinstance(included, Verdict):
+            raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")
+        return included
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as a dictionary for JSON."""
