@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
-
 from ftlm.analysis.poles import steady_states
 from ftlm.errors import FtlmError
+from ftlm.estimation.estimators import number_covariance
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.nuisance_parameters import refit_from
 from ftlm.estimation.output_error import JointFit
 from ftlm.findings import Finding, make_finding
-from ftlm.model.model import Model
+from ftlm.model.model import Estimate, Model
 from ftlm.simulation.initial_conditions import rest_evidence
 from ftlm.structure.structure import Initial, Offset, Structure
-from ftlm.utils.validation import Floats
 
 #: Other starts that a fit is compared with.
 OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
@@ -30,10 +28,6 @@ OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
 MAX_SQUARES_RATIO = 1.05
 #: Difference of two gains, in joint standard errors and relative to the larger one, from which on they contradict.
 GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
-#: Step of the derivatives of gains, in standard errors of a parameter.
-DERIVATIVE_STEP = 0.01
-#: Least step, relative to the parameter, that rounding leaves.
-DERIVATIVE_ROUNDING = 1e-7
 
 
 def start_not_told_findings(fit: Fit) -> list[Finding]:
@@ -77,31 +71,15 @@ def _name_start(initial: Initial, offset: Offset) -> str:
 def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple[float, float]]:
     """Return the finite steady-state gains of a fit by output and input, with their standard errors."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
-
-    def gains(values: Floats) -> dict[tuple[str, str], float]:
-        orders, coefficients, inputs = problem.split(values.tolist())
-        known = (
-            problem.structure.with_orders(dict(zip(problem.orders, orders, strict=True)))
-            .with_coefficients(problem.coefficients_by_name(coefficients))
-            .with_inputs(dict(zip(problem.names[len(orders) + len(coefficients) :], inputs, strict=True)))
-        )
-        return {(s.output, s.input): s.gain for s in steady_states(Model(known))}
-
-    if not np.all(np.isfinite(joint.covariance)):
-        return {}
+    orders, coefficients, inputs = problem.split(joint.values.tolist())
+    known = (
+        problem.structure.with_orders(dict(zip(problem.orders, orders, strict=True)))
+        .with_coefficients(problem.coefficients_by_name(coefficients))
+        .with_inputs(dict(zip(problem.names[len(orders) + len(coefficients) :], inputs, strict=True)))
+    )
+    estimate = Estimate("output-error", (), joint.values_by_name, covariance=number_covariance(joint, problem))
     try:
-        values, errors = joint.values, np.sqrt(np.maximum(np.diag(joint.covariance), 0.0))
-        at = gains(values)
-        slopes: dict[tuple[str, str], list[float]] = {pair: [] for pair in at}
-        steps = np.maximum(DERIVATIVE_STEP * errors, DERIVATIVE_ROUNDING * np.maximum(np.abs(values), 1.0))
-        for k, step in enumerate(steps):
-            above, below = (gains(values + side * step * np.eye(values.size)[k]) for side in (0.5, -0.5))
-            for pair, slope in slopes.items():
-                slope.append((above[pair] - below[pair]) / step)
-    except (FtlmError, KeyError):
+        states = steady_states(Model(known, estimate=estimate))
+    except FtlmError:
         return {}
-    with np.errstate(invalid="ignore", divide="ignore"):
-        spread = {
-            n: float(np.sqrt(np.array(slope) @ joint.covariance @ np.array(slope))) for n, slope in slopes.items()
-        }
-    return {n: (g, spread[n]) for n, g in at.items() if math.isfinite(g) and math.isfinite(spread[n])}
+    return {(s.output, s.input): (s.gain, s.error) for s in states if s.error is not None and math.isfinite(s.gain)}

@@ -281,8 +281,11 @@ class FrequencyIdentification:
 
     @property
     def fit_percent(self) -> dict[str, float]:
-        """Fit of each response in percent, by record: 100 minus its error relative to the measured response."""
-        return {e.name: 100.0 - e.rms for e in self.errors}
+        """Fit in percent, by output: 100 minus the root mean square error relative to the measured responses."""
+        squares: dict[str, list[float]] = {}
+        for error in self.errors:
+            squares.setdefault(error.output, []).append(error.rms**2)
+        return {output: 100.0 - math.sqrt(sum(own) / len(own)) for output, own in squares.items()}
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""

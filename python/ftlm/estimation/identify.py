@@ -187,7 +187,7 @@ def fit_offset_test(fit: Fit) -> OffsetTest | None:
     """Return the offset test at a fit, with or without an offset; None if not available."""
     structure = replace(fit.task.structure, offset="none")
     if fit.joint is not None:
-        values = dict(zip(fit.joint.names, fit.joint.values.tolist(), strict=True))
+        values = fit.joint.values_by_name
         asked = replace(structure, initial=fit.joint.initial)
         return offset_test(fit.task.runs, asked, values, every=fit.joint.refinement)
     if not fit.at_optimum:
@@ -435,7 +435,7 @@ def _estimate(
     """Return the estimate that the model file stores."""
     joint, values, errors = fit.joint, dict(fit.model.orders), {}
     if joint is not None:
-        values = dict(zip(joint.names, joint.values.tolist(), strict=True))
+        values = joint.values_by_name
         errors = {n: finite(v) for n, v in joint.standard_errors.items()}
     profiles = {} if joint is None else {n: (finite(p.low), finite(p.high)) for n, p in joint.profiles.items()}
     return Estimate(

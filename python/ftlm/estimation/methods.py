@@ -16,7 +16,7 @@ from ftlm.estimation.estimators import estimate_order_search, estimate_output_er
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.estimation.noise_model import check_noise_model, fit_noise_model
-from ftlm.estimation.output_error import JointFit, Loss, Noise
+from ftlm.estimation.output_error import Loss, Noise
 from ftlm.estimation.result import Identification, Task
 from ftlm.findings import Finding
 from ftlm.model.model import Model
@@ -140,15 +140,11 @@ class OutputError:
             return fit_noise_model(
                 estimate_output_error(task, m, workers, progress, None, self.loss, "quadratic", begin, more),
                 lambda white, joint: estimate_output_error(
-                    white, m, workers, None, None, self.loss, "quadratic", _values(joint), alone=True
+                    white, m, workers, None, None, self.loss, "quadratic", joint.values_by_name, alone=True
                 ),
             )
         fit = estimate_output_error(task, m, workers, progress, answers, self.loss, self.intervals, begin, more)
         return fit if self.reference is None else mark_reference_fit(fit, self.reference, weak)
-
-
-def _values(joint: JointFit) -> dict[str, float]:
-    return dict(zip(joint.names, joint.values.tolist(), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)

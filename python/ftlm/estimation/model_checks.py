@@ -387,7 +387,7 @@ def quantization_step(values: Floats) -> float:
 def correlation_findings(joint: JointFit) -> list[Finding]:
     """Return findings on groups of parameters that are not separately identifiable, one a group."""
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
-    sizes = {n: abs(v) for n, v in zip(joint.names, joint.values.tolist(), strict=True)}
+    sizes = {n: abs(v) for n, v in joint.values_by_name.items()}
     # Negated so that a standard error that is not a number counts as too large.
     vague = [
         i

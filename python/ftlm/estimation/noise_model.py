@@ -115,7 +115,7 @@ def whiten(run: Run, colour: Floats) -> Run:
 def _at_estimate(fit: Fit, joint: JointFit, runs: Sequence[Run], weight: float) -> tuple[Objective, Iterate]:
     """Return the objective of a fit on some runs, and its estimate as an iterate."""
     problem = FreeProblem.of(replace(fit.task.structure, initial=joint.initial))
-    values = dict(zip(joint.names, joint.values.tolist(), strict=True))
+    values = joint.values_by_name
     return Objective(problem, runs, [weight], every=joint.refinement), start_from_values(problem, values)
 
 

@@ -330,7 +330,7 @@ def refit_from(
     joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss = "squares", *, refine: bool = False
 ) -> JointFit:
     """Fit another structure from an earlier optimum; without `refine` on the coarsest grid that it allows."""
-    values = dict(zip(joint.names, joint.values.tolist(), strict=True))
+    values = joint.values_by_name
     return fit_output_error(runs, structure, start=values, loss=loss, refine=refine)
 
 

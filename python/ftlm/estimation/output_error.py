@@ -196,6 +196,11 @@ class JointFit:
     unstable_optimum: UnstableOptimum | None = None
 
     @property
+    def values_by_name(self) -> dict[str, float]:
+        """Estimates by name, in the order of the covariance."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
+
+    @property
     def choice(self) -> str:
         """Description of the initial guess that led to this optimum, and of the cost of the next optimum."""
         if not self.starts:
@@ -237,7 +242,7 @@ class JointFit:
     def intervals(self) -> dict[str, tuple[float, float]]:
         """95 % interval of each parameter: profile likelihood if available, else ± 1.96 standard errors."""
         errors = self.standard_errors
-        pairs = zip(self.names, self.values.tolist(), strict=True)
+        pairs = self.values_by_name.items()
         quadratic = {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in pairs}
         return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}
 

@@ -160,7 +160,7 @@ class Identification:
     @property
     def _values(self) -> dict[str, float]:
         """Orders, coefficients and estimated delays and limits by name."""
-        fit = {} if self.fit is None else dict(zip(self.fit.names, self.fit.values.tolist(), strict=True))
+        fit = {} if self.fit is None else self.fit.values_by_name
         return {**self.orders, **fit, **self.coefficients}
 
     @property

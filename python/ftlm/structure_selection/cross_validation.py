@@ -325,7 +325,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
     model = model_of(structure, joint, folds.runs)
     estimation = compare(model, list(folds.runs)).fit_percent
     grows = not structure.has_friction and model.stability(coupling=structure.coupling).unstable_poles > 0
-    start = dict(zip(joint.names, joint.values.tolist(), strict=True))
+    start = joint.values_by_name
     # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
     near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.step_converged else joint
     validation: dict[str, dict[str, float]] = {}
@@ -400,7 +400,7 @@ def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
         errors=joint.standard_errors,
         insignificant=insignificant_coefficients(joint),
         refined=True,
-        values=dict(zip(joint.names, joint.values.tolist(), strict=True)),
+        values=joint.values_by_name,
     )
 
 

@@ -358,7 +358,7 @@ def _ranking_key(trial: Trial) -> tuple[bool, float]:
 
 def values_of(joint: JointFit) -> dict[str, float]:
     """Return all free parameters by name."""
-    return dict(zip(joint.names, joint.values.tolist(), strict=True))
+    return joint.values_by_name
 
 
 def _select_forward(
