@@ -276,10 +276,10 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "mode_sampled_coarsely": FindingKind(
         "step",
         LEVEL_FACT,
-        "a mode of {frequency:.4g} rad/s has {samples:.2g} samples a period|: its numbers rest on how the inputs move "
-        "between samples, since a held input lags a linear one by half a sample, {phase:.0f} degrees of that mode, and "
-        "is {loss:.1g} % smaller there",
-        remedy="sample eight times a period at least, or state how the inputs move with {ask[intersample]}",
+        "a mode of {frequency:.4g} rad/s has {samples:.2g} samples a period|: its parameters depend on the behavior of "
+        "the inputs between samples, as zero- and first-order hold differ there by half a sample, {phase:.0f} degrees, "
+        "and by {loss:.1g} % of gain",
+        remedy="take at least eight samples a period, or state the behavior between samples with {ask[intersample]}",
     ),
     "scheme_unstable": FindingKind(
         "step",
@@ -390,8 +390,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "prior_ranks": FindingKind(
         "prior",
         LEVEL_WITH_CARE,
-        "{output}: the prior decides which orders lead|: with K0 = {prior:g} the best candidate leaves {share:.2g} of "
-        "the error of a model that does not move. Raise prior_covariance, or leave it out",
+        "{output}: the prior dominates the ranking of orders|: with K0 = {prior:g} the error of the best candidate is "
+        "{share:.2g} of that of a zero output. Raise prior_covariance, or leave it out",
     ),
     "no_standard_errors": _rule(
         "errors",
@@ -488,7 +488,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "arm_leaves_out": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "the equations of the flexible link leave out {parts}, which an arm has, and the model leaves something out",
+        "residual tests show dynamics that are not modeled, and the equations of the flexible link leave out {parts}",
         "the equations of the flexible link leave out {parts}",
         "{ask[coupling is simulated]} with {ask[friction]} adds the dry friction of the hubs, and "
         "{ask[cross_stage is inertial]} the other link",
@@ -581,12 +581,12 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "start_not_told": FindingKind(
         "history",
         LEVEL_WITH_CARE,
-        "what the run did before its first row cannot be told|: {taken}, the gain of {output} from {input} is "
-        "{gain:.4g} ± {error:.2g}, {other}, it is {other_gain:.4g} ± {other_error:.2g}, with {ratio:.3g} times the "
-        "squares",
-        "what the run did before its first row cannot be told: the gain of {output} from {input} is {gain:.4g} if it "
-        "was {taken}, and {other_gain:.4g} if {other}",
-        "record some rows before an input moves, or give {ask[initial]} and {ask[offset]}",
+        "the initial state cannot be told|: if the run begins {taken}, the gain of {output} from {input} is "
+        "{gain:.4g} ± {error:.2g}; if it begins {other}, it is {other_gain:.4g} ± {other_error:.2g}, with {ratio:.3g} "
+        "times the sum of squared residuals",
+        "the initial state cannot be told: the gain of {output} from {input} is {gain:.4g} if the run begins {taken}, "
+        "and {other_gain:.4g} if it begins {other}",
+        "record some rows before an input changes, or give {ask[initial]} and {ask[offset]}",
         prefix="{run}: ",
     ),
     "moves_before_input": FindingKind(
@@ -596,7 +596,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "standard deviations from where it rested, about {rows:.2g} rows early|; the input was logged after it acted, "
         "or one of the two signals is late",
         "{output} moves before its input {input}, by about {rows:.2g} rows",
-        "log the input before it acts, shift its rows, or let {ask[delay]} be negative, to one row",
+        "log the input before it acts, shift its rows, or allow a {ask[delay]} down to minus one sampling interval",
         prefix="{run}: ",
     ),
     "looked_like_rest": FindingKind(
@@ -759,7 +759,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_WITH_CARE,
         "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation) beside what the inputs "
         "explain; let the sensor settle, or have the line estimated with the model: {ask[offset is ramp]}",
-        remedy="{ask[offset is ramp]} estimates a line with the model",
+        remedy="{ask[offset is ramp]} estimates a linear trend with the model",
     ),
     "starts_off_zero": FindingKind(
         "history",

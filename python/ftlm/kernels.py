@@ -591,25 +591,24 @@ class Recursion:
     orders
         Shape (1 + k,): alpha, then the order of each of k terms; alpha minus an order is at most 2.
     terms
-        Row of the signal of each term.
+        Column of `samples` of the signal of each term.
     output
-        Row of the output y.
+        Column of the output y.
     step
         Sampling interval [s].
     hold
-        Whether each of s signals holds its samples until the next one, as commands do. Otherwise it is linear in
-        between.
+        For each of s signals: True for zero-order hold, as of commands; False for linear interpolation.
     p
-        Innovation length: number of rows of a step.
+        Innovation length: number of most recent regression equations in each update.
     prior_covariance
         Initial covariance of the coefficients; by default 1e10 over the sum of squares of a regressor so far.
     forgetting
         Factor in (0, 1] by which earlier rows count less with every row; 1 forgets nothing.
     initial
-        Exponents above -1 of powers of t that a start in motion adds to the terms, or ``"caputo"`` for those of the
-        initial values of Caputo derivatives.
+        Exponents above -1 of powers of t that nonzero initial conditions add to the terms, or ``"caputo"`` for those
+        of the initial values of Caputo derivatives.
     longest
-        Largest number of pulses.
+        Largest number of samples minus one.
     fixed
         Coefficient of each term, None for a free one; by default all are free.
 

@@ -10,10 +10,10 @@ use crate::recording::{Role, MIN_SIGNAL_PEAK};
 use crate::state_space::{self, Input};
 
 impl OutputSimulation {
-    /// Exact samples of a model with integer orders; None if it needs a grid.
+    /// Exact samples of a model with integer orders; None if it has to be discretized by block pulses.
     ///
-    /// Fractional orders, friction, a sensor filter, nonuniform samples, missing samples of inputs and equations that are
-    /// singular or nearly so need one.
+    /// That is so with fractional orders, friction, a sensor filter, nonuniform samples, missing samples of inputs, and
+    /// equations that are singular or nearly so.
     ///
     /// # Errors
     /// As [`state_space::respond`] and [`fit_initial_terms`].

@@ -348,7 +348,7 @@ def test_a_prior_that_decides_the_ranking_is_named(small_run):
     strong = ftlm.identify(small_run, free, method=ftlm.MultiInnovation(prior_covariance=1e-4, order_grid=grid), m=256)
     (finding,) = (f for f in strong.findings if f.code == "prior_ranks")
     assert finding.text.startswith(
-        "y: the prior decides which orders lead: with K0 = 0.0001 the best candidate leaves "
+        "y: the prior dominates the ranking of orders: with K0 = 0.0001 the error of the best candidate is "
     )
     for usual in (None, 1e8):
         method = ftlm.MultiInnovation(prior_covariance=usual, order_grid=grid)

@@ -1,4 +1,4 @@
-"""Transfer functions as models, and their connections: series, parallel, feedback, inverse; exact in every power."""
+"""Transfer functions as models and their connections, for real powers of s without approximation."""
 
 from __future__ import annotations
 
@@ -72,7 +72,8 @@ def transfer_function(
     ----------
     num, den
         Coefficients of s^n, …, s, 1 as in python-control and MATLAB; or pairs (coefficient, power) for fractional
-        powers: the vectors a, na of FOMCON's ``fotf`` are ``zip(a, na)``.
+        powers: FOMCON's ``fotf(a, na, b, nb)`` has
+        the numerator ``list(zip(b, nb))`` and the denominator ``list(zip(a, na))``.
     delay
         Delay of the input [s], ≥ 0.
     output, input

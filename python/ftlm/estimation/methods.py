@@ -70,12 +70,13 @@ class OutputError:
         number.
     reference
         Name of a signal of the runs that drives a closed loop from outside, such as its set point. It is the
-        instrument: residuals are made orthogonal to what the part of every input that follows the reference does,
-        which noise that the loop feeds back is no part of.
+        instrument: residuals are made orthogonal to the response to the part of every input that follows the
+        reference, which is uncorrelated with the noise that the loop feeds back.
     noise
-        ``"white"``, or ``"ar"``: the noise of the output is an autoregression, which is estimated with the model, so
-        that the one-step prediction errors are least. It has the precision of maximum likelihood in coloured noise, and
-        no bias in a closed loop. Intervals are those of standard errors.
+        ``"white"``, or ``"ar"`` for y = G u + e / A(q): model and autoregression are estimated together by the
+        prediction-error method. It is consistent in a closed loop if A(q) can describe the noise and the loop has a
+        delay (Ljung, chapter 13). It takes one output, a linear model and uniform samples, and gives intervals of
+        ± 1.96 standard errors.
 
     Raises
     ------
@@ -253,8 +254,8 @@ class MultiInnovation(OrderSearchMethod):
     innovation_length
         p of paper (43)-(44): a weight of the data against the prior, nothing else.
     prior_covariance
-        K0 of paper (43)-(44), in units of the squared coefficients. By default the prior is weak in any units: 1e10
-        over the sum of squares of the coefficient's regressor. The paper's is 1.
+        Diagonal of K0 of paper (43)-(44): one number for all coefficients. By default the prior is weak and does not
+        depend on units: 1e10 over the sum of squares of each coefficient's regressor. The paper's is 1.
     row_basis
         Coordinates of paper (42): ``"haar"``, for which m is a power of two, or ``"time"``.
 

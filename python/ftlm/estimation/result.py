@@ -366,21 +366,19 @@ class Identification:
         -----
         The first of these rules that applies gives the reason.
 
-        *Do not use*: the free run leaves the range of numbers, or grows (a pole with a positive real part); numbers
-        that the runs do not tell apart at all (infinite standard errors); an output that the free run explains by less
-        than half (NR above 0.5), on its own runs or on validation, over all runs or on one; own orders by which an
-        equation says that an output equals itself.
+        *Do not use*: the simulation overflows or has an unstable pole; a parameter is not identifiable (infinite
+        standard error); NR exceeds 0.5 for an output, on estimation or validation runs, together or on one of them; the
+        own orders of an equation make it an identity.
 
-        *With care*: a fit that falls by 20 points on validation, over all runs or on one, or leaves there more than a
-        tenth and three times as much as on its own runs, or more than a twentieth and five times as much; growth that
-        cannot be told, or a swing whose damping is not told apart from 0 (an integrator is no fault); residuals that
-        follow an input; a closed loop with coloured residuals; residuals that are not white (all three no smaller than
-        a thousandth of the output); a fit that did not stand still; a number that nothing tells, a coefficient known to
-        no more than half of itself, an order to no more than 0.25, a delay or a limit whose interval has no end; an
-        offset that is hidden by what a run did before its start; intervals that are rough and every other warning of
-        weight; no standard errors; no validation.
+        *With care*: on validation the fit falls by 20 points, or the residual (100 - fit) exceeds 10 % and three times
+        that of estimation, or 5 % and five times; stability is undecided, or the damping of an oscillation is not
+        significantly positive (an integrator is no fault); residuals are correlated with an input, are not white, or
+        are colored in a closed loop (each only above a thousandth of the output); the fit did not converge; a
+        parameter has no effect, a coefficient has a relative standard error above 0.5, an order one above 0.25, a delay
+        or a limit an unbounded interval; an offset is hidden by the initial conditions; another finding of this level;
+        no standard errors; no validation.
 
-        A saved model keeps what spoke against it, and is judged alike.
+        A saved model keeps the findings against it, and has the same verdict.
         """
         from ftlm.estimation.verdict import verdict
 

@@ -71,7 +71,9 @@ class Verdict:
         return self.level == TRUST_LEVEL
 
     def __call__(self, validation: Any = None) -> Verdict:
-        """Return the verdict that includes a validation, which is ``validation.verdict``; without one, this verdict.
+        """Return ``validation.verdict``, or this verdict without a validation: ``result.verdict(v)`` is ``v.verdict``.
+
+        The validation is taken to be one of the same result.
 
         Raises
         ------

@@ -157,7 +157,7 @@ def has_numbers(column: Column) -> bool:
 def assume_roles(
     wanted: ColumnSelection, columns: Sequence[Column], signals: tuple[Sequence[str], Sequence[str]] | None = None
 ) -> tuple[Assumption, ...]:
-    """Choose inputs and outputs among columns if none are named, and return what was assumed.
+    """Fill `wanted.inputs` and `wanted.outputs` in place if both are empty, and return the assumptions.
 
     Parameters
     ----------
@@ -166,8 +166,9 @@ def assume_roles(
     columns
         Columns of the file without its time.
     signals
-        Inputs and outputs of an equation. If the file has all of them, they are chosen, and nothing is assumed.
-        Otherwise, and without an equation, the words in the column names decide.
+        Inputs and outputs of an equation. If the file has all of them, they are taken, without an assumption.
+        Otherwise roles are guessed from words in the column names, such as input or torque, output or angle; both stay
+        empty if these are ambiguous.
     """
     if wanted.inputs or wanted.outputs:
         return ()
@@ -193,7 +194,7 @@ def assume_roles(
 
 
 def add_file_units(wanted: ColumnSelection, pool: Pool) -> None:
-    """Take the units that a file states for the selected columns, unless others are given."""
+    """Add the units that a file states for the selected columns to `wanted.units`, unless others are given."""
     for name, spec in (wanted.inputs | wanted.outputs).items():
         column = pool.find(spec, f"signal {name!r}")
         unit = known_unit(column.file_unit, column.name_with_unit)

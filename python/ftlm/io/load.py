@@ -86,9 +86,9 @@ def load(
         day are converted to seconds since the first row.
     inputs, outputs : mapping of str to column, or list of str, optional
         Columns by signal name; a list names columns that keep their names; at least one output. The unit in a name
-        such as ``I (A)`` may be omitted. Without both, and without `columns` and an ftlm header, they are chosen by the
-        words in the column names as by :func:`ftlm.open_file`, with the units of the file; the choice is listed in the
-        `warnings` of the run, and ambiguous names raise an error.
+        such as ``I (A)`` may be omitted. If neither is given here, by `columns` or by an ftlm header, both are guessed
+        from words in the column names as by :func:`ftlm.open_file`, with the units of the file; the guess is listed in
+        the `warnings` of the run, and ambiguous names raise an error.
     units : mapping of str to str, optional
         Units of signals, converted to SI. Units that the file states are not applied to columns that are named here;
         :func:`ftlm.open_file` shows them.

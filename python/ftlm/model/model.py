@@ -363,7 +363,7 @@ class Model:
 
     @check_arguments
     def parallel(self, other: Model) -> Model:
-        """Return the model whose output is the sum of both outputs from one input, exactly.
+        """Return the model whose output is the sum of both outputs from the same input, exactly.
 
         Both have one output and one input; common factors are not cancelled.
 
@@ -402,8 +402,7 @@ class Model:
         Raises
         ------
         ModelError
-            A delay; a numerator of lower order than the denominator, whose inverse would drive its output to infinity;
-            and everything that :meth:`series` refuses.
+            A delay; a strictly proper model, whose inverse is improper; and everything that :meth:`series` refuses.
         """
         from ftlm.analysis.model_algebra import inverse
 

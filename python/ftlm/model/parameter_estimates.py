@@ -26,7 +26,8 @@ class Parameter:
         Standard error; NaN if the parameter is fixed or the method gives none, infinite if the data do not determine
         it.
     interval
-        Ends of the 95 % interval; NaN where there is no standard error.
+        Ends of the 95 % confidence interval, by standard errors or profile likelihood; infinite where the data do not
+        bound the parameter, NaN where there is no standard error.
     unit
         Unit; empty if the parameter is dimensionless or the unit of a signal is unknown.
     fixed
@@ -47,7 +48,9 @@ class Parameter:
         if math.isnan(self.standard_error):
             return f"{self.name} = {value}"
         low, high = self.interval
-        return f"{self.name} = {value} ± {self.standard_error:.3g} (95 % interval {low:.6g} to {high:.6g})"
+        return (
+            f"{self.name} = {value} (standard error {self.standard_error:.3g}, 95 % interval {low:.6g} to {high:.6g})"
+        )
 
 
 def parameter_estimates(

@@ -70,7 +70,7 @@ def comparison_charts(
             slider=True,
             bands=_behind_measured(known[name]) if name in known else (),
             caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
-            + (" Shade: 95 % band of the simulation, from the covariance of the fit." if name in known else ""),
+            + (" Shade: 95 % confidence band of the simulation." if name in known else ""),
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)
         for name, figures in output_error.items()
@@ -332,11 +332,11 @@ def picture(run: Run, *signals: str) -> Figures:
     return Figures(charts)
 
 
-def prediction_bands(model: Model, run: Run, comparison: Comparison) -> dict[str, Band]:
-    """Return the ends of the 95 % band of each simulated output on one run, by output.
+def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str, Band]:
+    """Return the pointwise 95 % confidence band of each simulated output on one run, by output.
 
-    The band holds what the covariance of orders and coefficients makes of the simulation, to first order; delays,
-    limits and noise of the measurement are not in it. It takes one simulation per parameter.
+    The covariance of orders and coefficients is propagated to first order. The band excludes measurement noise and the
+    uncertainty of delays, saturations and dead zones. It takes one simulation per parameter.
 
     Parameters
     ----------
@@ -350,7 +350,8 @@ def prediction_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
     Returns
     -------
     dict
-        Empty for a model without covariance, with friction, or whose simulation fails beside the estimate.
+        Lower and upper end by output. Empty for a model without covariance or with friction, and if a simulation with
+        a changed parameter fails.
     """
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None or model.structure.has_friction:

@@ -39,8 +39,8 @@ from ftlm.order_search.search import landscape
 from ftlm.plot.comparison_charts import (
     Band,
     comparison_charts,
+    confidence_bands,
     input_charts,
-    prediction_bands,
     residual_charts,
     residual_series,
 )
@@ -237,7 +237,7 @@ def identification_page(
     judged = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
-    bands = [prediction_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
+    bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
     sections = first_sections(model, findings, compared, bool(others), result.fit, runs, bands)
     details = [residual_section(tests, result.information, compared, model.units)]
     details += correlation_sections(result.fit)
@@ -595,7 +595,7 @@ def model_page(
             there += [make_finding("run_of_its_own", run=run.name)] * (run.name in known.runs)
         findings += _on_validation(there, run)
     compared = [("validation", comparison) for comparison in validated]
-    bands = [prediction_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
+    bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
     sections = first_sections(model, findings, compared, bool(others), None, others, bands)
     details = []
     if tests := tests_on(model, others):

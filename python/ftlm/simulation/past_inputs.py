@@ -1,10 +1,9 @@
-"""History of a run under a prior: the responses to inputs before its first row, no larger than those to its own inputs.
+"""Initial terms of a compared run under a Gaussian prior on its inputs before the first row.
 
-The powers of time of an initial history follow what a model lacks in any run, if their coefficients are free. On a run
-that a model is compared with, a history is therefore what an unknown forcing on the right-hand side of each equation
-leaves behind. The forcing is constant on octaves of the past, and Gaussian. Its size is chosen by marginal likelihood,
-in units of the model's response to the inputs of the run. Initial values by Caputo's definition stay free, as those of
-integer orders are.
+With free coefficients, the initial terms of a run with a history would absorb the errors of a model. Here each equation
+is driven before the first row by an unknown zero-mean Gaussian input, which is piecewise constant on octaves of time,
+over four lengths of the run. Its variance, in units of the model's response to the inputs of the run, is chosen by
+marginal likelihood (empirical Bayes). Initial values by Caputo's definition have no prior.
 """
 
 from __future__ import annotations
@@ -31,7 +30,14 @@ from ftlm.simulation.output_samples import (
 )
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
-from ftlm.utils.linalg import column_norms, combinations, minimum_norm_solution, orthonormal, projections, thin_svd
+from ftlm.utils.linalg import (
+    column_norms,
+    linear_combinations,
+    minimum_norm_solution,
+    orthonormal,
+    projections,
+    thin_svd,
+)
 from ftlm.utils.resources import memory_limit, stop_flag
 from ftlm.utils.statistics import variance_inflation
 from ftlm.utils.validation import Floats
@@ -51,12 +57,14 @@ RESPONSE_TOLERANCE = 1e-10
 def fit_history(
     core: _core.OutputSimulation, model: Model, run: Run, terms: InitialTermsTuple, times: Floats, max_m: int
 ) -> InitialTermsTuple | None:
-    """Return the initial terms of a run with a history under its prior; None if a response is not finite.
+    """Return the posterior mean of the initial terms of a run with a history; None if a response is not finite.
 
     Parameters
     ----------
     core, terms
-        Simulation of the run, and the initial terms to fit, those of a history among them.
+        Simulation of the run by the core, and the names of the initial terms to fit.
+    model, run
+        Model and measured run.
     times
         Times of the compared samples [s].
     max_m
@@ -95,7 +103,9 @@ def fit_history(
     kept = spread > RESPONSE_TOLERANCE * spread.max(initial=0.0)
     fixed = [k for k, (i, e) in enumerate(names) if (i, e) in free or e == LEVEL_EXPONENT]
     basis = orthonormal(responses[:, fixed], RESPONSE_TOLERANCE)
-    target_left, forced_left = (rows - combinations(basis, projections(basis, rows)) for rows in (target, forced))
+    target_left, forced_left = (
+        rows - linear_combinations(basis, projections(basis, rows)) for rows in (target, forced)
+    )
     # Where no input moves, the past is all that moves an output.
     size = float(np.mean((forced_left if np.any(driven) else target_left) ** 2))
     mixed = []
@@ -105,11 +115,11 @@ def fit_history(
         along = np.stack([projections(left[:, kept], octave) for octave in octaves.T], axis=1)
         mixed.append((right[kept].T / spread[kept]) @ along * math.sqrt(size / start if start > 0.0 else 0.0))
     mixing = np.concatenate(mixed, axis=1)
-    shapes = combinations(responses, mixing)
-    shapes -= combinations(basis, np.einsum("ij,ik->jk", basis, shapes))
+    shapes = linear_combinations(responses, mixing)
+    shapes -= linear_combinations(basis, np.einsum("ij,ik->jk", basis, shapes))
     values = mixing @ _posterior_mean(shapes, target_left)
     values[fixed] += minimum_norm_solution(
-        responses[:, fixed], target - combinations(responses, values), RESPONSE_TOLERANCE
+        responses[:, fixed], target - linear_combinations(responses, values), RESPONSE_TOLERANCE
     )
     values /= norms[norms > 0.0]
     found: list[list[tuple[float, float]]] = [[] for _ in outputs]
@@ -125,7 +135,7 @@ def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
     """
     left, spread, right = thin_svd(shapes)
     along = projections(left, target)
-    noise = target - combinations(left, along)
+    noise = target - linear_combinations(left, along)
     variance = float(np.mean(noise**2)) * variance_inflation(noise)
     if not variance > 0.0:
         return right.T @ np.divide(along, spread, out=np.zeros_like(along), where=spread > 0.0)

@@ -22,7 +22,7 @@ def projections(columns: Floats, row: Floats) -> Floats:
     return np.asarray(np.einsum("ij,i->j", columns, row))
 
 
-def combinations(columns: Floats, amounts: Floats) -> Floats:
+def linear_combinations(columns: Floats, amounts: Floats) -> Floats:
     """Sum of the columns, each times its amount; one sum per column of amounts if these are a matrix."""
     return np.asarray(np.einsum("ij,j...->i...", columns, amounts))
 

@@ -114,7 +114,7 @@ pub fn refine_step<'a>(
     Ok(Optimum { attempt: best, grid, estimate, step_converged: still, covariance: spread })
 }
 
-/// Optimum of a long record at the limit for zero step, by deferred correction; None if a finer grid is needed for it.
+/// Optimum of a long record for zero step size, by deferred correction; None if that needs a finer grid.
 ///
 /// The residuals of two finer grids at the optimum, extrapolated to zero step, replace those of the grid: the difference
 /// depends on the parameters only slightly, so that it is added to the samples and the grid is fitted again (Stetter,

@@ -1,7 +1,7 @@
-//! Multistart of bodies with friction: linear fits with the measured sign of the velocity supply the initial guesses.
+//! Multistart for equations with friction: linear fits with the measured sign of the velocity are the initial guesses.
 //!
-//! With the measured sign of the velocity the equation is linear. Where the body rests, the sign is noise, but the
-//! estimates are close enough. Fits without friction add guesses with several amounts of friction. Stribeck friction
+//! With the measured sign of the velocity the equation is linear. While the body sticks, the sign is noise; the bias is
+//! acceptable for an initial guess. Fits without friction add guesses with several amounts of friction. Stribeck friction
 //! starts from the best fits with Coulomb friction.
 
 use std::collections::BTreeMap;

@@ -29,9 +29,10 @@ struct Part {
 
 /// Coefficients of one equation with friction and given orders, fitted to its integrals on all runs.
 ///
-/// Own terms restore and friction dissipates; inputs may have any sign. The friction sign is that of the measured
-/// velocity where it exceeds the noise. Elsewhere the body rests and friction balances the input forces. Each run has
-/// its own level, velocity and constant. Empty if friction is known, or no finite solution exists.
+/// Least squares of the integrated equation, in which terms of the output and friction have the signs of a passive body;
+/// inputs may have any sign. The friction sign is that of the measured velocity where it exceeds the noise. Elsewhere
+/// the body sticks, and friction is minus the net force. Each run has its own offset, initial velocity and constant of
+/// integration. Empty if friction is known, or no finite solution exists.
 ///
 /// # Errors
 /// As [`Recording::pulses`]; [`Error::Interrupted`](crate::error::Error::Interrupted).

@@ -5,7 +5,7 @@ import pytest
 
 import ftlm
 from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
-from ftlm.plot.comparison_charts import prediction_bands
+from ftlm.plot.comparison_charts import confidence_bands
 
 
 def run(seed, samples=300):
@@ -23,7 +23,7 @@ def found():
 
 def test_band_is_the_spread_of_drawn_models(found):
     other = run(2)
-    low, high = prediction_bands(found.model, other, found.model.compare(other))["y"]
+    low, high = confidence_bands(found.model, other, found.model.compare(other))["y"]
     rng = np.random.default_rng(3)
     values, covariance = parameter_vector(found.model), np.array(found.model.estimate.covariance)
     free = np.flatnonzero(np.diag(covariance))
@@ -40,7 +40,7 @@ def test_band_is_the_spread_of_drawn_models(found):
 def test_a_model_without_covariance_has_no_band(found):
     other = run(2)
     plain = ftlm.identify(run(1), found.task.structure, method="least-squares").model
-    assert prediction_bands(plain, other, plain.compare(other)) == {}
+    assert confidence_bands(plain, other, plain.compare(other)) == {}
 
 
 def test_the_page_shows_unseen_runs_with_their_band_first(found, tmp_path):
@@ -48,8 +48,8 @@ def test_the_page_shows_unseen_runs_with_their_band_first(found, tmp_path):
     heads = ["on runs that were not fitted</h2>", "Equations</h2>", "Warnings</h2>", "Residuals</h2>", "Settings</h2>"]
     places = [text.index(head) for head in heads]
     assert places == sorted(places)
-    assert text.count("95 % band of the simulation") == 1
+    assert text.count("95 % confidence band of the simulation") == 1
     assert text.index('<details class="part">') > places[2]
     alone = found.report(tmp_path / "alone.html").read_text(encoding="utf-8")
     assert "on runs that were not fitted" not in alone
-    assert "95 % band of the simulation" not in alone
+    assert "95 % confidence band of the simulation" not in alone
