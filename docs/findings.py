@@ -54,6 +54,11 @@ CHANGED_LEVELS = (
     ("none", "second_optimum", "another optimum as good, with other numbers"),
     ("none", "noise_decides", "an order search whose ranks noise decides"),
     ("none", "start_not_told", "two starts explain a run, with two gains"),
+    (
+        "none",
+        "other_intersample_fits",
+        "an input that was not constant between samples, or not linear, as it was taken",
+    ),
     ("none", "moves_before_input", "an output that leaves its level before its input changes"),
 )
 

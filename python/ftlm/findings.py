@@ -281,6 +281,17 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "and by {loss:.1g} % of gain",
         remedy="take at least eight samples a period, or state the behavior between samples with {ask[intersample]}",
     ),
+    "other_intersample_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{input} is {other} between samples, by its runs, and was taken as {taken}|: taken as {other}, it leaves "
+        "{ratio:.3g} times the sum of squared residuals, and {parameter} is {other_value:.4g} instead of {value:.4g} ± "
+        "{error:.2g}",
+        "{input} fits better as {other} between samples than as {taken}: {parameter} is {other_value:.4g}, not "
+        "{value:.4g}",
+        "state {input}={kind} in {ask[intersample]} if that is how it acted",
+        prefix="{run}: ",
+    ),
     "scheme_unstable": FindingKind(
         "step",
         LEVEL_WITH_CARE,

@@ -256,6 +256,178 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     (best, left)
 }
 
+/// Samples needed for each lag of an input in an ARX model, all runs together.
+const SAMPLES_AN_INPUT_LAG: usize = 40;
+/// Share of a column of a regression that is left beside the columns before it, below which it is dropped.
+const COLUMN_TOLERANCE: f64 = 1e-8;
+
+/// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t) of series that may follow inputs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ArxModel {
+    /// Whitening filter 1, a₁, …, aₙ of the noise, without what follows the inputs.
+    pub filter: Vec<f64>,
+    /// First row of the innovations in each series.
+    pub start: usize,
+    /// Innovations w of each series from row `start` on, 0 where a sample is missing.
+    pub innovations: Vec<Vec<f64>>,
+    /// Number of estimated coefficients.
+    pub parameters: usize,
+}
+
+/// ARX model of series with one spectrum, by least squares. O((lags · inputs)² · N).
+///
+/// In a spectrum of the series alone, what follows an input counts as noise, and hides itself. The order of the
+/// autoregression, `most` at most, minimizes the Bayesian information criterion; inputs have the same lags, 0 included,
+/// as far as the number of samples allows. NaN counts as a missing sample of a series; `inputs` have one row for each
+/// series and no missing samples.
+///
+/// ```
+/// // A sinusoid that follows an input, and noise that changes its sign at random: the filter is that of the noise.
+/// let mut state = 1_u32;
+/// let mut sign = || {
+///     state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+///     if state >> 31 == 0 { 0.1 } else { -0.1 }
+/// };
+/// let u: Vec<f64> = (0..1000).map(|t| (0.1 * f64::from(t)).sin()).collect();
+/// let e: Vec<f64> = u.iter().map(|u| 0.5 * u + sign()).collect();
+/// let model = ftlm::signal::statistics::arx_model(&[&e], &[vec![&u]], 25);
+/// let power = model.innovations[0].iter().map(|w| w * w).sum::<f64>() / model.innovations[0].len() as f64;
+/// assert!(model.filter == [1.0] && (power.sqrt() - 0.1).abs() < 0.005);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxModel {
+    let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
+    let most = most.min(counts.iter().min().copied().unwrap_or(0) / SAMPLES_A_COEFFICIENT);
+    let lags = most.min(counts.iter().sum::<usize>() / (SAMPLES_AN_INPUT_LAG * inputs.len().max(1)));
+    let start = most.max(lags);
+    let fixed = 1 + inputs.len() * (lags + 1);
+    let size = fixed + most + 1;
+    // Numbers of any size and unit have squares in range.
+    let (series, scale) = scale_to_one(series);
+    let inputs: Vec<Vec<Vec<f64>>> = inputs.iter().map(|input| scale_to_one(input).0).collect();
+    let fill = |run: usize, t: usize, row: &mut [f64]| {
+        row[0] = 1.0;
+        for (input, columns) in inputs.iter().zip(row[1..fixed].chunks_exact_mut(lags + 1)) {
+            columns.iter_mut().enumerate().for_each(|(k, value)| *value = input[run][t - k]);
+        }
+        row[fixed..size - 1].iter_mut().enumerate().for_each(|(k, value)| *value = series[run][t - 1 - k]);
+        row[size - 1] = series[run][t];
+        row[fixed..].iter().all(|value| !value.is_nan())
+    };
+    let (mut gram, mut row, mut rows) = (vec![vec![0.0; size]; size], vec![0.0; size], 0_usize);
+    for (run, values) in series.iter().enumerate() {
+        for t in start..values.len() {
+            if fill(run, t, &mut row) {
+                rows += 1;
+                for (i, line) in gram.iter_mut().enumerate() {
+                    let factor = row[i];
+                    line[i..].iter_mut().zip(&row[i..]).for_each(|(sum, value)| *sum += factor * value);
+                }
+            }
+        }
+    }
+    for i in 1..size {
+        let (above, below) = gram.split_at_mut(i);
+        above.iter().zip(&mut below[0]).for_each(|(line, value)| *value = line[i]);
+    }
+    let count = rows as f64;
+    let mut regression = Regression::new(gram);
+    (0..fixed).for_each(|column| regression.add(column));
+    let mut best = (f64::INFINITY, regression.clone(), 0);
+    for order in 0..=most {
+        if order > 0 {
+            regression.add(fixed + order - 1);
+        }
+        let left = regression.residual_power();
+        if left.is_nan() || left <= 0.0 {
+            break;
+        }
+        let criterion = count * libm::log(left) + order as f64 * libm::log(count.max(1.0));
+        if criterion < best.0 {
+            best = (criterion, regression.clone(), order);
+        }
+    }
+    let (_, regression, order) = best;
+    let coefficients = regression.coefficients();
+    let innovations = series
+        .iter()
+        .enumerate()
+        .map(|(run, values)| {
+            let error = |t: usize| {
+                let there = fill(run, t, &mut row);
+                let fitted: f64 = row.iter().zip(&coefficients).map(|(value, factor)| value * factor).sum();
+                if there {
+                    scale * (row[size - 1] - fitted)
+                } else {
+                    0.0
+                }
+            };
+            (start.min(values.len())..values.len()).map(error).collect()
+        })
+        .collect();
+    let filter = std::iter::once(1.0).chain(coefficients[fixed..fixed + order].iter().map(|c| -c)).collect();
+    ArxModel { filter, start, innovations, parameters: regression.used.len() }
+}
+
+/// Rows about their own means, all divided by the largest value, and that value; NaN stays.
+fn scale_to_one(rows: &[&[f64]]) -> (Vec<Vec<f64>>, f64) {
+    let centered: Vec<Vec<f64>> = rows
+        .iter()
+        .map(|row| {
+            subtract_mean(row).into_iter().zip(*row).map(|(v, raw)| if raw.is_nan() { f64::NAN } else { v }).collect()
+        })
+        .collect();
+    let largest = centered.iter().flatten().fold(0.0_f64, |most, v| most.max(v.abs()));
+    let scale = if largest > 0.0 { largest } else { 1.0 };
+    (centered.into_iter().map(|row| row.into_iter().map(|v| v / scale).collect()).collect(), scale)
+}
+
+/// Stepwise regression of the last column of a Gram matrix on its others, by the sweep operator.
+#[derive(Debug, Clone)]
+struct Regression {
+    gram: Vec<Vec<f64>>,
+    diagonal: Vec<f64>,
+    used: Vec<usize>,
+}
+
+impl Regression {
+    fn new(gram: Vec<Vec<f64>>) -> Self {
+        let diagonal = gram.iter().enumerate().map(|(k, line)| line[k]).collect();
+        Self { gram, diagonal, used: Vec::new() }
+    }
+
+    /// Add a column, unless the columns before it nearly contain it.
+    fn add(&mut self, column: usize) {
+        let pivot = self.gram[column][column];
+        if pivot.is_nan() || pivot <= COLUMN_TOLERANCE * self.diagonal[column] {
+            return;
+        }
+        let line: Vec<f64> = self.gram[column].iter().map(|value| value / pivot).collect();
+        for (_, other) in self.gram.iter_mut().enumerate().filter(|(k, _)| *k != column) {
+            let factor = other[column];
+            other.iter_mut().zip(&line).for_each(|(value, taken)| *value -= factor * taken);
+            other[column] = -factor / pivot;
+        }
+        self.gram[column] = line;
+        self.gram[column][column] = 1.0 / pivot;
+        self.used.push(column);
+    }
+
+    /// Sum of squares that the columns leave of the last one.
+    fn residual_power(&self) -> f64 {
+        self.gram.last().and_then(|line| line.last()).copied().unwrap_or(0.0)
+    }
+
+    /// Coefficient of each column, 0 for those that are not used; none for the last.
+    fn coefficients(&self) -> Vec<f64> {
+        let last = self.gram.len() - 1;
+        let mut found = vec![0.0; last];
+        self.used.iter().for_each(|&column| found[column] = self.gram[column][last]);
+        found
+    }
+}
+
 /// Autocovariances at lags 0 to `count` − 1 of an autoregression with this filter and innovation variance.
 ///
 /// ```

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 
 import ftlm
 from ftlm import _core
 from ftlm.plot.comparison_charts import residual_charts
 from ftlm.utils.statistics import autoregression, chi_squared_99, is_white, whiten_series
-from ftlm.validation.residual_tests import residual_findings
+from ftlm.validation import residual_tests
+from ftlm.validation.residual_tests import NoiseModel, residual_findings
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 
@@ -269,7 +271,7 @@ def motor_record(seed, *, coloured=False):
     u = np.where(np.arange(n) % 400 < 200, 1.0, -1.0)
     late = np.concatenate([np.zeros(35), np.repeat(u, fine)])[: n * fine]
     motor = tuple(np.array(part) for part in ([[-1 / 0.12]], [[8 / 0.12]], [[1.0]], [[0.0]]))
-    a, b, c, d, _ = signal.cont2discrete(motor, step / fine, "zoh")
+    a, b, c, d, _ = scipy.signal.cont2discrete(motor, step / fine, "zoh")
     y = signal.dlsim((a, b, c, d, step / fine), late)[1][::fine, 0]
     noise = rng.standard_normal(n + 60)
     noise = np.convolve(noise, 0.9 ** np.arange(61), "valid")[:n] if coloured else noise[:n]
@@ -320,7 +322,9 @@ def test_the_whitening_filter_is_that_of_yule_and_walker():
 
 def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatch):
     # A slow sine of a few samples: were its correlations judged as they are, the limit would be above 1.
-    monkeypatch.setattr("ftlm.validation.residual_tests.autoregression", lambda series, most: np.ones(1))
+    monkeypatch.setattr(
+        NoiseModel, "fit", lambda series, inputs, lags: NoiseModel(np.ones(1), 0, [e - e.mean() for e in series], 1.0)
+    )
     n = 60
     t = np.arange(n)
     u = np.sin(2 * np.pi * t / 120)
@@ -367,3 +371,110 @@ def test_the_caption_of_a_chart_says_what_its_bars_do(long_run, small_model):
             assert f"; {outside} of {bars.size} bars leave" in chart.caption
             assert ("could be" in chart.caption) is test.passed
             assert ("is not" in chart.caption) is not test.passed
+
+
+def held(numerator, denominator, u, step):
+    """Response of a transfer function to an input that is constant between samples, by SciPy."""
+    b, a, _ = scipy.signal.cont2discrete((numerator, denominator), step)
+    return scipy.signal.lfilter(np.ravel(b), a, u)
+
+
+SLOW_INPUTS = {
+    "step": lambda t: (t > 9.0).astype(float),
+    "chirp": lambda t: np.sin((0.2 + 0.05 * t) * t),
+    "two sines": lambda t: np.sin(1.3 * t) + 0.7 * np.sin(3.1 * t + 1.0),
+    "square": lambda t: np.sign(np.sin(0.9 * t)),
+}
+
+
+@pytest.mark.parametrize("kind", SLOW_INPUTS)
+def test_a_missing_lag_is_found_under_slow_inputs(kind):
+    """What the model lacks has the colour of such an input, which a spectrum of the residuals takes for noise."""
+    step, tau = 0.05, 0.9
+    t = step * np.arange(900)
+    u = SLOW_INPUTS[kind](t)
+    for seed in range(3):
+        y = held([1.0], np.polymul([tau, 1.0], [0.2 * tau, 1.0]), u, step)
+        y += np.random.default_rng(seed).normal(0.0, 0.02 * np.std(y), t.size)
+        run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y})
+        lacking = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
+        assert "residuals_follow_input" in {f.code for f in lacking.findings}
+        whole = ftlm.identify(run, ftlm.equation("D^2 y = a1 D y + a0 y + b u"))
+        assert "residuals_follow_input" not in {f.code for f in whole.findings}
+
+
+def test_coloured_noise_under_slow_inputs_raises_no_alarm():
+    """Of noise that follows no input, about one series in a hundred fails, whatever the colours of both."""
+    failed, tried = 0, 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        t = 0.05 * np.arange(600)
+        white = rng.normal(size=t.size)
+        for noise in (
+            white,
+            scipy.signal.lfilter([1.0], [1.0, -0.9], white),
+            scipy.signal.lfilter([1.0], [1.0, -1.8, 0.9], white),
+        ):
+            for shape in SLOW_INPUTS.values():
+                u = shape(t)
+                model = NoiseModel.fit([noise], [[u]], 25)
+                failed += residual_tests._independence([noise], [u], model, 25, first=0).failed
+                tried += 1
+    assert failed <= 0.03 * tried
+
+
+def test_the_arx_model_is_that_of_least_squares():
+    """Against NumPy on the same columns, with missing samples and two runs."""
+    rng = np.random.default_rng(5)
+    inputs = [rng.normal(size=400), rng.normal(size=300)]
+    series = [scipy.signal.lfilter([1.0], [1.0, -0.7], rng.normal(size=u.size)) + 0.8 * np.roll(u, 1) for u in inputs]
+    series[0][50] = np.nan
+    through, start, innovations, parameters = _core.arx_model(series, [inputs], 4)
+    lags = through.size - 1
+    rows, wanted = [], []
+    for raw, given in zip(series, inputs, strict=True):
+        e, u = raw - np.nanmean(raw), given - given.mean()
+        for k in range(start, e.size):
+            row = [1.0, *(u[k - j] for j in range(5)), *(e[k - j] for j in range(1, 5))]
+            if not np.isnan([e[k], *row]).any():
+                rows.append(row[: 6 + lags])
+                wanted.append(e[k])
+    found = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
+    assert parameters == 6 + lags
+    assert start == 4
+    np.testing.assert_allclose(-through[1:], found[6:], rtol=1e-9)
+    power = sum(float(w @ w) for w in innovations)
+    np.testing.assert_allclose(power, np.sum((np.array(wanted) - np.array(rows) @ found) ** 2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("true", ["foh", "zoh"])
+def test_a_wrong_behavior_between_samples_is_found(true):
+    """Half a sample of delay lies between the two; the finding has the estimate of the other one."""
+    step, a, b = 0.05, -1.2, 2.5
+    t = step * np.arange(900)
+    u = SLOW_INPUTS["two sines"](t)
+    other = {"foh": "zoh", "zoh": "foh"}[true]
+    for seed in range(3):
+        y = scipy.signal.lsim(([b], [1.0, -a]), u, t)[1] if true == "foh" else held([b], [1.0, -a], u, step)
+        y += np.random.default_rng(seed).normal(0.0, 0.02 * np.std(y), t.size)
+        run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y}, intersample={"u": true})
+        structure = ftlm.equation("D y = a y + b u")
+        right = ftlm.identify(run, structure)
+        assert "other_intersample_fits" not in {f.code for f in right.findings}
+        wrong = ftlm.identify(run.with_intersample({"u": other}), structure)
+        (found,) = [f for f in wrong.findings if f.code == "other_intersample_fits"]
+        assert (found.input, found.parameter, found.numbers["kind"]) == ("u", "a", true)
+        assert abs(wrong.parameters["a"].value - a) > 8 * wrong.parameters["a"].standard_error
+        assert found.numbers["other_value"] == pytest.approx(right.parameters["a"].value, rel=1e-4)
+
+
+def test_an_input_of_noise_and_a_missing_lag_keep_their_behavior_between_samples():
+    """Neither coloured noise nor a lag that the structure lacks passes for another reading of the input."""
+    rng = np.random.default_rng(3)
+    t = 0.05 * np.arange(900)
+    for u, denominator in ((rng.normal(size=t.size), [1.0, 1.2]), (SLOW_INPUTS["two sines"](t), [0.2, 1.2, 1.2])):
+        noise = scipy.signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=t.size))
+        y = held([2.0], denominator, u, 0.05)
+        run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y + 0.05 * np.std(y) * noise})
+        found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
+        assert "other_intersample_fits" not in {f.code for f in found.findings}

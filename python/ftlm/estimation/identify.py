@@ -16,7 +16,7 @@ from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.alternative_starts import start_not_told_findings
+from ftlm.estimation.alternative_assumptions import intersample_findings, start_not_told_findings
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
@@ -339,6 +339,8 @@ def assess_fit(fit: Fit) -> Identification:
         findings = [_noise_finding(f, tests) for f in findings] + _residual_findings(fit, tests)
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)
+        if any(f.code in (*LEFT_OUT_CODES, "noise_coloured") for f in findings):
+            findings += intersample_findings(fit)
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
     result = Identification(

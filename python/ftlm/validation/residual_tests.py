@@ -29,7 +29,6 @@ from ftlm.utils.statistics import (
     NORMAL_99,
     SIGNIFICANCE_LEVEL,
     autocorrelations,
-    autoregression,
     chi_squared_99,
     is_constant,
     portmanteau,
@@ -387,10 +386,8 @@ def _test_output(
         return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across))
     series = [np.where(gone, np.nan, e) for e, gone in zip(series, gaps, strict=True)]
     white_test = _whiteness(series, everything.size, lags)
-    # Through this filter the residuals are white, and the inputs lose what they share with them by chance alone.
-    colour = autoregression(series, lags)
-    white = whiten_series(series, colour)
     moving = {n: signals[n] for n in run_inputs if not is_constant(signals[n])}
+    noise = NoiseModel.fit(series, list(moving.values()), lags)
     loops = {
         name: feedback_test(series, moving[name], [v for n, v in moving.items() if n != name])
         for name in commands
@@ -398,10 +395,10 @@ def _test_output(
     }
     inputs = {}
     for name, values in signals.items():
-        inputs[name] = _independence(white, values, colour, lags, first=0)
+        inputs[name] = _independence(series, values, noise, lags, first=0)
         if inputs[name].failed and not commands.get(name, True):
             # What answers within the sample is no sign of what the model lacks.
-            later = _independence(white, values, colour, lags, first=1)
+            later = _independence(series, values, noise, lags, first=1)
             inputs[name] = later if later.passed else inputs[name]
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
@@ -419,17 +416,59 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
     return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
 
 
+@dataclass(frozen=True)
+class NoiseModel:
+    """Autoregressive model of residuals without what follows the inputs.
+
+    Parameters
+    ----------
+    filter
+        Whitening filter.
+    start
+        First row of the innovations.
+    innovations
+        White noise that drives the residuals, per run.
+    inflation
+        Ratio of its variance to the mean square of the innovations, which the fit of the coefficients made smaller.
+    """
+
+    filter: Floats
+    start: int
+    innovations: list[Floats]
+    inflation: float
+
+    @classmethod
+    def fit(cls, series: list[Floats], inputs: list[list[Floats]], lags: int) -> NoiseModel:
+        """Fit an ARX model to residuals and keep its noise.
+
+        An autoregression of the residuals alone takes what follows a periodic or slow input for noise, and so hides it.
+        """
+        through, start, innovations, parameters = _core.arx_model(series, inputs, lags)
+        rows = sum(row.size for row in innovations)
+        return cls(through, start, innovations, rows / max(rows - parameters, 1))
+
+    def whiten(self, series: list[Floats]) -> list[Floats]:
+        """Return series after the whitening filter, from the first row of the innovations on."""
+        lead = self.start - (self.filter.size - 1)
+        return [np.ascontiguousarray(row[lead:]) for row in whiten_series(series, self.filter)]
+
+
 def _independence(
-    white: list[Floats], signal: list[Floats], colour: Floats, lags: int, *, first: int
+    series: list[Floats], signal: list[Floats], noise: NoiseModel, lags: int, *, first: int
 ) -> CorrelationTest:
     """Largest correlation at lags from ``first`` on, against a simultaneous band for all of them."""
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
         return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, conclusive=False)
-    through = whiten_series(signal, colour)
-    cross, variance, _ = _core.correlation(white, through, lags)
+    # Through this filter the noise is white, and the inputs lose what they share with it by chance alone.
+    white, through = noise.whiten(series), noise.whiten(signal)
+    cross, _, _ = _core.correlation(white, through, lags)
+    _, variance, _ = _core.correlation(noise.innovations, through, lags)
     # Noise that is larger where the input moves widens correlations as its color does.
-    spread = math.sqrt(max(variance, _product_variance(white, through, lags)))
+    variance = max(variance, _product_variance(noise.innovations, through, lags))
+    power, driven = (sum(dot(row, row) for row in rows) for rows in (white, noise.innovations))
+    share = noise.inflation * driven / power if power > 0.0 else 1.0
+    spread = math.sqrt(variance * min(share, noise.inflation))
     largest = float(np.max(np.abs(cross[lags + first :])))
     limit = NormalDist().inv_cdf(1 - (1 - (1 - SIGNIFICANCE_LEVEL) ** (1 / (lags + 1 - first))) / 2) * spread
     decided = limit < 1.0

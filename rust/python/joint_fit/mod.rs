@@ -10,6 +10,6 @@ pub use fit::{joint_fit, joint_multistart, JointMultistart};
 pub use problem::JointProblem;
 pub use profile::{cost_surface, profile_intervals};
 pub use residuals::{
-    autocovariances, chi_squared, covariance_of, fit_covariance, is_white, long_run_covariance, portmanteau,
+    arx_model, autocovariances, chi_squared, covariance_of, fit_covariance, is_white, long_run_covariance, portmanteau,
     whitening_filter,
 };

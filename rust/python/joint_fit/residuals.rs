@@ -79,6 +79,36 @@ pub fn whitening_filter<'py>(
     Ok((PyArray1::from_vec(py, filter), power))
 }
 
+/// ARX model of series that may follow inputs: whitening filter of the noise, first row and values of the innovations,
+/// number of coefficients.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
+pub fn arx_model<'py>(
+    py: Python<'py>,
+    series: List<PyReadonlyArray1<'py, f64>>,
+    inputs: List<List<PyReadonlyArray1<'py, f64>>>,
+    most: usize,
+) -> PyResult<(Array<'py>, usize, Vec<Array<'py>>, usize)> {
+    let series = copy_vectors("series", &series)?;
+    let inputs = inputs.iter().map(|rows| copy_vectors("inputs", rows)).collect::<PyResult<Vec<_>>>()?;
+    let lags = most.saturating_mul(inputs.len() + 1).max(1);
+    let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(lags);
+    let model = run_interruptible(py, points, None, move |_| {
+        for rows in &inputs {
+            crate::error::check_length("inputs", series.len(), rows.len())?;
+            for (input, row) in rows.iter().zip(&series) {
+                crate::error::check_length("inputs", row.len(), input.len())?;
+                crate::error::check_finite("inputs", input)?;
+            }
+        }
+        crate::error::check_points("lags by 256", lags.saturating_mul(256))?;
+        let given: Vec<Vec<&[f64]>> = inputs.iter().map(|rows| rows.iter().map(Vec::as_slice).collect()).collect();
+        Ok(statistics::arx_model(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), &given, most))
+    })?;
+    let innovations = model.innovations.into_iter().map(|row| PyArray1::from_vec(py, row)).collect();
+    Ok((PyArray1::from_vec(py, model.filter), model.start, innovations, model.parameters))
+}
+
 /// Autocovariances of series at lags from 0, and the number of pairs in each mean.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]

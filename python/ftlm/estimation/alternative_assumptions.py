@@ -1,20 +1,25 @@
-"""Gains under other hypotheses on the start of a run: a finding where the data do not decide between them."""
+"""Estimates under other assumptions on the start of a run and on its inputs between samples."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ftlm.analysis.poles import steady_states
+from ftlm.data.run import Run
+from ftlm.data.sampling import ZERO_ORDER_HOLD, Intersample, drop_missing
 from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import number_covariance
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.nuisance_parameters import refit_from
+from ftlm.estimation.nuisance_parameters import fit_score, refit_from
 from ftlm.estimation.output_error import JointFit
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
-from ftlm.simulation.initial_conditions import rest_evidence
+from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
 from ftlm.structure.structure import Initial, Offset, Structure
 
 #: Other starts that a fit is compared with.
@@ -28,6 +33,9 @@ OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
 MAX_SQUARES_RATIO = 1.05
 #: Difference of two gains, in joint standard errors and relative to the larger one, from which on they contradict.
 GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
+#: Least share of rows in which an input changes, so that its behavior between samples is in doubt.
+MIN_CHANGING_SHARE = 0.5
+_BETWEEN_SAMPLES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 
 
 def start_not_told_findings(fit: Fit) -> list[Finding]:
@@ -61,6 +69,49 @@ def start_not_told_findings(fit: Fit) -> list[Finding]:
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
                 worst = distance, make_finding("start_not_told", **about, **numbers, **words)
     return [worst[1]] if worst else []
+
+
+def intersample_findings(fit: Fit) -> list[Finding]:
+    """Return a finding on each input whose other behavior between samples the runs clearly prefer.
+
+    An input that changes from row to row may be a staircase that the plant received, or samples of a smooth signal.
+    Half a sample of delay lies between the two, which a fit takes for a property of the plant. Each such input is
+    refitted from the optimum with its other behavior.
+    """
+    joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
+    if joint is None or structure.has_friction or structure.limits:
+        return []
+    findings = []
+    for name in runs[0].inputs:
+        if name not in structure.signals or not _changes_often(runs, name):
+            continue
+        other: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
+        changed = tuple(run.with_intersample({name: other}) for run in runs)
+        try:
+            refit = refit_from(joint, changed, replace(structure, initial=joint.initial))
+        except FtlmError:
+            continue
+        if refit.unstable_optimum is not None:
+            continue
+        if not fit_score(refit, joint) + START_SETTINGS.history_margin < fit_score(joint, joint):
+            continue
+        ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
+        values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
+        moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
+        if not moves or not max(moves.values()) > 1.0:
+            continue
+        most = max(moves, key=lambda n: moves[n])
+        numbers = {"value": values[most], "error": errors[most], "other_value": others[most], "ratio": ratio}
+        words = {"taken": _BETWEEN_SAMPLES[runs[0].intersample[name]], "other": _BETWEEN_SAMPLES[other]}
+        about = {"run": ", ".join(r.name for r in runs), "input": name, "parameter": most, "kind": other}
+        findings.append(make_finding("other_intersample_fits", **about, **numbers, **words))
+    return findings
+
+
+def _changes_often(runs: Sequence[Run], name: str) -> bool:
+    """Whether an input changes in most rows of the runs."""
+    steps = np.concatenate([np.diff(drop_missing(run[name])) for run in runs])
+    return bool(np.count_nonzero(steps) > MIN_CHANGING_SHARE * steps.size)
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:
