@@ -261,7 +261,7 @@ const SAMPLES_AN_INPUT_LAG: usize = 40;
 /// Share of a column of a regression that is left beside the columns before it, below which it is dropped.
 const COLUMN_TOLERANCE: f64 = 1e-8;
 
-/// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t) of series that may follow inputs.
+/// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t), k ≥ 1, of series that may follow inputs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArxModel {
     /// Whitening filter 1, a₁, …, aₙ of the noise, without what follows the inputs.
@@ -277,9 +277,9 @@ pub struct ArxModel {
 /// ARX model of series with one spectrum, by least squares. O((lags · inputs)² · N).
 ///
 /// In a spectrum of the series alone, what follows an input counts as noise, and hides itself. The order of the
-/// autoregression, `most` at most, minimizes the Bayesian information criterion; inputs have the same lags, 0 included,
-/// as far as the number of samples allows. NaN counts as a missing sample of a series; `inputs` have one row for each
-/// series and no missing samples.
+/// autoregression, `most` at most, minimizes the Bayesian information criterion; inputs have lags from 1 to `most`, as
+/// far as the number of samples allows. At lag 0 a controller's input contains the noise itself. NaN counts as a missing
+/// sample of a series; `inputs` have one row for each series and no missing samples.
 ///
 /// ```
 /// // A sinusoid that follows an input, and noise that changes its sign at random: the filter is that of the noise.
@@ -301,15 +301,15 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
     let most = most.min(counts.iter().min().copied().unwrap_or(0) / SAMPLES_A_COEFFICIENT);
     let lags = most.min(counts.iter().sum::<usize>() / (SAMPLES_AN_INPUT_LAG * inputs.len().max(1)));
     let start = most.max(lags);
-    let fixed = 1 + inputs.len() * (lags + 1);
+    let fixed = 1 + inputs.len() * lags;
     let size = fixed + most + 1;
     // Numbers of any size and unit have squares in range.
     let (series, scale) = scale_to_one(series);
     let inputs: Vec<Vec<Vec<f64>>> = inputs.iter().map(|input| scale_to_one(input).0).collect();
     let fill = |run: usize, t: usize, row: &mut [f64]| {
         row[0] = 1.0;
-        for (input, columns) in inputs.iter().zip(row[1..fixed].chunks_exact_mut(lags + 1)) {
-            columns.iter_mut().enumerate().for_each(|(k, value)| *value = input[run][t - k]);
+        for (input, columns) in inputs.iter().zip(row[1..fixed].chunks_exact_mut(lags.max(1))) {
+            columns.iter_mut().enumerate().for_each(|(k, value)| *value = input[run][t - 1 - k]);
         }
         row[fixed..size - 1].iter_mut().enumerate().for_each(|(k, value)| *value = series[run][t - 1 - k]);
         row[size - 1] = series[run][t];

@@ -435,14 +435,14 @@ def test_the_arx_model_is_that_of_least_squares():
     for raw, given in zip(series, inputs, strict=True):
         e, u = raw - np.nanmean(raw), given - given.mean()
         for k in range(start, e.size):
-            row = [1.0, *(u[k - j] for j in range(5)), *(e[k - j] for j in range(1, 5))]
+            row = [1.0, *(u[k - j] for j in range(1, 5)), *(e[k - j] for j in range(1, 5))]
             if not np.isnan([e[k], *row]).any():
-                rows.append(row[: 6 + lags])
+                rows.append(row[: 5 + lags])
                 wanted.append(e[k])
     found = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
-    assert parameters == 6 + lags
+    assert parameters == 5 + lags
     assert start == 4
-    np.testing.assert_allclose(-through[1:], found[6:], rtol=1e-9)
+    np.testing.assert_allclose(-through[1:], found[5:], rtol=1e-9)
     power = sum(float(w @ w) for w in innovations)
     np.testing.assert_allclose(power, np.sum((np.array(wanted) - np.array(rows) @ found) ** 2), rtol=1e-9)
 
