@@ -5,10 +5,8 @@ import gzip
 import os
 import struct
 import tempfile
-import zlib
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 import ftlm
@@ -17,6 +15,7 @@ from ftlm.io import isolated_reader as apart
 from ftlm.io.dialect import Layout
 from ftlm.order_search import checkpoint as frames
 from ftlm.structure.order import Order, parse_values
+from ftlm.utils.checkpoint_file import RECORD_ENCODER, CheckpointFile
 
 #: Files of the fuzzers live in memory where there is such a place.
 FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
@@ -110,25 +109,27 @@ def values(data):
 
 
 def sealed(data):
-    """A store whose digests are right, whatever its frames say: what a forger would write.
+    """A store whose digests are right, whatever its records say: what a forger would write.
 
     The input is a chain of payloads, each behind its length.
     """
-    pieces, at, digest = [frames.FILE_SIGNATURE], 0, bytes(frames.DIGEST_BYTES)
-    offset = len(frames.FILE_SIGNATURE)
+    payloads, at = [], 0
     while at + 4 <= len(data):
         (length,) = struct.unpack_from("<I", data, at)
-        payload = data[at + 4 : at + 4 + length]
+        payloads.append(data[at + 4 : at + 4 + length])
         at += 4 + length
-        piece, digest = frames.encode_frame(payload, offset, digest)
-        pieces.append(piece)
-        offset += len(piece)
-    stored(b"".join(pieces))
+    path = _file(".ftlm", b"")
+    with CheckpointFile(path, "search", "create") as file:
+        file.append(payloads)
+    _search_of(path)
 
 
 def stored(data):
     """A store as a file."""
-    path = _file(".ftlm", data)
+    _search_of(_file(".ftlm", data))
+
+
+def _search_of(path):
     found = ftlm.search_status(path)
     if all(s.candidates <= 200_000 for s in found.values()):
         ftlm.resume_search(path, threads=1)
@@ -170,19 +171,11 @@ NEEDS = {
 SLOW = ("mat", "parquet")
 
 
-def unsealed(data):
+def unsealed(path):
     """Payloads of a store, each behind its length: what :func:`sealed` takes."""
-    at, out = len(frames.FILE_SIGNATURE), []
-    while at < len(data):
-        (length,) = struct.unpack_from("<I", data, at)
-        assert (
-            struct.unpack_from("<I", data, at + 4)[0]
-            == frames._length_checksum(data[at : at + 4], at)
-            != zlib.crc32(b"")
-        )
-        out.append(data[at : at + 4] + data[at + 8 : at + 8 + length])
-        at += 8 + length + frames.DIGEST_BYTES
-    return b"".join(out)
+    with CheckpointFile(path, "search") as file:
+        payloads, _ = file.read()
+    return b"".join(struct.pack("<I", len(payload)) + payload for payload in payloads)
 
 
 @functools.cache
@@ -276,15 +269,15 @@ def _seeds(target, folder):
     ftlm.search_orders(
         run, structure, ftlm.order_grid(increment=0.25), m=16, store=folder / "a.ftlm", pruning=False, threads=1
     )
-    whole = (folder / "a.ftlm").read_bytes()
-    halves = unsealed(whole)
+    halves = unsealed(folder / "a.ftlm")
     request = frames.FRAME_DECODER.decode(halves[4 : 4 + struct.unpack_from("<I", halves)[0]])
     half = frames.PartialRounds(
         0, 0, 1, (0, 1, 4, 256, float("inf")), ((0, 1.0, (1.0, 2.0), ((),)),), (0, 0, 1, 0, 0, 0, 0), ()
     )
-    payloads = [msgspec.msgpack.encode(frame) for frame in (request, half)]
+    payloads = [RECORD_ENCODER.encode(frame) for frame in (request, half)]
     half_done = b"".join(struct.pack("<I", len(p)) + p for p in payloads)
     law = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u")
     ftlm.search_orders(run, law, ftlm.order_grid(increment=0.25), m=16, store=folder / "b.ftlm", top=3, threads=1)
-    of_law = (folder / "b.ftlm").read_bytes()
-    return (halves, half_done, unsealed(of_law)) if target == "sealed" else (whole, of_law)
+    if target == "sealed":
+        return halves, half_done, unsealed(folder / "b.ftlm")
+    return tuple((folder / f"{name}.ftlm").read_bytes() for name in "ab")

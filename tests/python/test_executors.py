@@ -18,7 +18,7 @@ import pytest
 import ftlm
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.order_search import batches
-from ftlm.order_search.checkpoint import SEARCH_FILE, FrameFile
+from ftlm.utils.checkpoint_file import CheckpointFile
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 
@@ -390,7 +390,7 @@ def test_a_killed_search_leaves_neither_a_lock_nor_workers(tmp_path, method):
             time.sleep(0.05)
         process.kill()
     # In the moment of the kill, while the workers may live.
-    FrameFile(tmp_path / "a.ftlm", SEARCH_FILE, create=False).close()
+    CheckpointFile(tmp_path / "a.ftlm", "search", "resume").close()
     workers = [int(word) for word in (tmp_path / "pids").read_text().split()]
     assert workers
     try:

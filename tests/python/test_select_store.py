@@ -1,8 +1,10 @@
 """A selection that was stopped goes on where it was, to the same bits; what is no store of it is refused in words."""
 
+import contextlib
+import dataclasses
 import shutil
+import sqlite3
 
-import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -10,19 +12,11 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm.cli.main import app
 from ftlm.estimation.output_error import fit_output_error
-from ftlm.order_search import checkpoint as frames
 from ftlm.structure_selection import cross_validation as trial
 from ftlm.structure_selection.candidates import name_candidates
-from ftlm.structure_selection.checkpoint import (
-    ANSWER_ENCODER,
-    SELECTION_FILE,
-    FitError,
-    FitFile,
-    Request,
-    Store,
-    StoredAnswer,
-)
+from ftlm.structure_selection.checkpoint import FitError, Request, Store, StoredAnswer, StoredFit
 from ftlm.structure_selection.cross_validation import Folds
+from ftlm.utils.checkpoint_file import RECORD_ENCODER, CheckpointFile
 from test_select import motor
 
 SECOND = ftlm.equation("D^2 y = d D y + a y + b u")
@@ -95,34 +89,38 @@ def test_screened_subsets_are_kept(tmp_path):
     assert ftlm.select(made, asked, threads=1, store=place).to_dict() == plain.to_dict()
 
 
-def test_a_store_cut_anywhere_goes_on_and_one_that_is_damaged_is_refused(runs, whole, tmp_path):
+def test_a_store_stopped_anywhere_goes_on_and_one_that_is_damaged_is_refused(runs, whole, tmp_path):
     path, found = whole
     data, place = path.read_bytes(), tmp_path / "cut.ftlm"
-    ends = [len(SELECTION_FILE.magic)]
-    digest = bytes(frames.DIGEST_BYTES)
-    while ends[-1] < len(data):
-        _, digest, end = frames.next_frame(memoryview(data), ends[-1], digest)
-        ends.append(end)
-    assert len(ends) == 6  # The request, two fits, two judgements.
     request = Request.of(*_asked(runs))
-    rng = np.random.default_rng(8)
-    cuts = [*rng.integers(0, len(data), 60).tolist(), *ends[1:], 0, 5]
-    for cut in cuts:
-        place.write_bytes(data[:cut])
+    with CheckpointFile(path, "selection") as file:
+        payloads, _ = file.read()
+    assert len(payloads) == 5  # The request, two fits, two judgements.
+    for count in range(5):
+        place.write_bytes(data)
+        with contextlib.closing(sqlite3.connect(place)) as file, file:
+            file.execute("DELETE FROM selection WHERE number > ?", (count,))
         with Store(place, request) as kept:
-            assert len(kept) == max(sum(end <= cut for end in ends[1:]) - 1, 0)
-        # What was torn is gone; a fresh one has its first frame again.
-        assert place.read_bytes() == data[: max([e for e in ends if e <= cut and e > ends[0]], default=ends[1])]
-    for place_of in rng.integers(0, len(data) - 200, 60).tolist():
+            assert len(kept) == max(count - 1, 0)
+        assert ftlm.select(runs, [SECOND, FIRST], threads=1, store=place).to_dict() == found.to_dict()
+        with CheckpointFile(place, "selection") as file:
+            assert file.read() == (payloads, None)
+    rng, damaged = np.random.default_rng(8), 0
+    for at in rng.integers(0, len(data), 200).tolist():
         flipped = bytearray(data)
-        flipped[place_of] ^= 0x10
-        place.write_bytes(bytes(flipped))
-        with pytest.raises(ftlm.DataError, match=r"damaged|no ftlm selection store|holds something else"):
-            Store(place, request)
-        assert place.read_bytes() == bytes(flipped)
-    place.write_bytes(data[: ends[3]])
-    assert ftlm.select(runs, [SECOND, FIRST], threads=1, store=place).to_dict() == found.to_dict()
-    assert place.read_bytes() == data
+        flipped[at] ^= 0x10
+        for content in (bytes(flipped), data[: at + 1]):
+            place.write_bytes(content)
+            try:
+                Store(place, request).close()
+            except ftlm.DataError:
+                damaged += 1
+                assert place.read_bytes() == content
+            else:
+                # Some bytes of a page hold nothing.
+                with CheckpointFile(place, "selection") as file:
+                    assert file.read() == (payloads, None)
+    assert damaged > 250
 
 
 def _asked(runs):
@@ -166,7 +164,7 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
     with pytest.raises(ftlm.DataError, match="is no ftlm selection store; give a file written with store="):
         ftlm.select(runs, [FIRST], store=text)
     assert text.read_text() == "to do\n"
-    with pytest.raises(ftlm.DataError, match="cannot be opened"):
+    with pytest.raises(ftlm.DataError, match="is no regular file"):
         ftlm.select(runs, [FIRST], store=tmp_path)
     with pytest.raises(ftlm.DataError, match="cannot be opened: No such file"):
         ftlm.select(runs, [FIRST], store=tmp_path / "no" / "such.ftlm")
@@ -178,8 +176,8 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
         ftlm.search_status(place)
     forged = tmp_path / "forged.ftlm"
     with Store(forged, request) as kept:
-        kept._log.append([ANSWER_ENCODER.encode(request)])
-    with pytest.raises(ftlm.DataError, match="holds something else at byte"):
+        kept._file.append([RECORD_ENCODER.encode(request)])
+    with pytest.raises(ftlm.DataError, match="holds something else in record"):
         Store(forged, request)
 
 
@@ -191,49 +189,56 @@ def test_errors_of_candidates_are_kept_and_those_of_ftlm_are_not(runs, tmp_path)
         wrong = ftlm.InternalError("a panic")
         assert kept.fit(SECOND, [], True, lambda: wrong) is wrong
         assert len(kept) == 1
-    assert ANSWER_ENCODER.encode(StoredAnswer(b"0", FitError("DataError", "x")))
+    assert RECORD_ENCODER.encode(StoredAnswer(b"0", FitError("DataError", "x")))
 
 
 def _forged(path, request, *payloads):
     """A store as the log itself writes it, its digests valid whatever its frames hold."""
     with Store(path, request) as kept:
-        kept._log.append(payloads)
+        kept._file.append(payloads)
     return path
 
 
 def _fit(runs):
     resting = ftlm.equation("D y = a y + b u", initial="rest")
-    return FitFile.of(fit_output_error(runs, resting, start={"a": -1.0, "b": 1.0}))
+    return StoredFit.of(fit_output_error(runs, resting, start={"a": -1.0, "b": 1.0}))
 
 
 def test_wrong_contents_under_valid_digests_are_refused_in_words(runs, tmp_path):
     request = Request.of(*_asked(runs))
     plain = _fit(runs)
-    sound = _forged(tmp_path / "sound.ftlm", request, ANSWER_ENCODER.encode(StoredAnswer(b"0", plain)))
+    sound = _forged(tmp_path / "sound.ftlm", request, RECORD_ENCODER.encode(StoredAnswer(b"0", plain)))
     with Store(sound, request) as kept:
         assert len(kept) == 1
-    unknown = ANSWER_ENCODER.encode(StoredAnswer(b"0", FitError("KeyError", "x")))
-    history = msgspec.structs.replace(plain, initial="auto", history=True)
+    unknown = RECORD_ENCODER.encode(StoredAnswer(b"0", FitError("KeyError", "x")))
+    history = StoredFit(dataclasses.replace(plain.joint, initial="auto"), True)
+    joint = plain.joint
+
+    def but(**changes):
+        return StoredFit(dataclasses.replace(joint, **changes), plain.history)
+
     fits = {
         r"a covariance or values of other than its \d numbers": [
-            msgspec.structs.replace(plain, covariance=plain.covariance[:-8]),
-            msgspec.structs.replace(plain, covariance=plain.covariance + b"0"),
-            msgspec.structs.replace(plain, on_grid=plain.on_grid * 2),
-            msgspec.structs.replace(plain, coefficients=plain.coefficients | {"c": 1.0}),
+            but(covariance=joint.covariance[:-1]),
+            but(covariance=joint.covariance.ravel()),
+            but(finest_grid_values=np.tile(joint.finest_grid_values, 2)),
+            but(coefficients=joint.coefficients | {"c": 1.0}),
         ],
-        "residuals that are no doubles": [msgspec.structs.replace(plain, residuals=({"y": b"1234567"},))],
+        "residuals that are no series": [but(residuals=[{"y": np.zeros((2, 2))}])],
         "a history that is no powers of t but 'auto'": [history],
     }
-    wrong = [("holds something else at byte .*choose another file", unknown)]
+    wrong = [("holds something else in record .*choose another file", unknown)]
     wrong += [
-        ("holds something else at byte .*choose another file", ANSWER_ENCODER.encode(StoredAnswer(b"0", one)))
+        ("holds something else in record .*choose another file", RECORD_ENCODER.encode(StoredAnswer(b"0", one)))
         for one in (
-            msgspec.structs.replace(plain, initial="nowhere"),
-            msgspec.structs.replace(plain, growth=(True, "x", False)),
+            but(initial="nowhere"),
+            but(unstable_optimum=(True, "x", False)),
+            but(covariance=((2, 2), bytes(31))),
+            but(covariance=((-1, 1 << 60), bytes(32))),
         )
     ]
     wrong += [
-        (f"holds a fit with {words} at byte .*; choose another file", ANSWER_ENCODER.encode(StoredAnswer(b"0", one)))
+        (f"holds a fit with {words} in record .*; choose another file", RECORD_ENCODER.encode(StoredAnswer(b"0", one)))
         for words, each in fits.items()
         for one in each
     ]
@@ -247,7 +252,7 @@ def test_wrong_contents_under_valid_digests_are_refused_in_words(runs, tmp_path)
 
 def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
     request = Request.of(*_asked(runs))
-    joint = _fit(runs).joint()
+    joint = _fit(runs).fit()
 
     def ask(kept, what):
         if what == "a fit":
@@ -266,7 +271,7 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
         if what != "a fit":
             others["an error"] = FitError("DataError", "x")
         for held, answer in others.items():
-            place = _forged(tmp_path / f"{what} {held}.ftlm", request, ANSWER_ENCODER.encode(StoredAnswer(key, answer)))
+            place = _forged(tmp_path / f"{what} {held}.ftlm", request, RECORD_ENCODER.encode(StoredAnswer(key, answer)))
             with (
                 Store(place, request) as kept,
                 pytest.raises(ftlm.DataError, match=f"holds {held} where {what} was asked for; choose another file"),

@@ -372,7 +372,7 @@ class Session:
         """Remove a model and its files."""
         self.stop(key)
         del self.models[key]
-        for suffix in (".json", ".html", ".ftlm"):
+        for suffix in (".json", ".html", ".ftlm", ".ftlm-journal"):
             with contextlib.suppress(OSError):
                 (self.folder / f"{key}{suffix}").unlink()
 

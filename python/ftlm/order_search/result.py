@@ -366,10 +366,8 @@ class StoreStatus:
         Names of the runs.
     version
         Version of ftlm that created the file.
-    truncated
-        Bytes of an unfinished write at its end.
     corruption
-        Description of corrupt data with its offset, or None.
+        Description of corrupt data with the number of its record, or None.
     """
 
     name: str
@@ -379,7 +377,6 @@ class StoreStatus:
     settings: dict[str, Any]
     runs: tuple[str, ...]
     version: str
-    truncated: int
     corruption: str | None
 
     @property
@@ -396,10 +393,6 @@ class StoreStatus:
         text = f"{self.name}: {self.done_count} of {self.candidates} candidates done ({share:.1f} %)"
         text += "" if self.best is None else f", best score {self.best:.6g}"
         text += f", runs {', '.join(self.runs)}"
-        if self.truncated:
-            text += (
-                f"\n{self.truncated} bytes of an unfinished write at its end: being written now, or dropped on resuming"
-            )
         if self.corruption is not None:
             text += f"\ndamaged: {self.corruption}; resume with {parameter('recover', True)} to keep what stands before"
         return text

@@ -28,7 +28,7 @@ from ftlm.order_search.batches import (
     search_coupled,
     search_equation,
 )
-from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
+from ftlm.order_search.checkpoint import Request, Store, check_record, read_store
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.progress import Progress
@@ -71,12 +71,13 @@ class Job:
 
     def request(self, name: str) -> Request:
         """Return the definition that a checkpoint file stores."""
-        records = tuple(RecordFile.of(r) for r in self.records)
         # Hints are not written: they tell a fit where to start and change no search.
         structure = replace(self.structure, hints=UNSET)
         # The records say it, where there is one: what has none is written as it always was.
         object.__setattr__(structure, "offset", UNSET)
-        return Request(name, structure, dict(self.values), asdict(self.settings), records, self.runs, dict(self.units))
+        return Request(
+            name, structure, dict(self.values), asdict(self.settings), tuple(self.records), self.runs, dict(self.units)
+        )
 
     @classmethod
     def of(cls, request: Request, threads: int, progress: ProgressCallback | None) -> Job:
@@ -85,7 +86,9 @@ class Job:
             kept: dict[str, Any] = {f.name: request.settings[f.name] for f in fields(SearchSettings)}
         except KeyError as error:
             raise ModelError(f"setting {error} is missing") from None
-        records = [r.record() for r in request.records]
+        records = list(request.records)
+        for record in records:
+            check_record(record)
         structure = replace(request.structure, offset=records[0].offset if records else "none")
         signals = structure.signals
         if not records or (len(structure.equations) != 1 and not structure.has_order_law):
@@ -408,7 +411,6 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
             job.settings.to_dict(),
             request.runs,
             contents.version,
-            contents.truncated_bytes,
             contents.corruption,
         )
     return states

@@ -6,6 +6,7 @@ import hashlib
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import TracebackType
 from typing import Literal, TypeAlias, TypeVar
 
@@ -15,14 +16,11 @@ import numpy as np
 from ftlm._core import __version__
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, DataError, FtlmError, ModelError
-from ftlm.estimation.output_error import JointFit, UnstableOptimum
-from ftlm.order_search import checkpoint as frames
-from ftlm.order_search.checkpoint import SELECTION_FILE, FrameFile
-from ftlm.structure.structure import History, Initial, Structure
+from ftlm.estimation.output_error import JointFit
+from ftlm.structure.structure import History, Structure
 from ftlm.structure_selection.best_subset import ScreenedSubset
-from ftlm.structure_selection.candidates import Change, Variant
 from ftlm.structure_selection.cross_validation import Trial
-from ftlm.utils.validation import Floats
+from ftlm.utils.checkpoint_file import DIGEST_BYTES, RECORD_ENCODER, CheckpointFile, decode_array
 
 Made = TypeVar("Made")
 #: Version of fit and validation. Results of different versions must not be combined.
@@ -34,29 +32,14 @@ CANDIDATE_ERRORS: dict[ErrorName, type[FtlmError]] = {
     "DataError": DataError,
     "ModelError": ModelError,
 }
-#: Size of a double [bytes].
-DOUBLE_BYTES = 8
-
-
-def _encode_numpy(value: object) -> object:
-    """Convert NumPy numbers to Python numbers, and a history to its powers."""
-    if isinstance(value, (np.floating, np.integer, np.bool_)):
-        return value.item()
-    if isinstance(value, tuple):
-        return tuple(value)
-    # What msgspec asks of a hook that knows no better.
-    raise NotImplementedError(type(value))
-
-
-ANSWER_ENCODER = msgspec.msgpack.Encoder(enc_hook=_encode_numpy)
 
 
 def _digest(value: object) -> bytes:
-    return hashlib.blake2b(ANSWER_ENCODER.encode(value), digest_size=frames.DIGEST_BYTES).digest()
+    return hashlib.blake2b(RECORD_ENCODER.encode(value), digest_size=DIGEST_BYTES).digest()
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="selection"):
-    """First frame: digests of runs, candidates and validation."""
+    """First record: digests of runs, candidates and validation."""
 
     algorithm: int
     version: str
@@ -105,188 +88,49 @@ class FitError(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ref
         return CANDIDATE_ERRORS[self.kind](self.words)
 
 
-class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
-    """Fit on file; arrays are little-endian doubles."""
+class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
+    """Fit on file. Its initial terms are a history or were given: on file both are powers of t."""
 
-    orders: dict[str, float]
-    coefficients: dict[str, float]
-    inputs: dict[str, float]
-    covariance: bytes
-    on_grid: bytes
-    noise: dict[str, float]
-    cost: float
-    samples: int
-    refinement: int
-    settled: bool
-    converged: bool
-    starts: tuple[tuple[float, str], ...]
-    residuals: tuple[dict[str, bytes], ...]
-    products: dict[str, tuple[float, tuple[str, ...]]]
-    initial: Initial
+    joint: JointFit
     history: bool
-    initial_terms: int
-    origin: str
-    growth: tuple[bool, float, bool] | None
 
     @classmethod
-    def of(cls, joint: JointFit) -> FitFile:
-        """Serialize a least-squares fit with Wald intervals."""
-        growth = joint.unstable_optimum
-        return cls(
-            joint.orders,
-            joint.coefficients,
-            joint.inputs,
-            _bytes(joint.covariance),
-            _bytes(joint.finest_grid_values),
-            joint.noise,
-            joint.cost,
-            joint.samples,
-            joint.refinement,
-            joint.step_converged,
-            joint.converged,
-            tuple(joint.starts),
-            tuple({n: _bytes(e) for n, e in part.items()} for part in joint.residuals),
-            dict(joint.products),
-            joint.initial,
-            isinstance(joint.initial, History),
-            joint.initial_terms,
-            joint.origin,
-            None if growth is None else (growth.is_accepted, growth.residual_excess, growth.at_stability_limit),
-        )
-
-    @property
-    def _count(self) -> int:
-        return len(self.orders) + len(self.coefficients) + len(self.inputs)
+    def of(cls, joint: JointFit) -> StoredFit:
+        """Serialize a fit."""
+        return cls(joint, isinstance(joint.initial, History))
 
     def inconsistency(self) -> str | None:
         """Describe inconsistent data, or return None."""
-        if len(self.covariance) != DOUBLE_BYTES * self._count**2 or len(self.on_grid) != DOUBLE_BYTES * self._count:
-            return f"a covariance or values of other than its {self._count} numbers"
-        if any(len(e) % DOUBLE_BYTES for part in self.residuals for e in part.values()):
-            return "residuals that are no doubles"
-        if self.history and isinstance(self.initial, str):
-            return f"a history that is no powers of t but {self.initial!r}"
+        joint, count = self.joint, len(self.joint.names)
+        if (joint.covariance.shape, joint.finest_grid_values.shape) != ((count, count), (count,)):
+            return f"a covariance or values of other than its {count} numbers"
+        if any(e.ndim != 1 for part in joint.residuals for e in part.values()):
+            return "residuals that are no series"
+        if self.history and isinstance(joint.initial, str):
+            return f"a history that is no powers of t but {joint.initial!r}"
         return None
 
-    def joint(self) -> JointFit:
+    def fit(self) -> JointFit:
         """Deserialize the fit."""
-        count = self._count
-        told = History(self.initial) if self.history and not isinstance(self.initial, str) else self.initial
-        return JointFit(
-            dict(self.orders),
-            dict(self.coefficients),
-            _array(self.covariance).reshape(count, count),
-            dict(self.noise),
-            self.cost,
-            self.samples,
-            self.refinement,
-            self.settled,
-            self.converged,
-            list(self.starts),
-            [{n: _array(e) for n, e in part.items()} for part in self.residuals],
-            dict(self.products),
-            dict(self.inputs),
-            told,
-            self.initial_terms,
-            finest_grid_values=_array(self.on_grid),
-            origin=self.origin,
-            unstable_optimum=None if self.growth is None else UnstableOptimum(*self.growth),
-        )
+        initial = self.joint.initial
+        if not self.history or isinstance(initial, str):
+            return self.joint
+        return replace(self.joint, initial=History(initial))
 
 
-class JudgementFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="judgement"):
+class StoredTrial(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="judgement"):
     """Validation of a fitted candidate; the key includes its fit."""
 
-    numbers: int
-    estimation: dict[str, float]
-    validation: dict[str, dict[str, float]]
-    scores: tuple[float, ...]
-    values: dict[str, float]
-    errors: dict[str, float]
-    idle: tuple[str, ...]
-    grows: bool
-    failed: str | None
-    fine: bool
-
-    @classmethod
-    def of(cls, trial: Trial) -> JudgementFile:
-        """Serialize a trial."""
-        validation = {n: dict(part) for n, part in trial.validation.items()}
-        return cls(
-            trial.parameters,
-            dict(trial.estimation),
-            validation,
-            trial.scores,
-            dict(trial.values),
-            dict(trial.errors),
-            trial.insignificant,
-            trial.unstable,
-            trial.failed,
-            trial.refined,
-        )
-
-    def trial(self, name: str, structure: Structure, joint: JointFit) -> Trial:
-        """Deserialize the trial."""
-        return Trial(
-            name,
-            structure,
-            self.numbers,
-            self.estimation,
-            self.validation,
-            self.scores,
-            values=self.values,
-            errors=self.errors,
-            insignificant=self.idle,
-            unstable=self.grows,
-            failed=self.failed,
-            refined=self.fine,
-            joint=None if self.failed is not None else joint,
-        )
+    trial: Trial
 
 
-class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Subset of the best-subset search on file."""
-
-    words: str
-    coefficients: tuple[str, ...]
-    integer_orders: tuple[tuple[str, float], ...]
-    offset: bool
-    inputs: tuple[str, ...]
-    rubs: tuple[str, ...]
-    start: dict[str, float]
-    score: float
-
-    @classmethod
-    def of(cls, one: ScreenedSubset) -> SubsetFile:
-        """Serialize a subset."""
-        v = one.change.variant
-        kept, inputs, rubs = (tuple(sorted(names)) for names in (v.coefficients, v.inputs, v.frictions))
-        return cls(one.change.words, kept, v.integer_orders, v.offset, inputs, rubs, dict(one.start), one.score)
-
-    def to_subset(self) -> ScreenedSubset:
-        """Deserialize the subset."""
-        variant = Variant(
-            frozenset(self.coefficients), self.integer_orders, self.offset, frozenset(self.inputs), frozenset(self.rubs)
-        )
-        return ScreenedSubset(Change(self.words, variant), self.start, self.score)
-
-
-class SubsetsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
+class StoredSubsets(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
     """All subsets of the best-subset search on file."""
 
-    each: tuple[SubsetFile, ...]
-
-    @classmethod
-    def of(cls, subsets: Sequence[ScreenedSubset]) -> SubsetsFile:
-        """Serialize all subsets."""
-        return cls(tuple(SubsetFile.of(s) for s in subsets))
-
-    def subsets(self) -> list[ScreenedSubset]:
-        """Deserialize all subsets."""
-        return [s.to_subset() for s in self.each]
+    subsets: list[ScreenedSubset]
 
 
-Answer = FitError | FitFile | JudgementFile | SubsetsFile
+Answer = FitError | StoredFit | StoredTrial | StoredSubsets
 
 
 class StoredAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
@@ -296,15 +140,7 @@ class StoredAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag=
     answer: Answer
 
 
-ANSWER_DECODER = msgspec.msgpack.Decoder(Request | StoredAnswer)
-
-
-def _bytes(values: Floats) -> bytes:
-    return np.ascontiguousarray(values, "<f8").tobytes()
-
-
-def _array(data: bytes) -> Floats:
-    return np.frombuffer(data, "<f8").astype(np.float64)
+ANSWER_DECODER = msgspec.msgpack.Decoder(Request | StoredAnswer, dec_hook=decode_array)
 
 
 class Store:
@@ -313,54 +149,42 @@ class Store:
     def __init__(self, path: str | os.PathLike[str], request: Request) -> None:
         self._known: dict[bytes, Answer] = {}
         self._lock = threading.Lock()
-        self._log = FrameFile(path, SELECTION_FILE, create=True)
+        self._file = CheckpointFile(path, "selection", "create")
         try:
-            data = self._log.read()
-            if self._log.has_no_frame(data):
-                data = self._log.begin(ANSWER_ENCODER.encode(request))
-            self._take(data, request)
+            payloads, damage = self._file.read()
+            if damage is not None:
+                raise DataError(f"store {path} is damaged: {damage}; choose another file, and leave this one")
+            if not payloads:
+                payloads = [RECORD_ENCODER.encode(request)]
+                self._file.append(payloads)
+            for number, payload in enumerate(payloads, 1):
+                self._take(number, payload, request)
         except BaseException:
-            self._log.close()
+            self._file.close()
             raise
 
-    def _take(self, data: bytes, request: Request) -> None:
-        path, offset, digest = self._log.path, len(SELECTION_FILE.magic), bytes(frames.DIGEST_BYTES)
-        view = memoryview(data)
-        while offset < len(data):
-            got = frames.next_frame(view, offset, digest)
-            if got == "torn":
-                break
-            if isinstance(got, str):
-                raise DataError(f"store {path} is damaged: {got}; choose another file, and leave this one")
-            payload, digest, end = got
-            try:
-                frame = ANSWER_DECODER.decode(payload)
-            except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
-                raise DataError(
-                    f"store {path} holds something else at byte {offset}: {error}; choose another file"
-                ) from error
-            if isinstance(frame, Request) != (offset == len(SELECTION_FILE.magic)):
-                raise DataError(f"store {path} holds something else at byte {offset}; choose another file")
-            # Digests tell what was damaged, not what was written wrong.
-            wrong = (
-                frame.answer.inconsistency()
-                if isinstance(frame, StoredAnswer) and isinstance(frame.answer, FitFile)
-                else None
-            )
-            if wrong is not None:
-                raise DataError(f"store {path} holds a fit with {wrong} at byte {offset}; choose another file")
-            if isinstance(frame, Request):
-                self._check_same(request, frame)
-            else:
-                self._known[frame.request] = frame.answer
-            offset = end
-            self._log.end, self._log.digest = end, digest
-        if self._log.end < len(data):
-            # What a kill left of the last frame.
-            self._log.truncate()
+    def _take(self, number: int, payload: bytes, request: Request) -> None:
+        """Check the request in the first record, and note the answer in any other one."""
+        path = self._file.path
+        try:
+            record = ANSWER_DECODER.decode(payload)
+        except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
+            raise DataError(
+                f"store {path} holds something else in record {number}: {error}; choose another file"
+            ) from error
+        if isinstance(record, Request) != (number == 1):
+            raise DataError(f"store {path} holds something else in record {number}; choose another file")
+        if isinstance(record, Request):
+            self._check_same(request, record)
+            return
+        # Digests detect damage, not wrong contents.
+        wrong = record.answer.inconsistency() if isinstance(record.answer, StoredFit) else None
+        if wrong is not None:
+            raise DataError(f"store {path} holds a fit with {wrong} in record {number}; choose another file")
+        self._known[record.request] = record.answer
 
     def _check_same(self, asked: Request, held: Request) -> None:
-        path = self._log.path
+        path = self._file.path
         # Digests are of what one version writes of candidates: those of another tell nothing.
         if (asked.algorithm, asked.version) != (held.algorithm, held.version):
             raise DataError(
@@ -372,9 +196,9 @@ class Store:
             raise DataError(f"store {path} holds a selection {difference}; choose another file")
 
     def _other(self, asked: str, answer: Answer) -> DataError:
-        held = {FitFile: "a fit", FitError: "an error", JudgementFile: "a judgement", SubsetsFile: "subsets"}
+        held = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a judgement", StoredSubsets: "subsets"}
         return DataError(
-            f"store {self._log.path} holds {held[type(answer)]} where {asked} was asked for; choose another file"
+            f"store {self._file.path} holds {held[type(answer)]} where {asked} was asked for; choose another file"
         )
 
     def __len__(self) -> int:
@@ -397,7 +221,7 @@ class Store:
             if answer is None:
                 return made
             with self._lock:
-                self._log.append([ANSWER_ENCODER.encode(StoredAnswer(key, answer))])
+                self._file.append([RECORD_ENCODER.encode(StoredAnswer(key, answer))])
                 self._known[key] = answer
         # What is given is always what the store gives back, so that one that goes on has the same bits.
         return read(answer)
@@ -413,12 +237,12 @@ class Store:
 
         def write(made: JointFit | FtlmError) -> Answer | None:
             if isinstance(made, JointFit):
-                return FitFile.of(made)
+                return StoredFit.of(made)
             return FitError.of(made)
 
         def read(answer: Answer) -> JointFit | FtlmError:
-            if isinstance(answer, FitFile):
-                return answer.joint()
+            if isinstance(answer, StoredFit):
+                return answer.fit()
             if isinstance(answer, FitError):
                 return answer.error()
             raise self._other("a fit", answer)
@@ -431,26 +255,31 @@ class Store:
         """Return the trial of a fitted candidate on validation data."""
 
         def read(answer: Answer) -> Trial:
-            if not isinstance(answer, JudgementFile):
+            if not isinstance(answer, StoredTrial):
                 raise self._other("a judgement", answer)
-            return answer.trial(name, structure, joint)
+            trial = answer.trial
+            fit = None if trial.failed is not None else joint
+            return replace(trial, name=name, structure=structure, joint=fit)
 
-        asked = ("judge", structure, joint.names, _bytes(joint.values), joint.initial, fine)
-        return self.recall_or_compute(asked, compute, JudgementFile.of, read)
+        def write(made: Trial) -> Answer:
+            return StoredTrial(replace(made, joint=None))
+
+        asked = ("judge", structure, joint.names, joint.values, joint.initial, fine)
+        return self.recall_or_compute(asked, compute, write, read)
 
     def subsets(self, structure: Structure, compute: Callable[[], list[ScreenedSubset]]) -> list[ScreenedSubset]:
         """Return all screened subsets."""
 
         def read(answer: Answer) -> list[ScreenedSubset]:
-            if not isinstance(answer, SubsetsFile):
+            if not isinstance(answer, StoredSubsets):
                 raise self._other("subsets", answer)
-            return answer.subsets()
+            return answer.subsets
 
-        return self.recall_or_compute(("subsets", structure), compute, SubsetsFile.of, read)
+        return self.recall_or_compute(("subsets", structure), compute, StoredSubsets, read)
 
     def close(self) -> None:
         """Close the file and release the lock."""
-        self._log.close()
+        self._file.close()
 
     def __enter__(self) -> Store:
         return self

@@ -1,0 +1,241 @@
+"""Checkpoint file of a long computation: an SQLite database of records, appended under digests by one writer.
+
+The only table has the name of the computation (``search`` or ``selection``) and one row a record:
+
+===========  ========================================================================================================
+``number``   1, 2, …
+``payload``  one MessagePack map, whose key ``type`` names its kind
+``digest``   BLAKE2b of the previous digest (nothing for the first record) and the payload, 16 bytes
+===========  ========================================================================================================
+
+Records are only appended. The rollback journal of SQLite makes an append complete or void, whatever ends the process,
+and is deleted at the end of each append: the file alone holds all records. A write-ahead log would keep the last in a
+second file after a kill. SQLite does not detect changed bytes of a page, so that every digest covers all records
+up to its own: a record that was lost, moved or changed is reported as damage, and no record after it is used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import sqlite3
+import stat
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import msgspec
+import numpy as np
+
+from ftlm.errors import DataError
+from ftlm.utils.files import write_atomically
+from ftlm.utils.parameters import parameter
+
+Kind: TypeAlias = Literal["search", "selection"]
+TABLE_COLUMNS = "(number INTEGER PRIMARY KEY, payload BLOB NOT NULL, digest BLOB NOT NULL)"
+DIGEST_BYTES = 16
+#: Maximum size of a checkpoint file. The largest search under an order law needs less than a tenth.
+MAX_FILE_BYTES = 4 << 30
+#: An append waits so long for readers, and a reader for an append.
+READER_TIMEOUT_S = 60.0
+#: Pause between two attempts to become the writer. A writer is without its lock for some microseconds after an append,
+#: and has it back before the second attempt.
+LOCK_PAUSE_S = 0.01
+
+
+def encode_numpy(value: object) -> object:
+    """Convert NumPy numbers to Python numbers, an array to its shape and little-endian doubles, a tuple to itself."""
+    if isinstance(value, np.ndarray):
+        return value.shape, np.ascontiguousarray(value, "<f8").tobytes()
+    if isinstance(value, (np.floating, np.integer, np.bool_)):
+        return value.item()
+    if isinstance(value, tuple):
+        return tuple(value)
+    # Requested of a hook for other types by msgspec.
+    raise NotImplementedError(type(value))
+
+
+def decode_array(_: type, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Convert the shape and the bytes of an array to the array."""
+    shape, data = msgspec.convert(value, tuple[tuple[int, ...], bytes])
+    return np.frombuffer(data, "<f8").astype(np.float64).reshape(shape)
+
+
+RECORD_ENCODER = msgspec.msgpack.Encoder(enc_hook=encode_numpy)
+
+
+def _digest(before: bytes, payload: bytes) -> bytes:
+    return hashlib.blake2b(before + payload, digest_size=DIGEST_BYTES).digest()
+
+
+def _insert(connection: sqlite3.Connection, kind: Kind, payloads: Sequence[bytes]) -> None:
+    """Append records to the table of a database, and commit them."""
+    with connection:
+        connection.execute(f"CREATE TABLE IF NOT EXISTS {kind} {TABLE_COLUMNS}")
+        last = connection.execute(f"SELECT digest FROM {kind} ORDER BY number DESC LIMIT 1").fetchone()
+        digest = b"" if last is None else last[0]
+        for payload in payloads:
+            digest = _digest(digest, payload)
+            connection.execute(f"INSERT INTO {kind} (payload, digest) VALUES (?, ?)", (payload, digest))
+
+
+class CheckpointFile:
+    """Open checkpoint file.
+
+    Parameters
+    ----------
+    path, kind
+        File, and the computation whose records it holds.
+    access
+        Whether the file is read, which other processes may do too, resumed by its only writer, or also created.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], kind: Kind, access: Literal["read", "resume", "create"] = "read"
+    ) -> None:
+        self.path, self.kind = Path(path), kind
+        verb = "read" if access == "read" else "opened"
+        try:
+            status = self._status(access)
+            # A pipe that nobody writes to would keep SQLite waiting.
+            if status is not None and not stat.S_ISREG(status.st_mode):
+                raise DataError(f"store {path} is no regular file; choose another file")
+            if status is not None and status.st_size > MAX_FILE_BYTES:
+                raise DataError(
+                    f"{path} has {status.st_size} bytes, more than the {MAX_FILE_BYTES} of the largest store; "
+                    f"start the {kind} again in another file"
+                )
+            uri = f"{self.path.absolute().as_uri()}?mode={'rwc' if access == 'create' else 'rw'}"
+            self._connection = sqlite3.connect(
+                uri, READER_TIMEOUT_S, uri=True, isolation_level=None, check_same_thread=False
+            )
+        except (OSError, ValueError, sqlite3.Error) as error:
+            why = error.strerror if isinstance(error, OSError) else None
+            raise DataError(f"store {path} cannot be {verb}: {why or error}; choose another file") from error
+        try:
+            # The intact records of a file that was cut off are read.
+            self._connection.execute("PRAGMA writable_schema = ON")
+            if access != "read":
+                self._lock()
+            self._check_kind()
+        except sqlite3.Error as error:
+            self.close()
+            raise self._opening_error(error, verb) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _status(self, access: str) -> os.stat_result | None:
+        """Return the status of the file, or None for a file that can be created."""
+        try:
+            return self.path.stat()
+        except FileNotFoundError:
+            if access != "create":
+                raise
+            self.path.parent.stat()
+            return None
+
+    def _lock(self) -> None:
+        """Lock the file against other writers until it is closed; readers are let in between appends."""
+        run = self._connection.execute
+        run("PRAGMA busy_timeout = 0")
+        run("BEGIN IMMEDIATE")
+        # Fails before any work where the file or its folder is read-only.
+        run("PRAGMA user_version = 0")
+        run("ROLLBACK")
+        time.sleep(LOCK_PAUSE_S)
+        # The journal is deleted on disk too when an append ends.
+        run("PRAGMA synchronous = EXTRA")
+        run("BEGIN IMMEDIATE")
+        run(f"PRAGMA busy_timeout = {round(1000 * READER_TIMEOUT_S)}")
+
+    def _check_kind(self) -> None:
+        """Raise DataError if the database is that of another kind of computation, or of another program."""
+        found = [str(sql) for (sql,) in self._connection.execute("SELECT sql FROM sqlite_master")]
+        self._is_empty = not found
+        other: Kind = "selection" if self.kind == "search" else "search"
+        if found == [f"CREATE TABLE {other} {TABLE_COLUMNS}"]:
+            raise DataError(
+                f"{self.path} is the store of a {other}, not of a {self.kind}; go on with it by the call that began it"
+            )
+        if found not in ([], [f"CREATE TABLE {self.kind} {TABLE_COLUMNS}"]):
+            raise self._foreign_error()
+
+    def _foreign_error(self) -> DataError:
+        return DataError(f"{self.path} is no ftlm {self.kind} store; give a file written with {parameter('store')}")
+
+    def _opening_error(self, error: sqlite3.Error, verb: str) -> DataError:
+        """Return the error of a file that SQLite does not open."""
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        if code == sqlite3.SQLITE_BUSY:
+            return DataError(
+                f"store {self.path} is in use by another {self.kind}; wait for it, stop it, or choose another file"
+            )
+        if code == sqlite3.SQLITE_CORRUPT:
+            return DataError(f"{self.path} cannot be used: {error}; start the {self.kind} again in another file")
+        if code != sqlite3.SQLITE_NOTADB:
+            return DataError(f"store {self.path} cannot be {verb}: {error}; choose another file")
+        with contextlib.suppress(OSError), self.path.open("rb") as stream:
+            if stream.read(32).startswith((b"ftlm search store 1\n", b"ftlm selection store 1\n")):
+                return DataError(
+                    f"{self.path} is a store of an earlier format; finish it with the version of ftlm that began it, "
+                    f"or start the {self.kind} again in another file"
+                )
+        return self._foreign_error()
+
+    def read(self) -> tuple[list[bytes], str | None]:
+        """Return the payloads of all intact records, and a description of the damage after them."""
+        payloads: list[bytes] = []
+        digest, damage = b"", None
+        if self._is_empty:
+            return [], None
+        try:
+            rows = self._connection.execute(f"SELECT number, payload, digest FROM {self.kind} ORDER BY number")
+            for number, payload, own in rows:
+                digest = _digest(digest, payload) if isinstance(payload, bytes) else b""
+                if (number, own) != (len(payloads) + 1, digest):
+                    damage = f"record {len(payloads) + 1} does not match its digest"
+                    break
+                payloads.append(payload)
+            else:
+                # Pages that no record uses, which an append might.
+                found = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+                damage = None if found == "ok" else f"after record {len(payloads)}: {found}"
+        except sqlite3.Error as error:
+            damage = f"after record {len(payloads)}: {error}"
+        return payloads, damage
+
+    def append(self, payloads: Sequence[bytes]) -> None:
+        """Append records and flush them to disk: all, or none and DataError."""
+        try:
+            if not self._connection.in_transaction:
+                self._connection.execute("BEGIN IMMEDIATE")
+            _insert(self._connection, self.kind, payloads)
+            self._connection.execute("BEGIN IMMEDIATE")
+        except sqlite3.Error as error:
+            raise DataError(
+                f"store {self.path} cannot be written: {error}; what it holds is whole: make room, or move it to "
+                "another folder, and resume it"
+            ) from error
+
+    def recover(self, payloads: Sequence[bytes]) -> Path:
+        """Replace a damaged file by one of its intact records, close it, and return the path of a copy of it."""
+        self.close()
+        copy = write_atomically(self.path.with_name(self.path.name + ".damaged"), self.path.read_bytes(), force=False)
+        with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as fresh:
+            fresh.execute("BEGIN")
+            _insert(fresh, self.kind, payloads)
+            write_atomically(self.path, fresh.serialize(), force=True)
+        return copy
+
+    def close(self) -> None:
+        """Close the file and release the lock."""
+        self._connection.close()
+
+    def __enter__(self) -> CheckpointFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
