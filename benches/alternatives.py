@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import ftlm
-from results import append, heading
+from results import heading, save
 
 #: Samples of a record, finer steps of the truth, and the noise as a share of the deviation.
 SAMPLES, FINER, NOISE = 400, 40, 0.02
@@ -168,7 +168,7 @@ def main() -> None:
         lines += measure(plant, seeds)
         print("\n".join(lines[-3:]), flush=True)
     if "--write" in sys.argv:
-        append([f"{heading()}: {lines[0]}", *lines[1:]])
+        save([f"{heading()}: {lines[0]}", *lines[1:]])
 
 
 if __name__ == "__main__":

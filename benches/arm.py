@@ -22,7 +22,7 @@ import ftlm
 from arm_measured import gains, hubs, left_out, measured, orders, rival, steps
 from lagrange import INPUTS, clean_run, structure, truth
 from plants import with_noise
-from results import append, heading
+from results import heading, save
 
 NORMAL_95 = 1.959963984540054
 
@@ -84,13 +84,13 @@ SECTIONS: dict[str, Callable[[], Iterator[str]]] = {
 
 
 def main() -> None:
-    """Measure and print; real runs are appended with ``--write``."""
+    """Measure and print; real runs are written with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("recovery", *SECTIONS))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--levels", default="20,40,60,80")
-    parser.add_argument("--write", action="store_true", help="append real runs to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     given = parser.parse_args()
     if given.what == "recovery":
         recovery(range(given.first, given.first + given.seeds), [float(v) for v in given.levels.split(",")])
@@ -101,7 +101,7 @@ def main() -> None:
         lines.append(line)
         print(line, flush=True)
     if given.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

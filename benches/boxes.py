@@ -5,7 +5,7 @@ what became of the candidates, and the growth from each step to the next: the ex
 processor time follows. ``--psf`` adds the real arm's first link, taken to be at rest; ``--squares`` ranks by squared
 equation errors; ``--alpha 1.05 1.3`` takes a part of the lattice; ``--against-brute-force`` runs every candidate to
 its end too and fails unless that keeps the same rows to the last bit (step 0.02: a quarter of an hour of one processor,
-half the step sixteen times that); ``--write`` appends all to benches/RESULTS.md and writes docs/boxes.json, from which
+half the step sixteen times that); ``--write`` writes benches/results.json and docs/boxes.json, from which
 the pages draw the growth.
 """
 
@@ -21,7 +21,7 @@ from pathlib import Path
 
 import ftlm
 from arm_measured import arm_run
-from results import append, commit, heading, machine
+from results import commit, heading, machine, save
 from search import M, plant_a_run
 
 STEPS = (0.05, 0.02, 0.01, 0.005)
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--alpha", type=float, nargs=2, default=(1.05, 2.0), help="its interval")
     parser.add_argument("--threads", type=int, help="all cores unless given")
     parser.add_argument("--against-brute-force", action="store_true", help="run every candidate to its end as well")
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     ranked: dict[str, str] = {"criterion": "equation-error", "norm": "l2"} if arguments.squares else {}
     options = {"coefficients": "least-squares", "m": M, "threads": arguments.threads, **ranked}
@@ -90,7 +90,7 @@ def main() -> None:
                 if not same:
                     raise SystemExit("the search and brute force disagree")
     if arguments.write:
-        append([f"- {line}" for line in lines])
+        save([f"- {line}" for line in lines])
         measured = {"commit": commit(), "machine": machine(), "load": os.getloadavg()[0], "searches": searches}
         GROWTH.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
 

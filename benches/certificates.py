@@ -1,8 +1,8 @@
 """Certificates over all orders: Plant A's deflection at several noises, and the real arm's first link.
 
 ``python benches/certificates.py [--within 0.2 0.05] [--noise 1e-4] [--psf] [--write]`` prints what is proved of all
-orders between those of a lattice of step 0.05, in how many boxes, and in what time; ``--write`` appends it to
-benches/RESULTS.md.
+orders between those of a lattice of step 0.05, in how many boxes, and in what time; ``--write`` writes it to
+benches/results.json.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import ftlm
 from arm_measured import arm_run
-from results import append, heading
+from results import heading, save
 from search import M, plant_a_run
 
 
@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--psf", action="store_true", help="the measured run psf as well (FTLM_DATA)")
     parser.add_argument("--alpha", type=float, nargs=2, default=(1.05, 2.0), help="its interval")
     parser.add_argument("--apart", type=float, default=0.05, help="how far orders are kept apart")
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
     runs = {f"Plant A, {noise:g} rad": plant_a_run(noise, noise) for noise in arguments.noise}
@@ -54,7 +54,7 @@ def main() -> None:
             )
             print(lines[-1], flush=True)
     if arguments.write:
-        append([f"- {line}" for line in lines])
+        save([f"- {line}" for line in lines])
 
 
 if __name__ == "__main__":

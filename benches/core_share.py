@@ -15,7 +15,7 @@ import time
 import ftlm
 from arm_measured import arm_run
 from identify import FILTERED, WORDS
-from results import append, heading
+from results import heading, save
 
 
 class CoreClock:
@@ -43,9 +43,9 @@ class CoreClock:
 
 
 def main() -> None:
-    """Measure and print; append with ``--write``."""
+    """Measure and print; write them with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     runs = [arm_run("psf"), arm_run("lqr")]
     rows = ["| equation | wall [s] | outside the core [s] | share |", "| --- | --- | --- | --- |"]
@@ -62,7 +62,7 @@ def main() -> None:
         rows.append(f"| {name} | {wall:.2f} | {outside:.2f} | {100 * outside / wall:.1f} % |")
     print("\n".join(rows))
     if arguments.write:
-        append([heading(), "", *rows])
+        save([heading(), "", *rows])
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Runs that start in motion, measured: coverage of intervals, bases for the history against each other, weak pasts.
 
-``python benches/history.py WHAT [--seeds 20] [--plants "0.7|1.7, 0.6"] [--write]`` prints tables; ``--write`` appends
-them to benches/RESULTS.md. WHAT is intervals (fits of both halves of a motion, and of the second with Caputo's terms),
+``python benches/history.py WHAT [--seeds 20] [--plants "0.7|1.7, 0.6"] [--write]`` prints tables; ``--write`` writes
+benches/results.json. WHAT is intervals (fits of both halves of a motion, and of the second with Caputo's terms),
 bases (the bias that each basis leaves and what it costs, by linear algebra on its own scheme) or waits (a run from
 rest, or after a wait that lets a past fade). Seeds are 0 to ``--seeds`` less one, noise is 1 %.
 """
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 import motion
-from results import append, heading
+from results import heading, save
 
 #: Half-width of a 95 % interval in standard errors.
 NORMAL_95 = 1.959963984540054
@@ -268,12 +268,12 @@ def bases(plants: list[str], seeds: int) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure and print; append with ``--write``."""
+    """Measure and print; write them with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("intervals", "bases", "waits"))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--plants", default="|".join(motion.PLANTS))
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     measured = {"intervals": intervals, "bases": bases, "waits": waits}[arguments.what]
     lines = [f"{heading()}:", ""]
@@ -282,7 +282,7 @@ def main() -> None:
         lines.append(f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 import ftlm
 from arm_measured import arm_run
 from lsim_link import STOCK, projected, response
-from results import append, heading
+from results import heading, save
 
 FILTERED = ("theta12", "theta22")
 TERMS = [("theta21", 2), ("theta11", 2), ("theta12", 2)]
@@ -172,7 +172,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=50_000, help="of the long run, up to 1 048 576")
     parser.add_argument("--jax", default=sys.executable, help="interpreter of an environment with jax-sysid")
     parser.add_argument("--alone", action="store_true", help="measure in this process")
-    parser.add_argument("--write", action="store_true", help="append to RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     asked = parser.parse_args()
     if asked.alone:
         for case in asked.cases:
@@ -195,7 +195,7 @@ def main() -> None:
         print(made, flush=True)
         lines.append(made)
     if asked.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Intervals where the quadratic picture fails, measured: coverage by standard errors and by profile likelihood.
 
-``python benches/intervals.py [CASE …] [--seeds 30] [--write]`` prints a row a number; ``--write`` appends them to
-benches/RESULTS.md. The link's deflection is driven by the measured hub of the first half of ``psf`` (needs measured
+``python benches/intervals.py [CASE …] [--seeds 30] [--write]`` prints a row a number; ``--write`` writes them to
+benches/results.json. The link's deflection is driven by the measured hub of the first half of ``psf`` (needs measured
 data: FTLM_DATA or the shared folder), simulated by Grünwald and Letnikov's sum on a grid 64 times finer than the
 samples; the other plants by SciPy's `lsim`. Quadratic intervals are value ± 1.96 standard errors.
 """
@@ -24,7 +24,7 @@ from scipy.signal import lfilter, lsim
 import ftlm
 from ftlm.estimation.confidence_intervals import likelihood_of, nonlinear_parameters
 from ftlm.utils.statistics import NORMAL_95
-from results import append, heading
+from results import heading, save
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 DATA = Path(os.environ.get("FTLM_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
@@ -157,12 +157,12 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure and print; append with ``--write``."""
+    """Measure and print; write them with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", default=list(CASES))
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     lines = [
         f"{heading()}: {arguments.seeds} seeds, 95 % intervals",
@@ -188,7 +188,7 @@ def main() -> None:
                 )
                 print(lines[-1], flush=True)
     if arguments.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Closed loops, offsets and cells with a constant-phase element, measured by Monte-Carlo.
 
-``python benches/loops.py WHAT [--seeds 30] [--write]`` prints tables; ``--write`` appends them to benches/RESULTS.md.
+``python benches/loops.py WHAT [--seeds 30] [--write]`` prints tables; ``--write`` writes them to benches/results.json.
 WHAT is loops, instruments, offsets or cell. Seeds are 0 to ``--seeds`` less one.
 """
 
@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 import loops
-from results import append, heading
+from results import heading, save
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -138,11 +138,11 @@ def cell(seeds: int) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure and print; append with ``--write``."""
+    """Measure and print; write them with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("loops", "instruments", "offsets", "cell"))
     parser.add_argument("--seeds", type=int, default=30)
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     rows: Iterable[str] = {"loops": closed, "instruments": instruments, "offsets": offsets, "cell": cell}[
         arguments.what
@@ -153,7 +153,7 @@ def main() -> None:
         lines.append(f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 import ftlm
 from arm_measured import FOLDER, arm_run, step_run
 from plants import resonant_plant
-from results import Kept, append, heading
+from results import Kept, heading, save
 
 #: The share of the cost beyond which a richer structure counts as worse.
 TOLD = 1e-3
@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--kept", type=Path, help="file of chains that are done, to go on from")
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     given = parser.parse_args()
     kept = Kept(given.kept)
     lines = [f"{heading()}:", "", "| record | chain | structure | fit | cost | numbers | time |"]
@@ -148,7 +148,7 @@ def main() -> None:
     lines += ["", f"- {worse} of {pairs} richer structures worse by over {100 * TOLD:g} % of the cost"]
     print(lines[-1])
     if given.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
 ``python benches/next_experiment.py [--seeds 20] [--criterion D] [--write]``: of each seed the paper's square of ten
 seconds is identified from an automatic start, the next input is designed on that model with its noise, within the
 square's peak and the largest angles that it moved, Plant A answers with noise of the same deviations, and that run is
-identified alone from an automatic start. Finished seeds are kept in ``--kept`` and not done again. ``--write`` appends
-to benches/RESULTS.md and writes docs/next_experiment.json, from which the page draws its table and its picture.
+identified alone from an automatic start. Finished seeds are kept in ``--kept`` and not done again. ``--write`` writes
+benches/results.json and docs/next_experiment.json, from which the page draws its table and its picture.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 import ftlm
 import plants
 from ftlm.reproduction.simulated_arm import demo_plant
-from results import append, commit, heading, machine
+from results import commit, heading, machine, save
 
 LEVEL = 40.0
 ORDERS = ("alpha1", "alpha2", "gamma1", "beta2", "mu2")
@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--criterion", choices=("D", "E"), default="D")
     parser.add_argument("--kept", type=Path, default=Path("next_experiment.jsonl"))
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md, write what the page shows")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json and what the page shows")
     arguments = parser.parse_args()
     rows: dict[int, dict[str, Any]] = {}
     if arguments.kept.exists():
@@ -115,7 +115,7 @@ def main() -> None:
     lines = [f"{heading()}:", "", *(f"- {line}" for line in lines_of(every))]
     print("\n".join(lines))
     if arguments.write:
-        append(lines)
+        save(lines)
         every = [{k: v for k, v in r.items() if k not in ("correlated", "names")} for r in every]
         shown = {"commit": commit(), "machine": machine(), "cores": os.cpu_count(), "seeds": every}
         SHOWN.write_text(json.dumps(shown) + "\n", encoding="utf-8")

@@ -26,7 +26,7 @@ from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.discretization import record
 from laws import laws
-from results import append, heading
+from results import heading, save
 
 #: Factors on the true coefficients and shifts of the true orders from which both start.
 FACTORS = np.array([1.3, 0.8, 1.5, 1.2])
@@ -71,9 +71,9 @@ def simulated(problem: FreeProblem, x: np.ndarray, rec: object, signals: tuple[s
 
 
 def main() -> None:
-    """Measure and print; append with ``--write``."""
+    """Measure and print; write them with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     run, structure = plants.noisy_run("A", 40.0, 0), plants.structure("A")
     problem, truth = FreeProblem.of(structure), plants.truth("A")
@@ -142,7 +142,7 @@ def main() -> None:
     ]
     print("\n".join(lines))
     if arguments.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Each promise of speed and memory beside its rival, in one run; instruction budgets of the hottest kernels.
 
-``python benches/promises.py [--write] [--quick]`` prints them; ``--write`` appends them to benches/RESULTS.md and
+``python benches/promises.py [--write] [--quick]`` prints them; ``--write`` writes them to benches/results.json and
 writes docs/performance.json, from which the pages draw cost against size; ``--only P3,growth`` runs parts. Core time is
 processor time, which other work on the machine disturbs less than wall time does.
 """
@@ -27,7 +27,7 @@ from ftlm.kernels import block_pulse_kernel
 from ftlm.order_search.options import MAX_IV_ITERATIONS
 from ftlm.simulation.discretization import record
 from ftlm.utils.validation import available_threads
-from results import append, commit, heading
+from results import commit, heading, save
 from search import fft_time, plant_a_run
 
 HERE = Path(__file__).parent
@@ -478,7 +478,7 @@ def memory(quick: bool) -> None:
 def main() -> None:
     """Measure, judge, print; say how long each part took."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md, write budgets and growth")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json and budgets and growth")
     parser.add_argument("--quick", action="store_true", help="leave out what takes more than a few seconds")
     parser.add_argument("--only", default="", help="parts by name, separated by commas")
     arguments = parser.parse_args()
@@ -504,7 +504,7 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     say(f"load {os.getloadavg()[0]:.1f} at the end; this process took at most {peak:.0f} MB")
     if write:
-        append([f"- {line}" for line in lines])
+        save([f"- {line}" for line in lines])
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What real records have, measured: coverage of 95 % intervals, or the warning that names the cause.
 
 ``python benches/robust.py [CASE …] [--seeds 30] [--plants whole,fractional] [--write]`` prints a table; ``--write``
-appends it to benches/RESULTS.md. Two plants, all orders free: a resonance of whole orders by SciPy's `lsim`, and
+writes it to benches/results.json. Two plants, all orders free: a resonance of whole orders by SciPy's `lsim`, and
 D^0.8 y = -1.5 y + 1.5 u by Grünwald and Letnikov's sum on a grid 64 times finer than the samples, extrapolated.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.signal import lfilter, lsim
 
 import ftlm
-from results import append, heading
+from results import heading, save
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -219,13 +219,13 @@ def fitted(task: tuple[str, str, int]) -> tuple[list[float], list[float], bool, 
 
 
 def main() -> None:
-    """Measure and print; append with ``--write``."""
+    """Measure and print; write them with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", default=list(CASES))
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--plants", default=",".join(PLANTS))
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     lines = [
         f"{heading()}: {ROWS} rows, {arguments.seeds} seeds, all orders free",
@@ -253,7 +253,7 @@ def main() -> None:
                 )
                 print(lines[-1], flush=True)
     if arguments.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

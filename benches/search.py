@@ -1,6 +1,6 @@
 """Order search on Plant A's deflection: ours, brute force, and the paper's algorithm written literally, in one run.
 
-``python benches/search.py [--write]`` prints ratios; ``--write`` appends them to benches/RESULTS.md.
+``python benches/search.py [--write]`` prints ratios; ``--write`` writes them to benches/results.json.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import literal
 from ftlm.reproduction.simulated_arm import demo_plant
 from ftlm.simulation.discretization import record
 from ftlm.utils.validation import available_threads
-from results import append, heading
+from results import heading, save
 
 #: Candidates that the literal algorithm is timed on; each takes seconds.
 LITERAL = 20
@@ -59,7 +59,7 @@ def fft_time() -> float:
 def main() -> None:
     """Time, compare, print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     write = parser.parse_args().write
     threads = available_threads()
     run = plant_a_run()
@@ -130,7 +130,7 @@ def main() -> None:
     if worst > 1e-6:
         raise SystemExit("the literal algorithm and ours disagree")
     if write:
-        append([f"- {line}" for line in lines])
+        save([f"- {line}" for line in lines])
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from arm_measured import arm_run
 from ftlm.structure_selection.candidates import NestedStructures, Variant, describe_structure, signature
 from ftlm.structure_selection.cross_validation import Folds, fit, scatter_factor, schwarz_criterion, validate_fit
 from oracles import held_response
-from results import Kept, append, heading
+from results import Kept, heading, save
 
 DRIVES = [(hub, k) for hub in ("theta11", "theta21", "theta22") for k in (0, 1, 2)]
 
@@ -197,7 +197,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--kept", type=Path, help="file of seeds that are done, to go on from")
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.seeds)
     rows = (
@@ -210,7 +210,7 @@ def main() -> None:
         print(line, flush=True)
         lines.append(line)
     if given.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

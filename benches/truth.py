@@ -1,7 +1,7 @@
 """Truth under noise, measured: bias against step, Monte-Carlo of the joint fit, the three-term table, random plants.
 
 ``python benches/truth.py WHAT [--seeds 100] [--plants A,A2,3T] [--levels 20,40,60,80] [--write]``
-prints tables; ``--write`` appends them to benches/RESULTS.md. WHAT is bias, intervals, instruments, orders,
+prints tables; ``--write`` writes them to benches/results.json. WHAT is bias, intervals, instruments, orders,
 three-terms, random-plants, arm (real runs, see arm_measured.py) or heating. Seeds are 0 to ``--seeds`` less one, and
 are never changed.
 """
@@ -30,7 +30,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.reproduction.simulated_arm import demo_plant
-from results import Kept, append, heading
+from results import Kept, heading, save
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -294,7 +294,7 @@ def heating() -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure and print; append with ``--write``."""
+    """Measure and print; write them with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "what",
@@ -304,7 +304,7 @@ def main() -> None:
     parser.add_argument("--plants", default="A,A2,3T")
     parser.add_argument("--levels", default="20,40,60,80")
     parser.add_argument("--kept", type=Path, help="file of random plants that are done, to go on from")
-    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
     names = arguments.plants.split(",")
     rows: Iterable[object] = {
@@ -324,7 +324,7 @@ def main() -> None:
         lines.append(str(row) if str(row).startswith("|") else f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:
-        append(lines)
+        save(lines)
 
 
 if __name__ == "__main__":

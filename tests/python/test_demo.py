@@ -3,8 +3,7 @@
 import pytest
 
 from ftlm.cli.framework import broken_line
-from ftlm.reproduction.demo import run_demo
-from ftlm.reproduction.report import demo_details, demo_page, demo_text
+from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from ftlm import DataError
 from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import _claim_of_orders, claims, table_3_coefficients
+from ftlm.reproduction.checks import _order_check, checks, table_3_coefficients
 from ftlm.reproduction.optimizer_comparison import OrderComparison, Panel, compare_optimizers
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
@@ -146,7 +146,7 @@ def by_words(found, words):
 
 
 def test_verdicts_follow_the_numbers(reproduction):
-    found = claims(reproduction)
+    found = checks(reproduction)
     for words in (
         "p itself improves",
         "Table 3 gives",
@@ -163,9 +163,9 @@ def test_verdicts_follow_the_numbers(reproduction):
         assert by_words(found, words).verdict == "does not hold", words
     # One simulated arm says nothing of the paper's.
     assert by_words(found, "orders of Tables 4 and 5").verdict == "cannot be told from a simulated truth"
-    measured = claims(replace(reproduction, simulated=False))
+    measured = checks(replace(reproduction, simulated=False))
     assert by_words(measured, "orders of Tables 4 and 5").verdict == "does not hold"
-    form = by_words(found, "find the orders of an arm").evidence
+    form = by_words(found, "find the orders of an arm").computed
     # Both stages' fits leave the noise, with orders that are not the arm's.
     assert "α₂ 1.9 ± " in form
     assert "α₄ 1.9" in form
@@ -173,7 +173,7 @@ def test_verdicts_follow_the_numbers(reproduction):
         published = stage.candidates["published, output error"].result
         assert published.settings["converged"]
         assert all(f.rmse == pytest.approx(1e-4, rel=0.05) for f in published.output_error.values())
-    assert "316 times less" in by_words(found, "printed models, under").brief
+    assert "316 times less" in by_words(found, "printed models, under").computed
 
 
 def trials_of(found, prior, arm="fractional"):
@@ -181,9 +181,9 @@ def trials_of(found, prior, arm="fractional"):
 
 
 def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
-    claim = by_words(claims(reproduction), "than the genetic algorithm")
+    claim = by_words(checks(reproduction), "than the genetic algorithm")
     assert claim.holds is None
-    assert "K0" in claim.claim_verdict.factors
+    assert "K0" in claim.ruling.factors
     for contest in reproduction.panel.contests:
         assert set(contest.order_grid) == {1.0, 1e10}
         assert set(contest.genetic) == set(contest.evolution) == {0, 1}
@@ -197,15 +197,15 @@ def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
 
 
 def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
-    claim = by_words(claims(reproduction), "larger p converges faster")
+    claim = by_words(checks(reproduction), "larger p converges faster")
     assert claim.verdict == "turns with K0"
-    assert [(level, held == count) for level, count, held in claim.claim_verdict.levels] == [
+    assert [(level, held == count) for level, count, held in claim.ruling.levels] == [
         ("1", True),
         ("10¹⁰", False),
     ]
     # With K0 = 1 deflections arrive at once, whatever p is, and are no cases.
-    assert claim.claim_verdict.levels[0] == ("1", 4, 4)
-    assert "no cases: 4 of 16" in claim.evidence
+    assert claim.ruling.levels[0] == ("1", 4, 4)
+    assert "arrive by step 2: 4 of 16" in claim.computed
     strong, weak = (trials_of(reproduction, prior) for prior in (1.0, 1e10))
     for output in ("theta11", "theta21"):
         steps = list(strong[output].convergence_steps.values())
@@ -216,16 +216,16 @@ def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
 
 
 def test_larger_p_has_a_smaller_error_on_some_angles_with_one_prior(reproduction):
-    claim = by_words(claims(reproduction), "larger innovation length")
+    claim = by_words(checks(reproduction), "larger innovation length")
     assert claim.verdict.startswith("turns with")
-    assert set(claim.claim_verdict.factors) == {"K0", "the angle"}
+    assert set(claim.ruling.factors) == {"K0", "the angle"}
     for t in reproduction.panel.trials:
         if t.prior == 1e10:
             assert max(t.errors.values()) < 1.01 * min(t.errors.values())
 
 
 def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduction):
-    found = claims(reproduction)
+    found = checks(reproduction)
     for words in ("better than whole ones", "closer to the run than the manual's"):
         assert by_words(found, words).verdict == "cannot be told from a simulated truth"
     freed = {(f.arm, f.stage): f for f in reproduction.panel.order_comparisons}
@@ -243,8 +243,8 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
     # Of a measured run nobody chose the truth.
     own = replace(reproduction.panel, trials=(), order_comparisons=(freed["fractional", 1], freed["fractional", 2]))
     measured = replace(reproduction, simulated=False, panel=own)
-    assert by_words(claims(measured), "better than whole ones").verdict == "holds"
-    assert by_words(claims(measured), "closer to the run than the manual's").verdict == "cannot be told"
+    assert by_words(checks(measured), "better than whole ones").verdict == "holds"
+    assert by_words(checks(measured), "closer to the run than the manual's").verdict == "cannot be told"
 
 
 def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
@@ -261,9 +261,21 @@ def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
     assert whole.earns("y") is False
     assert replace(whole, gains={"y": 3.0}).earns("y") is None
     data = SimpleNamespace(panel=Panel((), (), (replace(better, is_degenerate=True),)), simulated=False)
-    claim = _claim_of_orders(data)
+    claim = _order_check(data)
     assert claim.verdict == "cannot be told"
-    assert "not told in 1 cases" in claim.evidence
+    assert "not told in 1 cases" in claim.computed
+
+
+def test_a_fit_that_must_not_be_used_is_no_case_of_a_claim(reproduction):
+    label = "published, output error"
+    stages = dict(reproduction.stages)
+    for number, verdict, cases in ((2, "does not hold", 1), (1, "cannot be told", 0)):
+        candidates = stages[number].candidates
+        worse = replace(candidates[label], result=candidates["instrumental variables"].result)
+        stages[number] = replace(stages[number], candidates={**candidates, label: worse})
+        check = by_words(checks(replace(reproduction, stages=stages)), "find the orders of an arm")
+        assert (check.verdict, check.ruling.cases) == (verdict, cases)
+        assert f"stage {number} is no case" in check.computed
 
 
 def test_verdicts_turn_when_the_numbers_do(reproduction):
@@ -304,7 +316,7 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
         for o, t in reproduction.as_printed.items()
     }
     made = replace(reproduction, stages={1: other}, panel=Panel(trials, contests, freed), ran=ran, as_printed=tables)
-    found = claims(made)
+    found = checks(made)
     for words in (
         "larger innovation length",
         "larger p converges faster",
@@ -319,17 +331,17 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
         "can be computed again",
     ):
         assert by_words(found, words).verdict == "holds", words
-    near = by_words(claims(replace(made, simulated=False)), "orders of Tables 4 and 5")
+    near = by_words(checks(replace(made, simulated=False)), "orders of Tables 4 and 5")
     assert near.verdict == "holds"
-    # Of measured runs nobody knows the truth.
-    assert not [c for c in claims(replace(reproduction, simulated=False)) if "find the orders" in c.claim]
+    # The truth of measured runs is not known.
+    assert not [c for c in checks(replace(reproduction, simulated=False)) if "find the orders" in c.claim]
 
 
 def test_p_itself_is_judged_by_errors_not_by_coefficients_that_differ(reproduction):
     stage = reproduction.stages[1]
     uneven = dict(zip(printed.INNOVATION_LENGTHS, (1.0, 1.1, 1.2, 5.0), strict=True))
     weak = {o: {p: {n: uneven[p] for n in c} for p, c in each.items()} for o, each in stage.weak.items()}
-    found = claims(replace(reproduction, stages={1: replace(stage, weak=weak)}))
+    found = checks(replace(reproduction, stages={1: replace(stage, weak=weak)}))
     assert by_words(found, "p itself improves").verdict == "does not hold"
 
 
@@ -340,7 +352,7 @@ def test_both_readings_are_saved(saved):
     row = written["as printed"]["theta22"]["rows"]["7"]
     assert row["coefficients"]["a"] / -0.7787 == pytest.approx(1.0, abs=0.1)
     assert row["equation_error"]["error"] / 0.9791 == pytest.approx(1.0, abs=0.15)
-    assert {c["verdict"].split(" with ")[0] for c in written["claims"]} >= {"does not hold", "turns"}
+    assert {c["verdict"].split(" with ")[0] for c in written["checks"]} >= {"does not hold", "turns"}
     assert len(written["printed models run"]) == 16
     assert {t["K0"] for t in written["verdicts"]["trials"]} == {1.0, 1e10}
 

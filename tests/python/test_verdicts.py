@@ -13,7 +13,7 @@ from ftlm.estimation.genetic import differential_evolution_search
 from ftlm.fractional_calculus import block_pulse_matrix
 from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import beats, case, combine_cases, converges_faster, deviation_in_words
+from ftlm.reproduction.checks import beats, case, combine_cases, converges_faster, deviation_text
 from ftlm.reproduction.optimizer_comparison import (
     compare_optimizers,
     compare_orders,
@@ -146,12 +146,12 @@ def test_printed_models_move_5_to_316_times_less_than_the_paper_s_arm(first_stag
 
 def test_words_on_printed_models_follow_their_numbers(first_stage):
     rows = tuple(first_stage.values())
-    told = deviation_in_words(SimpleNamespace(ran=rows))
+    told = deviation_text(SimpleNamespace(ran=rows))
     assert "from 5.78 to 316, median 18.9" in told
     assert "at least 0.83 to 0.997, where 0.14 to 0.37 is printed: in 8 of 8 rows" in told
     # Had they moved as far, nothing would follow.
     moving = tuple(replace(r, angle_deviation=0.9 * r.implied_deviation) for r in rows)
-    assert deviation_in_words(SimpleNamespace(ran=moving)).endswith("from 1.11 to 1.11, median 1.11")
+    assert deviation_text(SimpleNamespace(ran=moving)).endswith("from 1.11 to 1.11, median 1.11")
 
 
 def test_the_one_angle_reading_moves_as_little(first_stage):
@@ -348,7 +348,7 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
 
     monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
-        compare_orders(1, demo_run("square"), "fractional", 1)
+        compare_orders(1, demo_run("square"), "fractional", 1, unseen=demo_run("sine"))
     preset = Preset(ftlm.OrderGrid(increment=0.25), 1, 2, common_pulses=True)
     for simulated, initial in ((True, "rest"), (False, "auto")):
         work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None, simulated=simulated)

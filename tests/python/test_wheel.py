@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+import ftlm
+
 ROOT = Path(__file__).resolve().parents[2]
 WHEEL = runpy.run_path(str(ROOT / "tests" / "wheel.py"))
 NOTICES = runpy.run_path(str(ROOT / "tests" / "notices.py"))
@@ -170,6 +172,24 @@ def test_rust_is_as_new_as_the_newest_crate_needs():
     own = needed.pop("ftlm")
     newest = max(needed.values(), key=lambda version: [*map(int, version.split("."))])
     assert [*map(int, own.split("."))] == [*map(int, newest.split("."))][:2], needed
+
+
+def test_every_push_is_checked_by_targets_of_the_makefile():
+    text = (ROOT / ".github" / "workflows" / "checks.yml").read_text(encoding="utf-8")
+    workflow = yaml.safe_load(text)
+    # YAML 1.1 reads the key `on` as true.
+    assert set(workflow[True]) == {"push", "pull_request"}
+    job = workflow["jobs"]["checks"]
+    assert job["steps"][-1]["run"] == "make ${{ matrix.target }}"
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (parts,) = re.findall(r"^test: (.*)$", makefile, re.MULTILINE)
+    assert {*job["strategy"]["matrix"]["target"], "wheel-test"} == set(parts.split())
+
+
+def test_the_citation_has_the_version_of_the_package():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited["version"] == ftlm.__version__
+    assert {"cff-version", "message", "title", "authors"} <= cited.keys()
 
 
 def test_hosted_machines_are_told_what_there_is():

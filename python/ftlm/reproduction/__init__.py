@@ -1,10 +1,10 @@
 """Reproduction of the paper's section 5, and the demonstration that is a part of it."""
 
-from ftlm.reproduction.claims import Claim, printed_saturation, table_3_coefficients
+from ftlm.reproduction.checks import Check, table_3_coefficients
 from ftlm.reproduction.cross_validation import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs
-from ftlm.reproduction.demo import Demo, DemoStage, run_demo
-from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads
-from ftlm.reproduction.report import unseen_page
+from ftlm.reproduction.cross_validation_report import unseen_page
+from ftlm.reproduction.demo import Demo, run_demo
+from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads, printed_saturation
 from ftlm.reproduction.reproduction import Reproduction, reproduce
 from ftlm.reproduction.simulated_arm import demo_plant, demo_run
 from ftlm.reproduction.stage_result import Candidate, Rival, Stage
@@ -13,10 +13,9 @@ from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_tab
 __all__ = [
     "AsPrinted",
     "Candidate",
-    "Claim",
+    "Check",
     "Deflection",
     "Demo",
-    "DemoStage",
     "PaperRow",
     "Reproduction",
     "Rival",

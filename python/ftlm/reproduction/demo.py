@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from ftlm.data.run import Run
 from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
+from ftlm.order_search.result import search_summary
+from ftlm.plot.comparison_charts import comparison_charts
+from ftlm.plot.model_charts import pole_charts
 from ftlm.progress import ShareTracker
+from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
+from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
+from ftlm.reproduction.figures import convergence_chart, derivative_chart
 from ftlm.reproduction.published_values import ANGLE_NAMES, INNOVATION_LENGTHS
+from ftlm.reproduction.report import fits_text, joint_equations
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage_models import Preset, StageWork
-from ftlm.reproduction.stage_result import Candidate, DroppedDerivative
-from ftlm.reproduction.tables import letters_of
+from ftlm.reproduction.stage_result import GRID_ALPHA, DroppedDerivative
+from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
 from ftlm.structure.order_grid import OrderGrid
+from ftlm.svg.bar_chart import bar_chart
+from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
+from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
-from ftlm.validation.comparison import Metrics, finite
+from ftlm.utils.formatting import Cell, symbol, wrap_text
+from ftlm.validation.comparison import finite
 
 #: Candidates that the result of an order search keeps.
 TOP_CANDIDATES = 20
@@ -30,33 +45,15 @@ TRACE_EVERY = 16
 PARTS_OF_A_STAGE = len(INNOVATION_LENGTHS) + 2
 #: Models that are saved, by the suffix of their file name.
 SAVED_MODELS = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
-
-
-@dataclass(frozen=True)
-class DemoStage:
-    """Row of the demonstration's tables, in the form of the paper's Tables 4 and 5, for one output.
-
-    Parameters
-    ----------
-    label
-        Name of the model.
-    output
-        Output of the equation.
-    orders, coefficients
-        Values by name; an integer-order model lacks those of absent terms.
-    equation_error, output_error
-        Errors on the estimation run.
-    validation
-        Output error on the other run.
-    """
-
-    label: str
-    output: str
-    orders: Mapping[str, float]
-    coefficients: Mapping[str, float]
-    equation_error: Metrics
-    output_error: Metrics
-    validation: Metrics
+#: Models in the terminal summary, with the paper's names of the methods.
+SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
+TABLE_NOTE = (
+    "Equation error: measured signals on the right-hand side. Free run: output error, with the other output measured; "
+    "the integer-order model has explicit Euler at 2 ms from the current alone, as published, and output error has the "
+    "coupled response to the current alone. Output error has (14)–(15), whose deflection moves with the hub and has no "
+    "current. Integer order, p and least squares have the paper's (22)–(25), in which a derivative of the current is "
+    "missing. p weighs the data against the prior K0 = 1 with coefficients near zero; least squares has no prior."
+)
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,7 @@ class Demo:
 
     square: Run
     sine: Run
-    rows: dict[int, list[DemoStage]]
+    rows: dict[int, list[PaperRow]]
     results: dict[int, dict[str, Identification]]
     traces: dict[str, dict[int, MultiInnovationTrace]]
     derived: dict[int, DroppedDerivative]
@@ -97,24 +94,33 @@ class Demo:
         """Orders and free coefficients of the simulated arm, by stage."""
         return {stage: truth_of(stage) for stage in STAGE_NUMBERS}
 
+    def rows_by_output(self, stage: int) -> list[PaperRow]:
+        """Return the table rows of a stage, those of one output together."""
+        return sorted(self.rows[stage], key=lambda r: r.output)
+
+    def fits(self, stage: int) -> dict[str, list[float]]:
+        """Fit of the free run of every model in percent: for each output on the square run and on the sine run."""
+        found: dict[str, list[float]] = {}
+        for r in self.rows[stage]:
+            fits = [math.nan if f is None else f.fit for f in (r.output_error, r.validation)]
+            found.setdefault(r.label, []).extend(fits)
+        return found
+
     def to_dict(self) -> dict[str, Any]:
         """Return rows and estimates for JSON."""
+
+        def row(r: PaperRow) -> dict[str, Any]:
+            index = 1 + ANGLE_NAMES.index(r.output)
+            numbers = {"orders": r.orders, "coefficients": r.coefficients}
+            errors = {f: getattr(r, f) for f in ("equation_error", "output_error", "validation")}
+            return (
+                {"model": r.label, "output": r.output}
+                | {kind: {f"{n}{index}": v for n, v in part.items()} for kind, part in numbers.items()}
+                | {kind: None if f is None else f.to_dict() for kind, f in errors.items()}
+            )
+
         return {
-            "rows": {
-                str(stage): [
-                    {
-                        "model": r.label,
-                        "output": r.output,
-                        "orders": dict(r.orders),
-                        "coefficients": dict(r.coefficients),
-                        "equation_error": r.equation_error.to_dict(),
-                        "output_error": r.output_error.to_dict(),
-                        "validation": r.validation.to_dict(),
-                    }
-                    for r in rows
-                ]
-                for stage, rows in self.rows.items()
-            },
+            "rows": {str(stage): [row(r) for r in rows] for stage, rows in self.rows.items()},
             "warnings": {
                 f"stage {stage}, {label}": list(result.warnings)
                 for stage, results in self.results.items()
@@ -125,20 +131,6 @@ class Demo:
             },
             "files": [str(f) for f in self.files],
         }
-
-
-def rows_of(candidate: Candidate) -> list[DemoStage]:
-    """Return a table row for every equation of a model that was compared with both runs."""
-    own, other = candidate.estimation, candidate.validation
-    rows: list[DemoStage] = []
-    if other is None:
-        return rows
-    for item in candidate.model.equations:
-        output, index = item.output, 1 + ANGLE_NAMES.index(item.output)
-        orders, coefficients = ({f"{n}{index}": v for n, v in part.items()} for part in letters_of(item))
-        errors = own.equation_error[output], own.output_error[output], other.output_error[output]
-        rows.append(DemoStage(candidate.label, output, orders, coefficients, *errors))
-    return rows
 
 
 def run_demo(
@@ -201,16 +193,19 @@ def run_demo(
         work.progress = course.subtask(at / parts)
         log(label)
 
-    preset = Preset(OrderGrid(increment=increment), TOP_CANDIDATES, TRACE_EVERY, common_pulses=False)
+    grid = OrderGrid(increment=increment, alpha=GRID_ALPHA)
+    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY, common_pulses=False)
     for stage in STAGE_NUMBERS:
         work = StageWork(stage, square, sine, preset, threads, begin_part, None)
-        models = {
-            "integer order": work.euler_candidate("integer order", work.manual("integer order")),
-            **work.searches(),
-        }
+        models = {"integer order": work.euler_candidate("integer order", work.manual("integer order"))}
+        models |= work.searches()
         words = "all orders and coefficients together by output error, from the current alone"
         models["output error"] = work.joint("output error", work.coupled, words)
-        demo.rows[stage] = [row for candidate in models.values() for row in rows_of(candidate)]
+        demo.rows[stage] = [
+            paper_row(label, c.model, c.estimation, output, c.validation)
+            for label, c in models.items()
+            for output in work.measured.outputs
+        ]
         demo.results[stage] = {label: c.result for label, c in models.items() if c.result is not None}
         demo.traces.update(work.traces(models))
         demo.derived[stage] = work.dropped_derivative(models["output error"].model)
@@ -218,3 +213,138 @@ def run_demo(
             demo.files.append(folder / f"stage{stage}-{stem}.json")
             models[label].model.save(demo.files[-1], force=force)
     return demo
+
+
+def demo_text(demo: Demo) -> str:
+    """Summary for a terminal: verdicts, models, fits on the validation run, three warnings."""
+    lines = [f"A simulated flexible arm: {demo.square.length} rows of a square current, checked on a sine.", ""]
+    for stage, results in demo.results.items():
+        best = results["output error"]
+        estimates = [p for n, p in best.parameters.items() if n in best.names]
+        near = sum(abs(p.value - demo.truth[stage][p.name]) <= 2 * p.standard_error for p in estimates)
+        lines += wrap_text(f"Stage {stage}, output error: {demo.validations[stage].verdict}")
+        lines += [f"  {line}" for line in equation_lines(best.model)]
+        lines += [line for line in behavior_lines(best.model) if "mode" in line or "integrates" in line][:3]
+        lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
+    outputs = list(dict.fromkeys(r.output for rows in demo.rows.values() for r in rows))
+    lines.append(f"{'free run, fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
+    lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
+    for label in SHOWN_MODELS:
+        fits = [fit for stage in demo.rows for fit in demo.fits(stage)[label]]
+        shown = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
+        lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(shown)))
+    lines += ["", "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well."]
+    joint = [results["output error"] for results in demo.results.values()]
+    lines += finding_lines([w for r in joint for w in r.findings], how="-v")
+    others = sum(len(r.warnings) for results in demo.results.values() for r in results.values() if r not in joint)
+    return "\n".join([*lines, f"{others} warnings about the other models: ftlm demo -v, or the page"])
+
+
+def demo_details(demo: Demo) -> str:
+    """All tables for a terminal of 120 columns, followed by the warnings."""
+    lines = []
+    for stage in demo.rows:
+        lines += [f"Stage {stage}, square current (the shape of the paper's Table {3 + stage})"]
+        lines += [paper_table_text(demo.rows_by_output(stage)), ""]
+    lines += ["Fit of the free run in percent: on the square run, and on the sine run that no model has seen"]
+    for stage, rows in demo.rows.items():
+        outputs = dict.fromkeys(r.output for r in rows)
+        lines.append(" " * 24 + "".join(f"{o + ' square':>18}{o + ' sine':>16}" for o in outputs))
+        lines += fits_text(demo.fits(stage), 24, (18, 16) * len(outputs))
+    lines += ["", TABLE_NOTE, "", "Which way a link bends: correlation of the deflection with its current"]
+    heads = ("simulated arm", "(14)–(15) identified", "the same in (22)–(25)")
+    lines.append(" " * 24 + "".join(f"{words:>26}" for words in heads))
+    for d in demo.derived.values():
+        lines.append(d.output.ljust(24) + "".join(f"{v:>26.2f}" for v in d.correlations.values()))
+    lines.append("")
+    for stage, results in demo.results.items():
+        best = results["output error"]
+        estimates = {**best.orders, **(best.fit.coefficients if best.fit is not None else {})}
+        lines.append(f"Stage {stage}, output error: estimate ± standard error (truth of the simulated arm)")
+        for n, v in estimates.items():
+            lines.append(f"  {n:<8}{v:>12.6g} ± {best.standard_errors[n]:<9.2g} ({demo.truth[stage][n]:.6g})")
+    lines.append("")
+    for stage, results in demo.results.items():
+        for label, result in results.items():
+            lines += [f"warning (stage {stage}, {label}): {w}" for w in result.warnings]
+    return "\n".join(lines)
+
+
+def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """Write the demonstration as one HTML page: verdicts, fits on the validation run, then the tables of each stage.
+
+    Raises
+    ------
+    DataError
+        The file exists and ``force`` is not set, or cannot be written.
+    """
+    boxes = Markup("").join(
+        verdict_box(checked.verdict, f"Stage {stage}, output error: ")
+        for stage, checked in demo.validations.items()
+        if checked.verdict is not None
+    )
+    bars = [chart for rows in demo.rows.values() for chart in _bar_charts(rows)]
+    validated: list[list[Cell]] = [
+        [r.output, r.label, r.output_error.fit, r.validation.fit, r.validation.error, r.validation.nr]
+        for stage in demo.rows
+        for r in demo.rows_by_output(stage)
+        if r.output_error is not None and r.validation is not None
+    ]
+    heads = ("output", "model", "fit % on the square", "fit % on the sine", "error (45) on the sine", "NR on the sine")
+    table = Table("Validation on the other input", heads, validated, note="Free runs; error in rad.")
+    sections = [
+        Section("Which model predicts", figures=bars, small=True),
+        *(_stage_section(demo, stage) for stage in demo.results),
+        Section("Validation", tables=[table]),
+    ]
+    lead = (
+        "Both stages of a simulated flexible two-link arm with fractional damping, identified from a noisy square run: "
+        "by output error in the arm's own equations, and in the paper's equations with every order on a grid. All "
+        "models are checked on a sine run."
+    )
+    return write_page(path, title="ftlm demo", sections=sections, lead=lead, force=force, verdict=boxes)
+
+
+def _stage_section(demo: Demo, stage: int) -> Section:
+    """Section of a stage; findings of the model to be used come first."""
+    results = demo.results[stage]
+    best = results["output error"]
+    compared = {
+        "output error, square run": best.comparison,
+        "output error, sine run": demo.validations[stage],
+        "multi-innovation, p = 7, square run": results["p = 7"].comparison,
+    }
+    charts = [f for label, c in compared.items() for f in comparison_charts(c, units=best.model.units, label=label)]
+    charts += [*pole_charts(best.model), *best.model.step().figures()]
+    for output in best.model.outputs:
+        title = f"Error (45) of {symbol(output)} after each step of the recursion"
+        charts.append(convergence_chart(demo.traces[output], title, log_x=False))
+    shown, left = first_findings(best.findings)
+    others = grouped_findings({n: r for n, r in results.items() if n != "output error"})
+    searches = {f"{n}, {o}": s for n, r in results.items() for o, s in r.searches.items()}
+    return Section(
+        f"Stage {stage}",
+        [*joint_equations(best.model), TABLE_NOTE],
+        warnings=shown,
+        more=[*left, *others],
+        tables=[
+            *behavior_tables(best.model),
+            estimates_table(best, demo.truth[stage]),
+            paper_table(demo.rows_by_output(stage), title=f"Stage {stage}, square current"),
+            search_summary(searches),
+        ],
+        figures=[*charts, derivative_chart(demo.derived[stage])],
+    )
+
+
+def _bar_charts(rows: list[PaperRow]) -> list[Figure]:
+    """Fits of all models on both runs as bars, one chart per output."""
+    charts = []
+    for output in dict.fromkeys(r.output for r in rows):
+        own = [r for r in rows if r.output == output]
+        runs = {"square, fitted to": "output_error", "sine, not seen": "validation"}
+        groups = [(words, [getattr(r, f).fit for r in own]) for words, f in runs.items()]
+        title = f"Fit of the free run of {symbol(output)}"
+        labels = [r.label for r in own]
+        charts.append(bar_chart(labels, groups, title=title, x_label="fit [%]", high=100.0, width=SMALL_WIDTH_PX))
+    return charts

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
@@ -12,13 +13,16 @@ from markupsafe import Markup
 from ftlm.estimation.linear import MultiInnovationTrace, trace_chart
 from ftlm.plot.comparison_charts import error_chart, pulse_times
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import ClaimVerdict, ReproductionData
+from ftlm.reproduction.checks import ClaimVerdict
 from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
 from ftlm.svg.figure import NARROW_WIDTH_PX, Figure, svg
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, metrics
+
+if TYPE_CHECKING:
+    from ftlm.reproduction.reproduction import Reproduction
 
 #: Points per line: some fifty charts keep the page below 2 MB.
 LINE_POINTS = 500
@@ -27,70 +31,60 @@ LINE_POINTS = 500
 MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
 
 
+def angle_chart(time: Floats, lines: Sequence[tuple[str, Floats]], output: str, title: str, caption: str) -> Figure:
+    """Chart of an angle over time by several models."""
+    return line_chart(
+        time,
+        lines,
+        title=title,
+        x_label="time [s]",
+        y_label=f"{symbol(output)} [rad]",
+        points=LINE_POINTS,
+        caption=caption.replace(" -", " −"),
+    )
+
+
 def reference_label(*, simulated: bool) -> str:
     """Label of the line that models are compared with."""
     return "simulated arm" if simulated else "measured"
 
 
-def mask_excursions(values: Floats, measured: Floats) -> Floats:
-    """Replace values far from the measured ones by NaN; the chart marks the gap."""
-    middle = float(np.mean(measured))
-    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(measured - middle)))
-    with np.errstate(invalid="ignore"):
-        return np.where(np.abs(values - middle) <= limit, values, np.nan)
-
-
 def fit_chart(
     models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
 ) -> Figure:
-    """Chart of an angle and its simulations by some models."""
+    """Chart of an angle and its simulations by some models, without far excursions."""
     first = models[0][1]
-    measured = first.measured[output][0]
-    lines = [(reference_label(simulated=simulated), measured)]
-    gone = []
+    measured, time = first.measured[output][0], pulse_times(first)
+    middle = float(np.mean(measured))
+    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(measured - middle)))
+    lines, gone = [(reference_label(simulated=simulated), measured)], []
     for label, comparison in models:
-        response = mask_excursions(comparison.simulated[output][0], measured)
+        response = comparison.simulated[output][0]
+        with np.errstate(invalid="ignore"):
+            response = np.where(np.abs(response - middle) <= limit, response, np.nan)
         left = np.flatnonzero(np.isnan(response))
         if left.size:
-            gone.append(f"{label} leaves the drawing after {pulse_times(first)[left[0]]:.2g} s")
-        lines.append((label, response))
-    told = " ".join(part for part in (caption, "; ".join(gone) + "." if gone else "") if part)
-    return line_chart(
-        pulse_times(first),
-        [line for line in lines if np.isfinite(line[1]).any()],
-        title=title,
-        x_label="time [s]",
-        y_label=f"{symbol(output)} [rad]",
-        points=LINE_POINTS,
-        caption=told,
-    )
+            gone.append(f"{label} leaves the drawing after {time[left[0]]:.2g} s")
+        if left.size < response.size:
+            lines.append((label, response))
+    words = " ".join(part for part in (caption, "; ".join(gone) + "." if gone else "") if part)
+    return angle_chart(time, lines, output, title, words)
 
 
-def printed_model_charts(found: ReproductionData) -> list[Figure]:
+def printed_model_charts(found: Reproduction) -> list[Figure]:
     """Charts of the printed hub models under the paper's current, beside an angle of the implied standard deviation."""
     charts = []
     for output in dict.fromkeys(r.output for r in found.ran if r.output.endswith("1")):
         rows = [r for r in found.ran if r.output == output]
         last = rows[-1]
-        lines = [("simulated arm", last.arm)]
-        lines += [(f"printed, p = {r.p}", r.response) for r in rows]
         caption = (
             f"The printed equations of Table {3 + int(output[-2])} from the current alone, and the simulated arm, "
             f"scaled to the deviation that the printed RMSE / NR implies ({last.implied_deviation:.2g} rad). p = "
-            f"{last.p} moves "
-            f"{last.deviation_ratio:.0f} times less than the angle that it was identified from."
+            f"{last.p} moves {last.deviation_ratio:.0f} times less than the angle that it was identified from."
         )
-        charts.append(
-            line_chart(
-                last.time,
-                lines,
-                title=f"{symbol(output)}: the printed models under the paper's current",
-                x_label="time [s]",
-                y_label=f"{symbol(output)} [rad]",
-                points=LINE_POINTS,
-                caption=caption,
-            )
-        )
+        lines = [("simulated arm", last.arm), *((f"printed, p = {r.p}", r.response) for r in rows)]
+        title = f"{symbol(output)}: the printed models under the paper's current"
+        charts.append(angle_chart(last.time, lines, output, title, caption))
     return charts
 
 
@@ -109,14 +103,15 @@ def share_picture(ruling: ClaimVerdict) -> Markup:
 
 def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> Figure:
     """Chart of the error (45) over the steps of the recursion, one line per p."""
-    ends = max(float(t.error[-1]) for t in traces.values())
-    drawn = {}
+    end = max(float(t.error[-1]) for t in traces.values())
+    drawn, gaps = [], False
     for p, trace in traces.items():
         with np.errstate(invalid="ignore"):
-            near = np.where(trace.error <= MAX_ERROR_RATIO * ends, trace.error, np.nan)
-        drawn[p] = replace(trace, error=near if np.isfinite(near).any() else trace.error)
-    figure = trace_chart([(f"p = {p}", trace) for p, trace in drawn.items()], title=title, log_x=log_x)
-    gaps = any(np.isnan(t.error).any() for t in drawn.values())
+            near = np.where(trace.error <= MAX_ERROR_RATIO * end, trace.error, np.nan)
+        near = near if np.isfinite(near).any() else trace.error
+        gaps = gaps or bool(np.isnan(near).any())
+        drawn.append((f"p = {p}", replace(trace, error=near)))
+    figure = trace_chart(drawn, title=title, log_x=log_x)
     words = f"Errors above {MAX_ERROR_RATIO:g} times the last ones are not drawn."
     return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
 
@@ -127,19 +122,12 @@ def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> F
     own = reference_label(simulated=simulated)
     lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
     caption = (
-        f"The same numbers in both, order of the current 0 where it should be {derived.order:.3g}. NR between the two: "
-        f"{nr:.3g}. Correlation with the current: {own} {bent['measured']:.2f}, (14)–(15) {bent['derived']:.2f}, "
+        f"Equal parameters in both forms; the order of the current is 0 instead of {derived.order:.3g}. NR between "
+        f"both: {nr:.3g}. Correlation with the current: {own} {bent['measured']:.2f}, (14)–(15) {bent['derived']:.2f}, "
         f"(22)–(25) {bent['published']:.2f}."
-    ).replace(" -", " −")
-    return line_chart(
-        derived.time,
-        lines,
-        title=f"{symbol(derived.output)}: which way the link bends",
-        x_label="time [s]",
-        y_label=f"{symbol(derived.output)} [rad]",
-        points=LINE_POINTS,
-        caption=caption,
     )
+    title = f"{symbol(derived.output)}: which way the link bends"
+    return angle_chart(derived.time, lines, derived.output, title, caption)
 
 
 def _fits_chart(
@@ -159,9 +147,10 @@ def _fits_chart(
 
 
 def _beside_integer(stage: Stage) -> dict[str, Candidate]:
-    """Models of Figures 6, 9 and 10."""
+    """Models of Figures 6, 9 and 10; Euler's method needs a start at rest."""
+    manual = "integer, Euler" if stage.traces else "integer, exact"
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
-    labels = {"integer, manual": stage.manual, last: last, "output error": "output error"}
+    labels = {"integer, manual": manual, last: last, "output error": "output error"}
     return {shown: stage.candidates[label] for shown, label in labels.items()}
 
 
@@ -177,38 +166,34 @@ def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
             title = f"Figure {place}(b). {symbol(output)}: error (45) after each step"
             figures.append(convergence_chart(stage.traces[output], title))
     for letter, output in zip("ab", stage.outputs, strict=True):
-        figures += _fits_chart(
-            _beside_integer(stage), output, f"{first + 2}({letter})", sine=False, simulated=simulated
-        )
+        number = f"{first + 2}({letter})"
+        figures += _fits_chart(_beside_integer(stage), output, number, sine=False, simulated=simulated)
     return figures
 
 
-def _letter(output: str) -> str:
-    return "abcd"[printed.ANGLE_NAMES.index(output)]
+def _place(figure: int, output: str) -> str:
+    return f"{figure}({'abcd'[printed.ANGLE_NAMES.index(output)]})"
 
 
-def sine_figures(found: ReproductionData) -> list[Figure]:
+def sine_figures(found: Reproduction) -> list[Figure]:
     """Figure 10."""
     return [
         figure
         for stage, output in found.angles
         for figure in _fits_chart(
-            _beside_integer(stage), output, f"10({_letter(output)})", sine=True, simulated=found.simulated
+            _beside_integer(stage), output, _place(10, output), sine=True, simulated=found.simulated
         )
     ]
 
 
-#: Labels of the lines.
-RIVAL_NAMES = {MULTI_INNOVATION_LABELS[0]: "p = 7, K₀ = 1", MULTI_INNOVATION_LABELS[1]: "p = 7, weak prior"}
-
-
-def rival_figures(found: ReproductionData) -> list[Figure]:
+def rival_figures(found: Reproduction) -> list[Figure]:
     """Figure 11, on the validation run, or on the estimation run without one."""
+    names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
     figures = []
     for output, rival in found.rivals.items():
-        models = {RIVAL_NAMES.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
-        unseen = rival.genetic.validation is not None
-        figures += _fits_chart(models, output, f"11({_letter(output)})", sine=unseen, simulated=found.simulated)
+        models = {names.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
+        unseen = rival.models["genetic"].validation is not None
+        figures += _fits_chart(models, output, _place(11, output), sine=unseen, simulated=found.simulated)
     return figures
 
 
@@ -226,10 +211,10 @@ FLOW_CHART_BOXES = (
 
 def flow_chart() -> Figure:
     """Figure 2: from the physics to the model."""
-    title = "Figure 2. From the physics to the identified model"
     names = ", then ".join(f"{a} {b}" for a, b in FLOW_CHART_BOXES)
     described = f"Flow chart: {names}. From the free run an arrow leads back to the orders: every candidate in turn."
-    return Figure(title, _flow(described, narrow=False), _flow(described, narrow=True))
+    drawings = [_flow(described, narrow=narrow) for narrow in (False, True)]
+    return Figure("Figure 2. From the physics to the identified model", *drawings)
 
 
 def _flow(described: str, *, narrow: bool) -> Markup:

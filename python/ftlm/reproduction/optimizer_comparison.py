@@ -1,9 +1,9 @@
-"""Comparison of multi-innovation with two global optimizers: one record, criterion and budget, uninformed bounds."""
+"""Cases behind the verdicts: multi-innovation by p and K0, two global optimizers, integer and free orders."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,15 +14,24 @@ from ftlm.data.run import Run
 from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_evolution_search, genetic_search
 from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
+from ftlm.estimation.methods import OutputError
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import improves_prediction, is_degenerate
 from ftlm.kernels import pulse_means
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
-from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import INNOVATION_LENGTHS
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
-from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, RIVAL_ALPHA, TRACE_EVERY, Stage
+from ftlm.reproduction.stage_result import (
+    GRID_ALPHA,
+    MULTI_INNOVATION_LABELS,
+    PRIOR_COVARIANCES,
+    RIVAL_ALPHA,
+    SEARCH_OPTIONS,
+    TRACE_EVERY,
+    Stage,
+    published_structure,
+)
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.simulate import explicit_euler
 from ftlm.structure.order_grid import OrderGrid
@@ -34,6 +43,12 @@ MAX_SEEDS, MIN_SEEDS, MAX_EVALUATIONS = 10, 3, 40_000
 #: Default smallest increment of the order grid, on every arm: the paper's grid has 60 000 candidates per angle, as many
 #: evaluations per seed, and takes minutes.
 CONTEST_STEP = 0.1
+#: An error has converged if it stays below the final error of p = 1 plus this share.
+CONVERGENCE_MARGIN = 0.02
+#: Joint fits use every fourth sample: 8 ms on the virtual rig, a fifteenth of the fastest link mode's period.
+ROW_STRIDE = 4
+#: Increment of the order grids of trials.
+PANEL_STEP = 0.25
 
 
 @dataclass(frozen=True)
@@ -57,13 +72,23 @@ def seeds_for(candidates: int) -> tuple[int, ...]:
     return tuple(range(min(MAX_SEEDS, max(MIN_SEEDS, MAX_EVALUATIONS // max(candidates, 1)))))
 
 
+def _best_orders(run: Run, single: Structure, grid: OrderGrid, p: int, prior: float, **work: Any) -> SearchResult:
+    """Return the best candidate of multi-innovation on an order grid."""
+    options: dict[str, Any] = {
+        **SEARCH_OPTIONS,
+        "coefficients": "multi-innovation",
+        "innovation_length": p,
+        "prior_covariance": prior,
+    }
+    return rank_orders(run, single, grid, top=1, **options, **work)
+
+
 def compare_optimizers(
     run: Run,
     single: Structure,
     order_grid: OrderGrid,
     asked: GeneticAlgorithm | None = None,
     *,
-    seeds: Sequence[int] | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> OptimizerComparison:
@@ -78,9 +103,7 @@ def compare_optimizers(
     order_grid
         Order grid of multi-innovation; its ends bound the orders of the optimizers.
     asked
-        Settings of the genetic algorithm given by the user.
-    seeds
-        Default seeds; by default as many as the budget of evaluations allows.
+        Settings of the genetic algorithm given by the user; the order grid and the number of evaluations are replaced.
     threads, progress
         See :func:`ftlm.search_orders`.
 
@@ -92,21 +115,11 @@ def compare_optimizers(
     # Reference values of a structure would inform the bounds.
     blind = replace(single, reference={})
     searches = {
-        prior: rank_orders(
-            run,
-            blind,
-            order_grid,
-            coefficients="multi-innovation",
-            innovation_length=INNOVATION_LENGTHS[-1],
-            prior_covariance=prior,
-            top=1,
-            threads=threads,
-            progress=progress,
-        )
+        prior: _best_orders(run, blind, order_grid, INNOVATION_LENGTHS[-1], prior, threads=threads, progress=progress)
         for prior in PRIOR_COVARIANCES
     }
     count = searches[PRIOR_COVARIANCES[0]].candidates
-    settings = asked or GeneticAlgorithm(seeds=tuple(seeds or seeds_for(count)))
+    settings = asked or GeneticAlgorithm(seeds=seeds_for(count))
     budget = settings.evaluations or max(count, 2 * settings.population)
     settings = replace(settings, order_grid=order_grid, evaluations=budget)
     records = prepare([run], blind, None, power_of_two=True)
@@ -115,14 +128,6 @@ def compare_optimizers(
         for search in (genetic_search, differential_evolution_search)
     ]
     return OptimizerComparison(settings, count, searches, *rivals)
-
-
-#: An error has converged if it stays below the final error of p = 1 plus this share.
-CONVERGENCE_MARGIN = 0.02
-#: Joint fits use every fourth sample: 8 ms on the virtual rig, a fifteenth of the fastest link mode's period.
-ROW_STRIDE = 4
-#: Increment of the order grids.
-PANEL_STEP = 0.25
 
 
 @dataclass(frozen=True)
@@ -173,10 +178,8 @@ class Contest:
     ----------
     arm, output
         Arm of the record, angle.
-    candidates
-        Candidates of the order grid, and evaluations per seed.
-    increment
-        Increment of the order grid.
+    candidates, increment
+        Candidates of the order grid, which are the evaluations per seed, and its increment.
     order_grid
         Error (45) of p = 7 by K0.
     genetic, evolution
@@ -273,12 +276,11 @@ class Panel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return all cases for JSON."""
-        parts: tuple[tuple[str, Iterable[Any]], ...] = (
-            ("trials", self.trials),
-            ("contests", self.contests),
-            ("whole and free orders", self.order_comparisons),
-        )
-        return {name: [item.to_dict() for item in items] for name, items in parts}
+        return {
+            "trials": [t.to_dict() for t in self.trials],
+            "contests": [c.to_dict() for c in self.contests],
+            "whole and free orders": [f.to_dict() for f in self.order_comparisons],
+        }
 
 
 def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
@@ -297,59 +299,29 @@ def manual_nr(stage: StageNumber, run: Run) -> dict[str, float]:
     for name, samples in explicit_euler(link_model(stage=stage, form="published"), run).items():
         with np.errstate(over="ignore", invalid="ignore"):
             finite_run = bool(np.all(np.isfinite(samples)))
-        measured = pulse_means(run[name], m)
-        found[name] = metrics(measured, pulse_means(samples, m)).nr if finite_run else math.inf
+        found[name] = metrics(pulse_means(run[name], m), pulse_means(samples, m)).nr if finite_run else math.inf
     return found
 
 
 def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int | None) -> list[Trial]:
     """Run multi-innovation on both angles of a stage, with all p and both values of K0."""
-    structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
+    structure, grid = published_structure(stage), OrderGrid(increment=PANEL_STEP, alpha=GRID_ALPHA)
     run = square.select(list(structure.signals))
     manual, found = manual_nr(stage, run), []
     for output in structure.outputs:
         single = structure.equation(output)
         for prior in PRIOR_COVARIANCES:
-            best = {
-                p: rank_orders(
-                    run,
-                    single,
-                    OrderGrid(increment=PANEL_STEP),
-                    coefficients="multi-innovation",
-                    innovation_length=p,
-                    prior_covariance=prior,
-                    top=1,
-                    threads=threads,
-                )
-                for p in printed.INNOVATION_LENGTHS
-            }
-            last = best[printed.INNOVATION_LENGTHS[-1]].model
+            best = {p: _best_orders(run, single, grid, p, prior, threads=threads) for p in INNOVATION_LENGTHS}
+            last = best[INNOVATION_LENGTHS[-1]].model
             known = single.with_orders({n: last.orders[n] for n in single.order_names})
-            traces = {
-                p: multi_innovation_trace(run, known, innovation_length=p, prior_covariance=prior, every=TRACE_EVERY)
-                for p in printed.INNOVATION_LENGTHS
-            }
-            end = float(traces[printed.INNOVATION_LENGTHS[0]].error[-1])
+            common: dict[str, Any] = {"prior_covariance": prior, "row_basis": "haar", "every": TRACE_EVERY}
+            traces = {p: multi_innovation_trace(run, known, innovation_length=p, **common) for p in INNOVATION_LENGTHS}
+            end = float(traces[INNOVATION_LENGTHS[0]].error[-1])
+            steps = {p: convergence_step(t, end) for p, t in traces.items()}
             nr = compare_means(last, run).output_error[output].nr
-            found.append(
-                Trial(
-                    arm,
-                    seed,
-                    output,
-                    prior,
-                    {p: s.score for p, s in best.items()},
-                    {p: convergence_step(t, end) for p, t in traces.items()},
-                    nr,
-                    manual[output],
-                )
-            )
+            errors = {p: s.score for p, s in best.items()}
+            found.append(Trial(arm, seed, output, prior, errors, steps, nr, manual[output]))
     return found
-
-
-def contest(made: OptimizerComparison, output: str, arm: str, increment: float) -> Contest:
-    """Return the errors of all three optimizers."""
-    lattice = {k: search.score for k, search in made.order_grid.items()}
-    return Contest(arm, output, made.candidates, increment, lattice, made.genetic.errors, made.evolution.errors)
 
 
 def compare_orders(
@@ -359,81 +331,61 @@ def compare_orders(
     threads: int | None,
     progress: Callable[[int, int], None] | None = None,
     *,
-    unseen: Run | None = None,
+    unseen: Run,
 ) -> OrderComparison:
     """Fit integer and free orders of one stage of a simulated arm, which starts at rest, on a decimated run.
 
-    Both are compared on an unseen run, if there is one.
+    Both are compared on an unseen run.
 
     Raises
     ------
     ConvergenceError
         No initial guess of one of the fits converged.
     """
-    structure = replace(flexible_link(stage=stage, coupling="simulated"), initial="rest")
-    own = square.select(list(structure.signals))
+    structure = replace(flexible_link(stage=stage, form="lagrange", coupling="simulated"), initial="rest")
+    own, other = (run.select(list(structure.signals)) for run in (square, unseen))
     run = decimate_run(own, ROW_STRIDE)
     whole = structure.with_orders({n: integer_order(n) for n in structure.order_names})
-    # Whole orders on an arm that has none let coefficients go where their squares are no numbers.
+    method = OutputError(loss="squares", intervals="auto", noise="white")
+    # Coefficients of integer orders overflow on an arm without them.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        fits = [identify(run, item, threads=threads, progress=progress) for item in (whole, structure)]
-    m = default_m([own], power_of_two=True)
-    coarse, fine = (compare_means(replace(fit.model, m=m), own) for fit in fits)
-    others = None
-    if unseen is not None:
-        other = unseen.select(list(structure.signals))
-        others = tuple(compare_means(replace(fit.model, m=m), other) for fit in fits)
-    return _order_comparison(arm, stage, (coarse, fine), others, fits)
+        fits = [identify(run, item, method=method, threads=threads, progress=progress) for item in (whole, structure)]
+    models = [replace(fit.model, m=default_m([own], power_of_two=True)) for fit in fits]
+    seen, judged = ([compare_means(model, each) for model in models] for each in (own, other))
+    return _order_comparison(arm, stage, seen, judged, fits)
 
 
 def _order_comparison(
     arm: str,
     stage: int,
-    seen: tuple[Comparison, Comparison],
-    unseen: tuple[Comparison, ...] | None,
+    seen: Sequence[Comparison],
+    unseen: Sequence[Comparison | None],
     fits: Sequence[Identification | None],
 ) -> OrderComparison:
-    """Return the comparison of whole and free orders, in this order."""
+    """Return the comparison of integer and free orders, in this order."""
     nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in seen)
+    before, after = ({} if c is None else c.fit_percent for c in unseen)
+    gains = {o: after[o] - before[o] for o in nr if o in before and math.isfinite(after[o] - before[o])}
     free = fits[1]
     assert free is not None
-    gains = {}
-    if unseen is not None:
-        before, after = (c.fit_percent for c in unseen)
-        gains = {o: after[o] - before[o] for o in nr if math.isfinite(after[o] - before[o])}
-    degenerate = any(fit is None or is_degenerate(fit) for fit in fits)
     orders = {n: (v, *free.intervals[n]) for n, v in free.orders.items()}
+    degenerate = any(fit is None or is_degenerate(fit) for fit in fits)
     return OrderComparison(arm, stage, nr, free_nr, orders, gains, degenerate)
 
 
-def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads: int | None) -> Panel:
+def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
     """Return the cases of one run and its stage results; trials only for runs that start at rest."""
-    trials: list[Trial] = []
-    contests = []
-    freed = []
-    for stage in stages:
-        if stage.traces:
-            trials += trials_of(stage.number, square, arm, seed, threads)
-        for output, rival in stage.rivals.items():
-            lattice = dict(zip(PRIOR_COVARIANCES, (rival.models[n] for n in MULTI_INNOVATION_LABELS), strict=True))
-            errors = {k: c.estimation.output_error[output].error for k, c in lattice.items()}
-            contests.append(
-                Contest(
-                    arm,
-                    output,
-                    rival.candidates,
-                    rival.increment,
-                    errors,
-                    rival.genetic_run.errors,
-                    rival.evolution_run.errors,
-                )
-            )
-        whole, free = (stage.candidates[n] for n in ("integer, identified", "output error"))
-        if free.result is not None and free.result.fit is not None:
-            both = (whole.validation, free.validation)
-            unseen = None if both[0] is None or both[1] is None else (both[0], both[1])
-            seen = (whole.estimation, free.estimation)
-            freed.append(_order_comparison(arm, stage.number, seen, unseen, (whole.result, free.result)))
+    contests, freed = [], []
+    for output, rival in stage.rivals.items():
+        lattice = dict(zip(PRIOR_COVARIANCES, (rival.models[n] for n in MULTI_INNOVATION_LABELS), strict=True))
+        errors = {k: c.estimation.output_error[output].error for k, c in lattice.items()}
+        sizes = rival.candidates, rival.increment
+        contests.append(Contest(arm, output, *sizes, errors, rival.genetic_run.errors, rival.evolution_run.errors))
+    both = [stage.candidates[n] for n in ("integer, identified", "output error")]
+    if both[1].result is not None and both[1].result.fit is not None:
+        seen, unseen, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
+        freed.append(_order_comparison(arm, stage.number, seen, unseen, fits))
+    trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else []
     return Panel(tuple(trials), tuple(contests), tuple(freed))
 
 
@@ -453,26 +405,26 @@ def simulated_panel(
     """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
 
     Without an order grid there are neither; with ``has_contests=False`` there are no contests. Before each step `begin`
-    is called with what it is, a key of `ftlm.reproduction.stage_models.STEPS`.
+    is called with its name, a key of `ftlm.reproduction.stage_models.STEP_COSTS`.
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
     freed: list[OrderComparison] = []
     for seed in seeds:
-        run = demo_run("square", noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
+        run, unseen = (demo_run(s, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm]) for s in ("square", "sine"))
         begin("trials")
         trials += trials_of(stage, run, arm, seed, threads)
         if order_grid is None or seed != seeds[0]:
             continue
-        structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
+        structure = published_structure(stage)
         own = run.select(list(structure.signals))
         for output in structure.outputs if has_contests else ():
             begin("rivals")
-            made = compare_optimizers(
-                own, structure.equation(output), order_grid, genetic, threads=threads, progress=progress
-            )
-            contests.append(contest(made, output, arm, order_grid.increment))
+            single = structure.equation(output)
+            made = compare_optimizers(own, single, order_grid, genetic, threads=threads, progress=progress)
+            errors = {k: search.score for k, search in made.order_grid.items()}
+            sizes = made.candidates, order_grid.increment
+            contests.append(Contest(arm, output, *sizes, errors, made.genetic.errors, made.evolution.errors))
         begin("freed")
-        unseen = demo_run("sine", noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
         freed.append(compare_orders(stage, run, arm, threads, progress, unseen=unseen))
     return Panel(tuple(trials), tuple(contests), tuple(freed))

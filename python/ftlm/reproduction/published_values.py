@@ -129,6 +129,22 @@ def last_orders(output: str) -> dict[str, float]:
     return {f"{n}{index}": v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
 
 
+def printed_saturation(output: str) -> tuple[float, float, float]:
+    """Fit x·p / (p + c) to the printed a of p = 1 and 7; return x, c and the largest error at p = 3 and 5.
+
+    Parameters
+    ----------
+    output
+        An angle of the paper, such as ``"theta11"``.
+    """
+    first, *between, last = ((p, row.coefficients["a"]) for p, row in FRACTIONAL_ROWS[output].items())
+    # 1/a = 1/x + (c/x)/p is a line in 1/p.
+    slope = (1 / first[1] - 1 / last[1]) / (1 / first[0] - 1 / last[0])
+    x = 1 / (1 / first[1] - slope / first[0])
+    c = slope * x
+    return x, c, max(abs(x * p / (p + c) / a - 1) for p, a in between)
+
+
 #: Angles in the terms a, b and d of an equation: its own angle, or the other one of its stage.
 TERM_INTERPRETATIONS = {
     "(22)–(25)": "as printed there",

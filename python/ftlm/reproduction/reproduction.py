@@ -7,22 +7,20 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolution, load_pygad
-from ftlm.model.model import Model
 from ftlm.progress import format_time_left
-from ftlm.reproduction.claims import Claim, ReproductionData, claims
+from ftlm.reproduction.checks import Check, checks
 from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, Panel, panel_of, rivals_order_grid, simulated_panel
 from ftlm.reproduction.published_models import PrintedModelRun, run_printed_models
 from ftlm.reproduction.published_values import AsPrinted, as_printed
 from ftlm.reproduction.report import reproduction_page
-from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run
+from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
 from ftlm.reproduction.stage_models import (
     RIVALS_OMITTED,
     Preset,
@@ -32,25 +30,25 @@ from ftlm.reproduction.stage_models import (
     seconds_of,
     seconds_of_all,
 )
-from ftlm.reproduction.stage_result import TRACE_EVERY, Stage
+from ftlm.reproduction.stage_result import GRID_ALPHA, TRACE_EVERY, Rival, Stage, published_structure
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads, join_names, nearest, real_number, short_repr, whole_number
 
-#: Candidates that an order search keeps; the tables need only the best.
-TOP_CANDIDATES = 1
-#: File of the tables, which is always saved.
-TABLES_FILE = "tables.json"
 #: Name of the given runs in verdicts.
 MEASURED_LABEL = "as measured"
-ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES_FILE)
+#: Files of runs and tables, which are always saved.
+ALWAYS_SAVED = ("square.csv", "sine.csv", "tables.json")
 #: Polling interval for Ctrl-C [s].
 INTERRUPT_POLL_S = 0.1
+#: Most records of an arm.
+MAX_RECORDS = 1000
 
 
-class Reproduction(ReproductionData):
+@dataclass(frozen=True)
+class Reproduction:
     """Reproduction of section 5 of the paper.
 
     Parameters
@@ -73,10 +71,40 @@ class Reproduction(ReproductionData):
         Tables 4 and 5 as the paper computed them, by angle.
     """
 
+    square: Run
+    sine: Run | None
+    simulated: bool
+    stages: dict[int, Stage]
+    order_grid: OrderGrid
+    notes: tuple[str, ...] = ()
+    panel: Panel = field(default_factory=Panel)
+    ran: tuple[PrintedModelRun, ...] = ()
+    as_printed: dict[str, AsPrinted] = field(default_factory=dict)
+
     @property
-    def claims(self) -> list[Claim]:
-        """Claims of the paper with verdicts."""
-        return claims(self)
+    def checks(self) -> list[Check]:
+        """Claims of the paper with computed numbers and verdicts."""
+        return checks(self)
+
+    @property
+    def truth(self) -> dict[int, dict[str, float]]:
+        """Orders and coefficients of the simulated arm by stage; empty for measured runs."""
+        return {n: truth_of(n) for n in self.stages} if self.simulated else {}
+
+    @property
+    def runs(self) -> list[Run]:
+        """The square run, and the sine run if there is one."""
+        return [self.square] if self.sine is None else [self.square, self.sine]
+
+    @property
+    def angles(self) -> list[tuple[Stage, str]]:
+        """Every stage with each of its outputs."""
+        return [(stage, output) for stage in self.stages.values() for output in stage.outputs]
+
+    @property
+    def rivals(self) -> dict[str, Rival]:
+        """Optimizer comparisons of all stages by output."""
+        return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
 
     def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the reproduction as one offline HTML file.
@@ -116,11 +144,10 @@ class Reproduction(ReproductionData):
             A file exists, or the folder cannot be written.
         """
         where = Path(folder)
-        models: dict[str, Model] = {}
-        for number, stage in self.stages.items():
-            models |= {f"stage{number}-{slug(label)}.json": c.model for label, c in stage.candidates.items()}
-            for output, rival in stage.rivals.items():
-                models |= {f"{output}-{slug(label)}.json": c.model for label, c in rival.models.items()}
+        models = {
+            f"stage{n}-{slug(label)}.json": c.model for n, s in self.stages.items() for label, c in s.candidates.items()
+        }
+        models |= {f"{o}-{slug(label)}.json": c.model for o, r in self.rivals.items() for label, c in r.models.items()}
         check_folder(where, [*ALWAYS_SAVED, *models], force=force)
         runs = dict(zip(ALWAYS_SAVED, self.runs, strict=False))
         for name, run in runs.items():
@@ -128,8 +155,8 @@ class Reproduction(ReproductionData):
         for name, model in models.items():
             model.save(where / name, force=force)
         text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
-        write_atomically(where / TABLES_FILE, text.encode(), force=force)
-        return [where / name for name in (*runs, *models, TABLES_FILE)]
+        write_atomically(where / ALWAYS_SAVED[-1], text.encode(), force=force)
+        return [where / name for name in (*runs, *models, ALWAYS_SAVED[-1])]
 
     def to_dict(self) -> dict[str, Any]:
         """Return all numbers of the tables and the verdicts for JSON."""
@@ -137,7 +164,7 @@ class Reproduction(ReproductionData):
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
             "lattice": {"step": self.order_grid.increment, "alpha": list(self.order_grid.alpha)},
-            "claims": [c.to_dict() for c in self.claims],
+            "checks": [c.to_dict() for c in self.checks],
             "as printed": {o: a.to_dict() for o, a in self.as_printed.items()},
             "printed models run": [r.to_dict() for r in self.ran],
             "as it should be": {str(n): s.to_dict() for n, s in self.stages.items()},
@@ -215,9 +242,9 @@ def reproduce(
             "genetic: the order grid and the norm are those of the comparison; leave order_grid and norm out"
         )
     simulated = square is None
-    others, lattice = _other_arms(arms, records), OrderGrid(increment=increment)
+    others, lattice = _other_arms(arms, records), OrderGrid(increment=increment, alpha=GRID_ALPHA)
     for each in (increment, real_number("rivals_increment", rivals_increment)):
-        OrderGrid(increment=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
+        OrderGrid(increment=each).values(published_structure(1))
     if square is None and sine is not None:
         raise ModelError("a sine run is given without a square run; give both, or neither")
     omitted = []
@@ -234,54 +261,43 @@ def reproduce(
     numbers = stages_of(square, sine)
     more = (len(others), records) if simulated else ()
     seconds = seconds_of_all(increment, len(numbers), *more, rivals_increment=compared_increment)
-    about = format_time_left(estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))).removesuffix(
-        " left"
-    )
-    log(f"this takes {about}")
-    preset = Preset(lattice, TOP_CANDIDATES, TRACE_EVERY, common_pulses=True, rivals_increment=compared_increment)
+    expected = estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))
+    log(f"this takes {format_time_left(expected).removesuffix(' left')}")
+    preset = Preset(lattice, 1, TRACE_EVERY, common_pulses=True, rivals_increment=compared_increment)
     own = MAIN_ARM if simulated else MEASURED_LABEL
     seeds = [seed + k for k in range(records)]
     run, other = square, sine
 
-    def stage_of(number: StageNumber) -> Job:
-        def job(steps: WorkerProgress) -> StageOutcome:
-            work = StageWork(number, run, other, preset, threads, log, steps, simulated=simulated)
-            stage = work.compute_stage(genetic)
-            work.begin(f"stage {number}: the paper's printed models under its own current", "printed")
-            rows = run_printed_models(number, threads)
-            work.begin(f"stage {number}: verdicts, both ends of K0", "trials")
-            panel = panel_of([stage], run, own, seed, threads)
-            return StageOutcome(stage, rows, as_printed(stage.outputs), panel, work.notes)
+    def compute_stage(number: StageNumber, steps: WorkerProgress) -> StageOutcome:
+        work = StageWork(number, run, other, preset, threads, log, steps, simulated=simulated)
+        stage = work.compute_stage(genetic)
+        work.begin("the paper's printed models under its own current", "printed")
+        rows = run_printed_models(number, threads)
+        work.begin("verdicts, both ends of K0", "trials")
+        return StageOutcome(
+            stage, rows, as_printed(stage.outputs), panel_of(stage, run, own, seed, threads), work.notes
+        )
 
-        return job
+    def compute_panel(arm: str, number: StageNumber, steps: WorkerProgress) -> Panel:
+        log(f"verdicts: the arm “{arm}”, stage {number}")
+        return simulated_panel(
+            number,
+            arm,
+            seeds[1:] if arm == MAIN_ARM else seeds,
+            noise,
+            threads,
+            genetic=genetic,
+            begin=lambda name: steps.begin(seconds_of(name, increment, compared_increment)),
+            progress=steps,
+            order_grid=None if arm == MAIN_ARM else rivals_order_grid(increment, rivals_increment),
+            has_contests=not omitted,
+        )
 
-    def panel_on(arm: str, number: StageNumber) -> Job:
-        def job(steps: WorkerProgress) -> Panel:
-            log(f"verdicts: the arm “{arm}”, stage {number}")
-            of_more = seeds[1:] if arm == MAIN_ARM else seeds
-
-            def begin(name: str) -> None:
-                steps.begin(seconds_of(name, increment, compared_increment))
-
-            return simulated_panel(
-                number,
-                arm,
-                of_more,
-                noise,
-                threads,
-                genetic=genetic,
-                begin=begin,
-                progress=steps,
-                order_grid=None if arm == MAIN_ARM else rivals_order_grid(increment, rivals_increment),
-                has_contests=not omitted,
-            )
-
-        return job
-
-    pairs = [(arm, n) for arm in ([MAIN_ARM, *others] if simulated else []) for n in numbers]
-    jobs: list[Job] = [*(stage_of(n) for n in numbers), *(panel_on(*pair) for pair in pairs)]
+    jobs: list[Job] = [lambda steps, n=n: compute_stage(n, steps) for n in numbers]  # type: ignore[misc]
+    for arm in [MAIN_ARM, *others] if simulated else []:
+        jobs += [lambda steps, a=arm, n=n: compute_panel(a, n, steps) for n in numbers]  # type: ignore[misc]
     ended = run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress)
-    made: list[StageOutcome] = [m for m in ended if isinstance(m, StageOutcome)]
+    made = [m for m in ended if isinstance(m, StageOutcome)]
     panel = Panel()
     for part in (*(m.panel for m in made), *(p for p in ended if isinstance(p, Panel))):
         panel = panel.merge_with(part)
@@ -309,8 +325,6 @@ class StageOutcome:
     notes: list[str]
 
 
-#: Most records of an arm.
-MAX_RECORDS = 1000
 #: Job of a worker, called with its progress.
 Job = Callable[[WorkerProgress], StageOutcome | Panel]
 
@@ -354,7 +368,7 @@ def run_jobs(
             stop.set()
             for future in under_way:
                 future.cancel()
-        # Where one has failed the others end in KeyboardInterrupt, which says nothing.
+        # After a failure the other jobs end in KeyboardInterrupt, which says nothing.
         ended = [f.result() for f in under_way if f in done]
     whole.end()
     return ended

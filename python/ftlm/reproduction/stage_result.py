@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ftlm.arm.flexible_link import flexible_link
 from ftlm.estimation.genetic import GeneticRun
 from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
+from ftlm.estimation.verdict import is_degenerate
 from ftlm.model.model import Model
 from ftlm.reproduction.simulated_arm import StageNumber
+from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, Metrics, finite
 
@@ -24,9 +29,29 @@ WEAK_PRIOR = 1e10
 PRIOR_COVARIANCES = (1.0, WEAK_PRIOR)
 #: Labels of multi-innovation in the optimizer comparison, by K0.
 MULTI_INNOVATION_LABELS = ("p = 7", "p = 7, weak prior")
-#: Highest orders of the optimizer comparison: they contain those printed for both methods, and all candidates can be
-#: evaluated.
-RIVAL_ALPHA = (1.95, 2.0)
+#: Highest orders of the paper's grid, and those of the optimizer comparison, which contain the orders printed for both
+#: methods and leave so few candidates that all can be evaluated.
+GRID_ALPHA, RIVAL_ALPHA = (1.05, 2.0), (1.95, 2.0)
+#: Options of every order search, named so that no default changes a table.
+SEARCH_OPTIONS = {"criterion": "output-error", "norm": "l1", "row_basis": "haar"}
+
+
+def published_structure(stage: StageNumber, **changes: Any) -> Structure:
+    """Return the paper's (22)-(25) of a stage, every equation by itself, with zero initial conditions."""
+    made = flexible_link(
+        stage=stage, form="published", coupling="measured", laws=(), parameters="effective", offset="none"
+    )
+    return replace(made, **{"initial": "rest", **changes})
+
+
+def prior_text(prior: float) -> str:
+    """Format K0 as 1 or 10¹⁰."""
+    return "1" if prior == PRIOR_COVARIANCES[0] else f"10{str(round(math.log10(prior))).translate(SUPERSCRIPT_DIGITS)}"
+
+
+def are_usable(*candidates: Candidate) -> bool:
+    """Whether all fits may be used; a comparison with another one says nothing."""
+    return not any(c.result is not None and is_degenerate(c.result) for c in candidates)
 
 
 @dataclass(frozen=True)
@@ -39,10 +64,8 @@ class Candidate:
         Label, such as "p = 7".
     model
         The model.
-    estimation
-        Both errors on the estimation run, with the inputs that the method uses.
-    validation
-        Both errors on the other run; None without one.
+    estimation, validation
+        Both errors on the estimation run, with the inputs that the method uses, and on the other run, if there is one.
     input_driven
         Output error from the currents alone, by run and output.
     result
@@ -77,10 +100,8 @@ class Rival:
 
     Parameters
     ----------
-    candidates
-        Candidates of the order grid, and default evaluations per seed.
-    increment
-        Increment of the order grid.
+    candidates, increment
+        Candidates of the order grid, which are also the default evaluations per seed, and its increment.
     population
         Population size of the genetic algorithm.
     genetic_run, evolution_run
@@ -95,16 +116,6 @@ class Rival:
     genetic_run: GeneticRun
     evolution_run: GeneticRun
     models: dict[str, Candidate]
-
-    @property
-    def genetic(self) -> Candidate:
-        """Best seed of the genetic algorithm."""
-        return self.models["genetic"]
-
-    @property
-    def lattice(self) -> Candidate:
-        """Multi-innovation with p = 7 and K0 = 1."""
-        return self.models["p = 7"]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
@@ -125,21 +136,21 @@ class DroppedDerivative:
     """Effect of the derivative of the current that (19) drops on the simulated deflection, at equal parameters."""
 
     output: str
-    order: float  # that the current would have; 0 as published
+    order: float  # of the current's derivative; 0 as published
     time: Floats  # middle of every pulse [s]
     current: Floats  # pulse means
     measured: Floats
     published: Floats  # by (22)-(25)
-    derived: Floats  # by (14)-(15), nothing dropped
+    derived: Floats  # by (14)-(15)
 
     @property
     def correlations(self) -> dict[str, float]:
         """Correlation of the deflection with the current: measured, (14)-(15), published; NaN at rest."""
         found = {}
-        for words, series in (("measured", self.measured), ("derived", self.derived), ("published", self.published)):
-            parts = [v - np.mean(v) for v in (series, self.current)]
+        for name in ("measured", "derived", "published"):
+            parts = [v - np.mean(v) for v in (getattr(self, name), self.current)]
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                found[words] = float(np.dot(*parts) / np.sqrt(np.dot(parts[0], parts[0]) * np.dot(parts[1], parts[1])))
+                found[name] = float(np.dot(*parts) / np.sqrt(np.dot(parts[0], parts[0]) * np.dot(parts[1], parts[1])))
         return found
 
 
@@ -184,11 +195,6 @@ class Stage:
     def outputs(self) -> tuple[str, str]:
         """Hub angle and deflection."""
         return f"theta{self.number}1", f"theta{self.number}2"
-
-    @property
-    def manual(self) -> str:
-        """Label of the manual's model as simulated in the paper; Euler's method needs a start at rest."""
-        return "integer, Euler" if self.traces else "integer, exact"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the stage results for JSON."""

@@ -1,11 +1,11 @@
-"""Tables in the form of the paper's Tables 4 and 5."""
+"""Tables in the form of the paper's, computed values beside the printed ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
@@ -14,7 +14,7 @@ from ftlm.arm.flexible_link import PARAMETER_SETS
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.claims import ReproductionData, printed_saturation, table_3_coefficients
+from ftlm.reproduction.checks import table_3_coefficients
 from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, TERM_INTERPRETATIONS, implied_spreads
 from ftlm.reproduction.stage_result import (
     MULTI_INNOVATION_LABELS,
@@ -23,13 +23,13 @@ from ftlm.reproduction.stage_result import (
     WEAK_PRIOR,
     Candidate,
     Stage,
+    prior_text,
 )
 from ftlm.structure.equation import Equation
 from ftlm.svg.html_page import NOT_IN_MODEL, Table
 from ftlm.utils.formatting import (
     DIVERGED_TEXT,
     SIGNIFICANT_DIGITS,
-    SUPERSCRIPT_DIGITS,
     Cell,
     Exact,
     number,
@@ -39,13 +39,17 @@ from ftlm.utils.formatting import (
 )
 from ftlm.validation.comparison import Comparison, Metrics
 
+if TYPE_CHECKING:
+    from ftlm.reproduction.reproduction import Reproduction
+
 #: Order of each coefficient's term in the paper's equations (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 #: Heads of the columns of parameters and criteria, and groups of the parameter columns.
-ORDER_HEADS = tuple(map(symbol_html, ORDER_LETTERS))
-NUMBER_HEADS = (*ORDER_HEADS, *map(symbol_html, COEFFICIENT_LETTERS))
+NUMBER_HEADS = tuple(map(symbol_html, (*ORDER_LETTERS, *COEFFICIENT_LETTERS)))
 CRITERION_HEADS = ("error (45)", "RMSE", "NR")
 COLUMN_GROUPS = (("", 1), ("orders", 4), ("coefficients", 4))
+PRIOR_HEADS = tuple(Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in PRIOR_COVARIANCES)
+PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,8 @@ class PaperRow:
         ``alpha``, ``beta``, ``gamma``, ``mu``; orders of absent terms are missing.
     coefficients
         ``a``, ``b``, ``d``, ``g``, likewise.
-    equation_error, output_error
-        Metrics; None if they were not computed.
+    equation_error, output_error, validation
+        Errors on the estimation run, and output error on another run; None if they were not computed.
     """
 
     label: str
@@ -72,6 +76,7 @@ class PaperRow:
     coefficients: Mapping[str, float]
     equation_error: Metrics | None
     output_error: Metrics | None
+    validation: Metrics | None = None
 
 
 def letter_of(name: str) -> str:
@@ -91,17 +96,10 @@ def letters_of(item: Equation) -> tuple[dict[str, float], dict[str, float]]:
     return orders, coefficients
 
 
-def four_digits(orders: Mapping[str, float]) -> dict[str, float]:
-    """Round orders to the four decimals of the paper's Table 6."""
-    return {name: round(order, 4) + 0.0 for name, order in orders.items()}
-
-
 def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
-    """Cells under `NUMBER_HEADS`: orders in full, coefficients as estimates."""
-    return [
-        *(Exact(orders[n]) if n in orders else None for n in ORDER_LETTERS),
-        *map(coefficients.get, COEFFICIENT_LETTERS),
-    ]
+    """Cells under `NUMBER_HEADS`: orders to the four decimals of the paper's Table 6, coefficients as estimates."""
+    cells = [Exact(round(orders[n], 4) + 0.0) if n in orders else None for n in ORDER_LETTERS]
+    return [*cells, *map(coefficients.get, COEFFICIENT_LETTERS)]
 
 
 def criteria_cells(figures: Metrics | None) -> list[Cell]:
@@ -109,7 +107,9 @@ def criteria_cells(figures: Metrics | None) -> list[Cell]:
     return [None] * 3 if figures is None else [figures.error, figures.rmse, figures.nr]
 
 
-def paper_row(label: str, model: Model, comparison: Comparison, output: str) -> PaperRow:
+def paper_row(
+    label: str, model: Model, comparison: Comparison, output: str, validation: Comparison | None = None
+) -> PaperRow:
     """Return the row of one equation of an arm's model with coefficients a, b, d, g and an index.
 
     Raises
@@ -121,12 +121,21 @@ def paper_row(label: str, model: Model, comparison: Comparison, output: str) -> 
     if item is None:
         raise ModelError(f"the model has no output {output!r}; it has {', '.join(model.outputs)}")
     errors = comparison.equation_error.get(output), comparison.output_error.get(output)
-    return PaperRow(label, output, *letters_of(item), *errors)
+    return PaperRow(
+        label, output, *letters_of(item), *errors, None if validation is None else validation.output_error[output]
+    )
 
 
-def _beginnings(rows: Sequence[PaperRow]) -> dict[int, str]:
-    """Output of each group of rows, by the index of its first row."""
-    return {i: r.output for i, r in enumerate(rows) if i == 0 or rows[i - 1].output != r.output}
+def table_by_angle(
+    title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **rest: Any
+) -> Table:
+    """Return a table whose rows are grouped under the symbol of their angle."""
+    flat: list[Sequence[Cell]] = []
+    headings = {}
+    for output, each in rows.items():
+        headings[len(flat)] = symbol_html(output)
+        flat += each
+    return Table(title, columns, flat, headings=headings, **rest)
 
 
 def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -> Table:
@@ -139,21 +148,15 @@ def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -
     title
         Caption.
     """
-    cells = [
-        [
-            row.label,
-            *number_cells(row.orders, row.coefficients),
-            *criteria_cells(row.equation_error),
-            *criteria_cells(row.output_error),
-        ]
-        for row in rows
-    ]
-    return Table(
+    cells: dict[str, list[list[Cell]]] = {}
+    for row in rows:
+        errors = [*criteria_cells(row.equation_error), *criteria_cells(row.output_error)]
+        cells.setdefault(row.output, []).append([row.label, *number_cells(row.orders, row.coefficients), *errors])
+    return table_by_angle(
         title,
         ("model", *NUMBER_HEADS, *CRITERION_HEADS, *CRITERION_HEADS),
         cells,
         groups=(*COLUMN_GROUPS, ("equation error", 3), ("output error (free run)", 3)),
-        headings={i: symbol_html(output) for i, output in _beginnings(rows).items()},
     )
 
 
@@ -170,10 +173,10 @@ def paper_table_text(rows: Sequence[PaperRow]) -> str:
         " " * left + "".join(groups),
         "model".ljust(_LABEL_WIDTH) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
     ]
-    starts, infinite = _beginnings(rows), False
-    for i, (label, *cells) in enumerate(paper_table(rows).rows):
-        if i in starts:
-            lines.append(symbol(starts[i]))
+    table, infinite = paper_table(rows), False
+    for i, (label, *cells) in enumerate(table.rows):
+        if i in table.headings:
+            lines.append(symbol(rows[i].output))
         numbers = "".join(
             _fit_to_width(v, width - 1).rjust(width) for v, width in zip(cells, _TEXT_WIDTHS, strict=True)
         )
@@ -190,60 +193,8 @@ def _fit_to_width(value: Cell, width: int) -> str:
         return NOT_IN_MODEL
     if not math.isfinite(value):
         return "?" if math.isnan(value) else "∞"
-    texts = [
-        f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e") for digits in range(SIGNIFICANT_DIGITS, 0, -1)
-    ]
+    texts = [f"{value:.{n}g}".replace("e-0", "e-").replace("e+0", "e") for n in range(SIGNIFICANT_DIGITS, 0, -1)]
     return next((t for t in texts if len(t) <= width), texts[-1])
-
-
-WEAK_PRIOR_TEXT = f"10{str(round(math.log10(WEAK_PRIOR))).translate(SUPERSCRIPT_DIGITS)}"
-PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
-#: Table 1: symbols, descriptions, and names in ftlm.
-SYMBOL_ROWS = (
-    ("θ₁₁, θ₂₁", "hub angles: how far each motor has turned", "theta11, theta21 [rad]"),
-    ("θ₁₂, θ₂₂", "deflection angles: how far each link bends at its root", "theta12, theta22 [rad]"),
-    ("I₁, I₂", "motor currents", "I1, I2 [A]"),
-    ("T₁, T₂", "motor torques, proportional to the currents", "LinkParameters.torque_constant [N m/A]"),
-    ("V", "viscoelastic potential energy of a link, (7)", "LinkParameters.stiffness"),
-    ("Tr₁₁, Tr₁₂, Tr", "kinetic energies of motor, link and both, (8), (9)", "hub_inertia, link_inertia"),
-    (
-        "Q₁₁, Q₁₂",
-        "generalised forces: motor and its friction, friction of the link, (10), (11)",
-        "hub_friction, link_friction",
-    ),
-    ("D^α θ", "highest derivative of an equation", "alpha1 … alpha4"),
-    ("D^γ θ₁₁, D^γ θ₂₁", "derivative of the hub angle in the hub's friction", "gamma1, gamma3 (gamma2, gamma4 follow)"),
-    ("D^β θ₁₂, D^β θ₂₂", "derivative of the deflection in the link's elasticity", "beta2, beta4 (beta1, beta3 follow)"),
-    ("D^μ θ₁₂, D^μ θ₂₂", "derivative of the deflection in the link's friction", "mu2, mu4 (mu1, mu3 follow)"),
-)
-#: Table 2: the seven steps with their functions.
-PROCEDURE_STEPS = (
-    ("Record currents and angles", "rig.record, load", "Run: point samples with units"),
-    (
-        "Choose M, make the operational matrix",
-        "operational_matrix, haar_matrix",
-        "never formed: every integral is a truncated power series, by fast Fourier transform",
-    ),
-    ("Turn the equation into an integral equation, (38)", "flexible_link, equation", "divided by D^α, exactly"),
-    ("Expand the data in Haar wavelets, (39)", "haar_transform", "a change of basis; pulse means do as well"),
-    (
-        "Vary the orders, coefficients by (44)",
-        "search_orders, identify(method='multi-innovation')",
-        "closed form of (44); multi_innovation_trace is the recursion",
-    ),
-    ("Simulate, and sum the errors, (45)", "compare, simulate", "both errors, kept apart"),
-    ("Take the orders of the smallest error", "SearchResult.table, .model", "every candidate accounted for"),
-)
-
-
-def by_angle(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **rest: Any) -> Table:
-    """Return a table whose rows are grouped under the symbol of their angle."""
-    flat: list[Sequence[Cell]] = []
-    headings = {}
-    for output, each in rows.items():
-        headings[len(flat)] = symbol_html(output)
-        flat += each
-    return Table(title, columns, flat, headings=headings, **rest)
 
 
 def printed_head(words: str) -> Markup:
@@ -257,18 +208,11 @@ def equation_of(candidate: Candidate, output: str) -> Equation:
 
 
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
-    """Orders and significant coefficients of one equation."""
+    """Orders, and coefficients at least as large as their standard errors, of one equation."""
     orders, coefficients = letters_of(equation_of(candidate, output))
-    return number_cells(
-        four_digits(orders), {n: v for n, v in coefficients.items() if is_significant(candidate, output, n)}
-    )
-
-
-def is_significant(candidate: Candidate, output: str, letter: str) -> bool:
-    """Whether a coefficient is at least as large as its standard error."""
-    name = f"{letter}{printed.ANGLE_NAMES.index(output) + 1}"
-    error = 0.0 if candidate.result is None else candidate.result.standard_errors.get(name, 0.0)
-    return not error > abs(candidate.model.coefficients.get(name, math.inf))
+    errors = {} if candidate.result is None else candidate.result.standard_errors
+    index = printed.ANGLE_NAMES.index(output) + 1
+    return number_cells(orders, {n: v for n, v in coefficients.items() if not errors.get(f"{n}{index}", 0.0) > abs(v)})
 
 
 def model_table(stage: Stage, title: str) -> Table:
@@ -284,16 +228,16 @@ def model_table(stage: Stage, title: str) -> Table:
             if (row := beside.get(label)) is not None:
                 numbers = number_cells(row.orders, row.coefficients)
                 rows[output].append([printed_head(label.partition(",")[0]), *numbers, row.error, row.rmse, row.nr])
-    return by_angle(
+    return table_by_angle(
         title,
         ("model", *NUMBER_HEADS, *CRITERION_HEADS),
         rows,
         groups=(*COLUMN_GROUPS, ("output error (free run)", 3)),
-        note="Free runs are driven as the method drives them: rows of p, least squares and instrumental variables "
-        "by the current and the measured other angle; the manual's integer model (by explicit Euler at the run's step, "
-        "and exactly), whole orders identified and output error by the current alone. The last two are (14)–(15), "
-        "whose deflection hangs on the hub's motion and has no current; all other rows are the paper's (22)–(25). "
-        "Errors in rad. –: not in the model, or a coefficient that its own standard error exceeds. " + PRINTED_NOTE,
+        note="Inputs of the free runs: the current and the measured other angle for rows of p, least squares and "
+        "instrumental variables; the current alone for the manual's integer model (by explicit Euler at the run's "
+        "step, and exactly), integer orders identified and output error. The last two have (14)–(15), whose deflection "
+        "moves with the hub and has no current; all other rows have the paper's (22)–(25). Errors in rad. –: not in "
+        "the model, or a coefficient that its own standard error exceeds. " + PRINTED_NOTE,
     )
 
 
@@ -306,7 +250,7 @@ def fits_table(stage: Stage) -> Table:
         alone = [figures[output].fit for figures in c.input_driven.values()]
         return [label, *errors, *driven, *alone, *[None] * (2 - len(alone))]
 
-    return by_angle(
+    return table_by_angle(
         f"Stage {stage.number}: both errors, and the fit of the free run on both inputs",
         ("model", "equation error", "free run", "square", "sine", "square", "sine"),
         {o: [row(label, c, o) for label, c in stage.candidates.items()] for o in stage.outputs},
@@ -315,43 +259,47 @@ def fits_table(stage: Stage) -> Table:
     )
 
 
-def near_table(found: ReproductionData) -> Table:
-    """Table of both errors at the printed orders, and at those of the smallest equation error."""
-    rows: list[list[Cell]] = []
-    for stage in found.stages.values():
-        for label, candidate in (("printed", stage.printed_orders), ("smallest equation error", stage.by_equation)):
-            for output in stage.outputs:
-                orders, _ = letters_of(equation_of(candidate, output))
-                both = candidate.estimation.equation_error[output].nr, candidate.estimation.output_error[output].nr
-                head = Markup("{}, {}").format(symbol_html(output), label)
-                rows.append([head, *number_cells(orders, {})[: len(ORDER_HEADS)], *both])
-    return Table(
-        "Orders close to α: equation error and free run",
-        ("angle, orders", *ORDER_HEADS, "NR of the equation error", "NR of the free run"),
-        rows,
-        note="Coefficients by least squares. “Smallest equation error”: the orders that the lattice gives when the "
-        "equation error (RMSE) ranks its candidates.",
-    )
+#: Table 1: symbols, descriptions, and names in ftlm.
+SYMBOL_ROWS = (
+    ("θ₁₁, θ₂₁", "hub angles: how far each motor has turned", "theta11, theta21 [rad]"),
+    ("θ₁₂, θ₂₂", "deflection angles: how far each link bends at its root", "theta12, theta22 [rad]"),
+    ("I₁, I₂", "motor currents", "I1, I2 [A]"),
+    ("T₁, T₂", "motor torques, proportional to the currents", "LinkParameters.torque_constant [N m/A]"),
+    ("V", "viscoelastic potential energy of a link, (7)", "LinkParameters.stiffness"),
+    ("Tr₁₁, Tr₁₂, Tr", "kinetic energies of motor, link and both, (8), (9)", "hub_inertia, link_inertia"),
+    ("Q₁₁, Q₁₂", "generalized forces: motor, hub friction, link friction, (10), (11)", "hub_friction, link_friction"),
+    ("D^α θ", "highest derivative of an equation", "alpha1 … alpha4"),
+    ("D^γ θ₁₁, D^γ θ₂₁", "derivative of the hub angle in the hub's friction", "gamma1, gamma3 (gamma2, gamma4 follow)"),
+    ("D^β θ₁₂, D^β θ₂₂", "derivative of the deflection in the link's elasticity", "beta2, beta4 (beta1, beta3 follow)"),
+    ("D^μ θ₁₂, D^μ θ₂₂", "derivative of the deflection in the link's friction", "mu2, mu4 (mu1, mu3 follow)"),
+)
+#: Table 2: the seven steps with their functions.
+PROCEDURE_STEPS = (
+    ("Record currents and angles", "rig.record, load", "point samples with units"),
+    ("Choose M, make the operational matrix", "operational_matrix, haar_matrix", "truncated power series in its place"),
+    ("Form the integral equation, (38)", "flexible_link, equation", "divided by D^α, exactly"),
+    ("Expand the data in Haar wavelets, (39)", "haar_transform", "a change of basis; pulse means are equivalent"),
+    ("Vary the orders, coefficients by (44)", "search_orders, multi_innovation_trace", "closed form of (44)"),
+    ("Simulate, and sum the errors, (45)", "compare, simulate", "both errors, separately"),
+    ("Take the orders of the smallest error", "SearchResult.table, .model", "every candidate is counted"),
+)
 
 
-def symbols_table() -> Table:
-    """Table 1."""
-    return Table("Table 1. Symbols", ("symbol", "what it is", "name here"), SYMBOL_ROWS, wrap=True)
-
-
-def steps_table() -> Table:
-    """Table 2, every step with its function."""
+def description_tables() -> list[Table]:
+    """Tables 1 and 2: symbols, and every step with its function."""
     rows = [
         [f"{k}. {step}", Markup(", ").join(Markup("<code>{}</code>").format(f) for f in functions.split(", ")), how]
         for k, (step, functions, how) in enumerate(PROCEDURE_STEPS, 1)
     ]
-    title = "Table 2. The seven steps, and the functions of ftlm that do them"
-    return Table(title, ("step", "function", "how"), rows, wrap=True)
+    return [
+        Table("Table 1. Symbols", ("symbol", "what it is", "name here"), SYMBOL_ROWS, wrap=True),
+        Table("Table 2. The seven steps, with the functions of ftlm", ("step", "function", "how"), rows, wrap=True),
+    ]
 
 
-def parameters_table() -> Table:
-    """Table 3 beside the maker's effective parameters."""
-    hub_and_link = {
+def parameter_tables() -> list[Table]:
+    """Table 3 beside the maker's effective parameters, and the coefficients that follow from both."""
+    fields = {
         "J": ("hub_inertia", "link_inertia"),
         "B": ("hub_friction", "link_friction"),
         "K_s": ("stiffness",),
@@ -361,91 +309,74 @@ def parameters_table() -> Table:
     for name, (value, unit) in printed.TABLE_3.items():
         stem = letter_of(name)
         stage, *place = map(int, name[len(stem) :])
-        fields = hub_and_link.get(stem.rstrip("_"))
         effective = None
-        if fields is not None:
-            effective = Exact(getattr(PARAMETER_SETS["effective"][stage], fields[place[0] - 1 if place else 0]))
+        if (known := fields.get(stem.rstrip("_"))) is not None:
+            effective = Exact(getattr(PARAMETER_SETS["effective"][stage], known[place[0] - 1 if place else 0]))
         shown = Markup("<i>{}</i><sub>{}</sub>").format(name[0], name.partition("_")[2])
         rows.append([shown, Exact(value), unit, effective, value / effective if effective else None])
-    return Table(
-        "Table 3. Parameters: printed, and the maker's effective ones",
-        ("parameter", "printed", "printed unit", "effective, SI", "printed / effective"),
-        rows,
-        note="Effective torque constants hold gear ratio and efficiency. Lengths enter no equation.",
-    )
-
-
-def integer_table() -> Table:
-    """Coefficients of the integer-order models from Table 3 and from the effective parameters."""
-    rows: list[list[Cell]] = [
-        [symbol_html(n), t + 0.0, e + 0.0, p, t / p, e / p] for n, (t, e, p) in table_3_coefficients().items()
-    ]
-    return Table(
-        "Coefficients of the integer-order models",
-        (
-            "coefficient",
-            "from Table 3",
-            "from the effective set",
-            "printed in Tables 4, 5",
-            "Table 3 / printed",
-            "effective / printed",
+    return [
+        Table(
+            "Table 3. Parameters: printed, and the maker's effective ones",
+            ("parameter", "printed", "printed unit", "effective, SI", "printed / effective"),
+            rows,
+            note="Effective torque constants include gear ratio and efficiency. Lengths enter no equation.",
         ),
-        rows,
-    )
+        Table(
+            "Coefficients of the integer-order models",
+            (
+                "coefficient",
+                "from Table 3",
+                "effective set",
+                "in Tables 4, 5",
+                "Table 3 / printed",
+                "effective / printed",
+            ),
+            [[symbol_html(n), t + 0.0, e + 0.0, p, t / p, e / p] for n, (t, e, p) in table_3_coefficients().items()],
+        ),
+    ]
 
 
-def saturation_table(found: ReproductionData) -> Table:
+def saturation_table(found: Reproduction) -> Table:
     """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
     rows: dict[str, list[list[Cell]]] = {output: [] for _, output in found.angles}
     for stage, output in found.angles:
         of_p = {p: stage.candidates[f"p = {p}"] for p in printed.INNOVATION_LENGTHS}
         orders = {p: letters_of(equation_of(c, output))[0] for p, c in of_p.items()}
-        x, c, _ = printed_saturation(output)
+        x, c, _ = printed.printed_saturation(output)
         name = f"a{printed.ANGLE_NAMES.index(output) + 1}"
         for p, candidate in of_p.items():
             alike = "yes" if orders[p] == orders[printed.INNOVATION_LENGTHS[-1]] else "no"
             weak = stage.weak[output][p][name] if stage.weak else None
             stated = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
             rows[output].append([f"p = {p}", candidate.model.coefficients[name], alike, weak, stated, x * p / (p + c)])
-    prior = Markup("<i>K</i><sub>0</sub> = {}")
-    return by_angle(
+    curve = Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)")
+    return table_by_angle(
         "Coefficient a by innovation length",
-        (
-            "innovation length",
-            prior.format("1"),
-            "orders of p = 7",
-            prior.format(WEAK_PRIOR_TEXT),
-            "printed",
-            Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)"),
-        ),
+        ("innovation length", PRIOR_HEADS[0], "orders of p = 7", PRIOR_HEADS[1], "printed", curve),
         rows,
         note="The last column is the curve of a prior through the printed values of p = 1 and p = 7. With the weak "
-        "prior all p are at the orders of p = 7.",
+        "prior all p have the orders of p = 7.",
     )
 
 
-def genetic_table(found: ReproductionData) -> Table:
+def genetic_table(found: Reproduction) -> Table:
     """Table 6."""
     rows: list[list[Cell]] = []
     for output, rival in found.rivals.items():
         angle, row = symbol_html(output), printed.GENETIC_ROWS[output]
         best = Markup("{}, best of {} seeds").format(angle, len(rival.genetic_run.errors))
-        rows.append([best, *computed_cells(rival.genetic, output)])
+        rows.append([best, *computed_cells(rival.models["genetic"], output)])
         rows.append([printed_head(angle), *number_cells(row.orders, row.coefficients)])
     title = "Table 6. Orders and coefficients by the genetic algorithm"
     return Table(title, ("angle", *NUMBER_HEADS), rows, groups=COLUMN_GROUPS, note=PRINTED_NOTE)
 
 
-#: Labels of the models beside the other optimizers.
-RIVAL_LABELS = {
-    "genetic": "genetic algorithm",
-    MULTI_INNOVATION_LABELS[0]: "p = 7, K₀ = 1",
-    MULTI_INNOVATION_LABELS[1]: f"p = 7, K₀ = {WEAK_PRIOR_TEXT}",
-}
-
-
-def rivals_table(found: ReproductionData) -> Table:
+def rivals_table(found: Reproduction) -> Table:
     """Table 7 at equal budgets."""
+    labels = {
+        n: f"p = 7, K₀ = {prior_text(k)}" for n, k in zip(MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, strict=True)
+    }
+    labels["genetic"] = "genetic algorithm"
     rows: dict[str, list[list[Cell]]] = {}
     for output, rival in found.rivals.items():
         rows[output] = []
@@ -453,24 +384,23 @@ def rivals_table(found: ReproductionData) -> Table:
             own, other = candidate.estimation, candidate.validation
             unseen = criteria_cells(None if other is None else other.output_error[output])
             spread = float(np.std(own.measured[output][0]))
-            rows[output].append(
-                [RIVAL_LABELS.get(label, label), *criteria_cells(own.output_error[output]), *unseen, spread]
-            )
+            errors = criteria_cells(own.output_error[output])
+            rows[output].append([labels.get(label, label), *errors, *unseen, spread])
         for k, label in enumerate(("genetic algorithm", "multi-innovation")):
             criteria, implied = map(Exact, printed.TABLE_7_CRITERIA[output][k]), implied_spreads()[output][k]
             rows[output].append([printed_head(label), *criteria, None, None, None, implied])
-    return by_angle(
+    return table_by_angle(
         "Table 7. Multi-innovation and its rivals: the same record, the same number of candidates",
         ("algorithm", *CRITERION_HEADS, *CRITERION_HEADS, "σ of the angle"),
         rows,
         groups=(("", 1), ("square, identified from", 3), ("sine, never seen", 3), ("", 1)),
-        note="Free runs, driven by the current and the measured other angle. All keep to α from "
-        f"{RIVAL_ALPHA[0]:g} to {RIVAL_ALPHA[1]:g}; what p = 7 comes to on the whole lattice stands in Tables 4 and 5. "
+        note="Free runs, driven by the current and the measured other angle. All have α from "
+        f"{RIVAL_ALPHA[0]:g} to {RIVAL_ALPHA[1]:g}; p = 7 on the whole grid stands in Tables 4 and 5. "
         "Printed σ is RMSE / NR. " + PRINTED_NOTE,
     )
 
 
-def seeds_table(found: ReproductionData) -> Table:
+def seeds_table(found: Reproduction) -> Table:
     """Error (45) of each optimizer and seed, with the number of evaluations."""
     seeds = list(dict.fromkeys(seed for rival in found.rivals.values() for seed in rival.genetic_run.errors))
     rows: dict[str, list[list[Cell]]] = {}
@@ -479,89 +409,49 @@ def seeds_table(found: ReproductionData) -> Table:
             each = max(run.evaluations.values())
             rows.setdefault(output, []).append([name, rival.candidates, each, *map(run.errors.get, seeds)])
     heads = ("algorithm", "candidates", "evaluations a seed", *(f"seed {s}" for s in seeds))
-    return by_angle("Error (45) by seed", heads, rows)
+    return table_by_angle("Error (45) by seed", heads, rows)
 
 
-def bounds_table(found: ReproductionData) -> Table:
-    """Table of the bounds of both optimizers."""
-    rows: list[list[Cell]] = []
-    for output, rival in found.rivals.items():
-        bounds = {letter_of(n): b for n, b in rival.genetic_run.bounds.items()}
-        orders = [" … ".join(number(Exact(end), 4) for end in bounds[n]) for n in printed.ORDER_LETTERS]
-        rows.append(
-            [symbol_html(output), *orders, *(f"±{number(bounds[n][1], 4)}" for n in printed.COEFFICIENT_LETTERS)]
-        )
-    return Table(
-        "Bounds of both rivals",
-        ("angle", *NUMBER_HEADS),
-        rows,
-        note="Orders in steps of 0.001, on the interval of the lattice. Coefficients: four times what makes a term "
-        "alone as large as the output; the maker's values are not in them.",
-    )
-
-
-def printed_reading_table(found: ReproductionData, stage: Stage) -> Table:
+def printed_reading_table(found: Reproduction, stage: Stage) -> Table:
     """Table 4 or 5 as the paper computed it: recomputed, printed, and their ratio."""
     rows: dict[str, list[list[Cell]]] = {}
     for output in stage.outputs:
-        made = found.as_printed[output]
         rows[output] = []
-        for p, row in made.rows.items():
+        for p, row in found.as_printed[output].rows.items():
             stated = printed.FRACTIONAL_ROWS[output][p]
-            figures = row.equation
-            ours = [*map(row.coefficients.get, printed.COEFFICIENT_LETTERS), figures.error, figures.rmse, figures.nr]
-            theirs = [*map(stated.coefficients.get, printed.COEFFICIENT_LETTERS), stated.error, stated.rmse, stated.nr]
-            rows[output].append([f"p = {p}", *ours])
-            rows[output].append([printed_head(f"p = {p}"), *theirs])
-            ratios = [None if a is None or not b else number(a / b, 3) for a, b in zip(ours, theirs, strict=True)]
-            rows[output].append(["ours / printed", *ratios])
-    readings = "; ".join(
-        f"{symbol(o)}: {found.as_printed[o].reading} ({TERM_INTERPRETATIONS[found.as_printed[o].reading.terms]})"
-        for o in stage.outputs
-    )
-    scales = ", ".join(f"{symbol(o)} by {found.as_printed[o].scale:.3g}" for o in stage.outputs)
-    return by_angle(
+            ours = [*map(row.coefficients.get, COEFFICIENT_LETTERS), *criteria_cells(row.equation)]
+            theirs = [*map(stated.coefficients.get, COEFFICIENT_LETTERS), stated.error, stated.rmse, stated.nr]
+            ratios = [
+                number(float(a) / b, 3) if a is not None and b else None for a, b in zip(ours, theirs, strict=True)
+            ]
+            rows[output] += [[f"p = {p}", *ours], [printed_head(f"p = {p}"), *theirs], ["ours / printed", *ratios]]
+    made = {symbol(o): found.as_printed[o] for o in stage.outputs}
+    settings = "; ".join(f"{o}: {t.reading} ({TERM_INTERPRETATIONS[t.reading.terms]})" for o, t in made.items())
+    scales = ", ".join(f"{o} by {t.scale:.3g}" for o, t in made.items())
+    return table_by_angle(
         f"Table {3 + stage.number} as printed: multi-innovation at the printed orders, equation errors",
-        ("row", *map(symbol_html, printed.COEFFICIENT_LETTERS), *CRITERION_HEADS),
+        ("row", *map(symbol_html, COEFFICIENT_LETTERS), *CRITERION_HEADS),
         rows,
-        note=f"Nearest reading: {readings}. The simulated arm has whole orders and Coulomb friction; its angles are "
+        note=f"Closest settings: {settings}. The simulated arm has integer orders and Coulomb friction; its angles are "
         f"scaled to the deviations that the printed RMSE / NR imply ({scales}). " + PRINTED_NOTE,
     )
 
 
-def printed_runs_table(found: ReproductionData) -> Table:
+def printed_runs_table(found: Reproduction) -> Table:
     """Table of the printed models under the paper's own current."""
     rows: dict[str, list[list[Cell]]] = {}
     for r in found.ran:
         a = f"a{printed.ANGLE_NAMES.index(r.output) + 1}"
         back = [r.returned_coefficients.get(prior, {}).get(a) for prior in PRIOR_COVARIANCES]
+        deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
         stated = printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"]
         rows.setdefault(r.output, []).append(
-            [
-                f"p = {r.p}",
-                Exact(r.stability.unstable_poles),
-                r.angle_deviation,
-                r.single_equation_deviation,
-                r.implied_deviation,
-                r.deviation_ratio,
-                stated,
-                *back,
-            ]
+            [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, stated, *back]
         )
-    prior = Markup("<i>K</i><sub>0</sub> = {}")
-    return by_angle(
+    heads = ("σ, both equations [rad]", "σ, (26) alone [rad]", "σ of the paper's angle [rad]", "times too small")
+    return table_by_angle(
         "The printed models of Tables 4 and 5 under the paper's current",
-        (
-            "model",
-            "unstable poles",
-            "σ, both equations [rad]",
-            "σ, (26) alone [rad]",
-            "σ of the paper's angle [rad]",
-            "times too small",
-            "a printed",
-            prior.format("1"),
-            prior.format(WEAK_PRIOR_TEXT),
-        ),
+        ("model", "unstable poles", *heads, "a printed", *PRIOR_HEADS),
         rows,
         groups=(("", 7), ("a, identified from its own response", 2)),
         note="Square current of 0.3 A, 10 s, from rest. σ of the paper's angle is RMSE / NR of Table 7. Poles are "
@@ -569,38 +459,32 @@ def printed_runs_table(found: ReproductionData) -> Table:
     )
 
 
-def order_comparison_table(found: ReproductionData) -> Table:
-    """Table of integer and free orders on every arm."""
-    rows: list[list[Cell]] = []
+def case_tables(found: Reproduction) -> list[Table]:
+    """Tables of error and steps by p, arm, K0 and angle, first record of each arm, and of integer and free orders."""
+    rows: dict[tuple[str, str, float], list[Cell]] = {}
+    for t in found.panel.trials:
+        steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
+        head = f"{t.arm}, {symbol(t.output)}, K₀ = {prior_text(t.prior)}"
+        rows.setdefault((t.arm, t.output, t.prior), [head, *t.errors.values(), *steps, t.nr, t.manual])
+    orders: list[list[Cell]] = []
     for f in found.panel.order_comparisons:
         for output in f.free_nr:
             away = ", ".join(f"{symbol(n)} {f.orders[n][0]:.3g}" for n in f.fractional_orders) or "none"
-            rows.append([f"{f.arm}, {symbol(output)}", f.integer_nr[output], f.free_nr[output], away])
-    return Table(
-        "Whole and free orders of (14)–(15), from the current alone",
-        ("arm, angle", "NR, whole orders", "NR, free orders", "orders whose interval excludes the whole one"),
-        rows,
-        note="Joint output error on one of four rows.",
-    )
-
-
-def panel_table(found: ReproductionData) -> Table:
-    """Table of error and steps by p, arm, K0 and angle, on the first record of each arm."""
-    rows: list[list[Cell]] = []
-    seen = set()
-    for t in found.panel.trials:
-        key = t.arm, t.output, t.prior
-        if key in seen:
-            continue
-        seen.add(key)
-        prior = "1" if t.prior == PRIOR_COVARIANCES[0] else WEAK_PRIOR_TEXT
-        steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
-        rows.append([f"{t.arm}, {symbol(t.output)}, K₀ = {prior}", *t.errors.values(), *steps, t.nr, t.manual])
+            orders.append([f"{f.arm}, {symbol(output)}", f.integer_nr[output], f.free_nr[output], away])
     p = [f"p = {p}" for p in printed.INNOVATION_LENGTHS]
-    return Table(
-        "Multi-innovation on several arms and with both ends of K₀",
-        ("arm, angle, K₀", *p, *p, "p = 7", "manual"),
-        rows,
-        groups=(("", 1), ("error (45), free run", 4), ("steps to 2 % of the end of p = 1", 4), ("NR", 2)),
-        note="First record of each arm; verdicts are computed from all records. –: never.",
-    )
+    return [
+        Table(
+            "Multi-innovation on several arms and with both ends of K₀",
+            ("arm, angle, K₀", *p, *p, "p = 7", "manual"),
+            list(rows.values()),
+            groups=(("", 1), ("error (45), free run", 4), ("steps to 2 % of the end of p = 1", 4), ("NR", 2)),
+            note="First record of each arm; verdicts are computed from all records. –: never. Weak prior: "
+            f"{WEAK_PRIOR:g}.",
+        ),
+        Table(
+            "Integer and free orders of (14)–(15), from the current alone",
+            ("arm, angle", "NR, integer orders", "NR, free orders", "orders whose interval excludes the integer one"),
+            orders,
+            note="Joint output error on one of four rows.",
+        ),
+    ]

@@ -31,7 +31,7 @@ from ftlm.utils.validation import Floats
 #: Increment of the powers of time.
 POWER_INCREMENT = 0.25
 #: Ratio of a signal's norm to its noise standard deviation, and the highest power, in quarters, that it needs for
-#: biases below a tenth of a standard error (benches/RESULTS.md).
+#: biases below a tenth of a standard error (benches/history.py bases).
 REFERENCE_SIGNAL_RATIO, REFERENCE_QUARTERS = 2500.0, 6
 #: Factor by which one more quarter reduces the unmodeled past.
 SIGNAL_RATIO_PER_QUARTER = 2.5
