@@ -281,7 +281,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     solved = np.eye(len(outputs)) - loop
     if abs(float(np.linalg.det(solved))) < 1e-12:
         raise ModelError(
-            f"the equations of {', '.join(outputs)} cannot be solved for them: they are no more than a loop"
+            f"the equations of {', '.join(outputs)} cannot be solved for them: they form an algebraic loop"
         )
     c: Floats = np.asarray(np.linalg.solve(solved, reads), dtype=np.float64)
     d: Floats = np.asarray(np.linalg.solve(solved, direct), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Gains under other hypotheses on the start of a run: a finding where the data do not decide between them."""
+"""Gains under other initial conditions: a finding if the data do not determine which ones are right."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ MAX_SQUARES_RATIO = 1.05
 GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 
 
-def start_not_told_findings(fit: Fit) -> list[Finding]:
-    """Return a finding if another start explains the runs as well as the one that was taken, with another gain."""
+def undetermined_start_findings(fit: Fit) -> list[Finding]:
+    """Return a finding if other initial conditions explain the runs as well and give another gain."""
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or structure.has_friction or structure.limits or structure.offset not in ("none", "level"):
         return []
     if all(rest_evidence(run, structure) is not None for run in runs):
-        # What shows rest, or that it is assumed, is said.
+        # Another finding states the evidence of rest, or that rest is assumed.
         return []
     taken = joint.initial if joint.initial == "rest" else "caputo", structure.offset
     own = _gains(joint, structure)
@@ -64,7 +64,7 @@ def start_not_told_findings(fit: Fit) -> list[Finding]:
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:
-    """Name a start."""
+    """Describe initial conditions."""
     return ("at rest" if initial == "rest" else "in motion") + (" at a level of its own" if offset == "level" else "")
 
 

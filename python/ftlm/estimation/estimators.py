@@ -1,4 +1,4 @@
-"""Joint output-error fit with external instruments, for data from a closed loop."""
+"""Estimators of whole structures: joint output error, external instruments, order search with linear methods."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def fit_with_instruments(
             try:
                 there = _evaluate_moments(measured, clean, tried)
             except FtlmError:
-                # No finite free run that far.
+                # No finite simulation that far.
                 continue
             if _moment_norm(there) < level:
                 values, here = tried, there
@@ -320,7 +320,7 @@ def fit_at_best_orders(
 def prior_findings(
     task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
 ) -> list[Finding]:
-    """Return a finding on each search by simulation under a prior whose best candidate hardly moves."""
+    """Return a finding on each search whose prior covariance makes the best simulation nearly zero."""
     if settings.coefficients != "multi-innovation" or settings.prior_covariance is None:
         return []
     if settings.criterion != "output-error":

@@ -600,7 +600,8 @@ def identify_frequency(
     count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
     if count <= numbers:
         raise DataError(
-            f"{count // 2} frequencies give {count} numbers, and {numbers} are free ({', '.join(problem.names)}); "
+            f"{count // 2} frequencies give {count} values, and {numbers} parameters are free "
+            f"({', '.join(problem.names)}); "
             "measure more frequencies, or fix numbers"
         )
     if isinstance(progress, Progress):
@@ -626,7 +627,7 @@ def identify_frequency(
     fits = [f for f in fits if math.isfinite(f.cost)]
     if not fits:
         raise ConvergenceError(
-            "no start has a finite response: the lattice of orders is empty or singular; widen "
+            "no initial guess has a finite response: the order grid is empty or singular; widen "
             f"{parameter('orders')}, or give {parameter('start')}"
         )
     first = min(fits, key=lambda f: f.cost)
@@ -686,7 +687,9 @@ def _structure(
             f"the structure has a law of its coefficients, which this fit does not keep; leave {parameter('laws')} out"
         )
     if not (wanted.order_names or wanted.coefficient_names or wanted.free_inputs):
-        raise ModelError("nothing is free: every order, coefficient and delay is a number; name what is unknown")
+        raise ModelError(
+            "no parameter is free: every order, coefficient and delay is a number; give the unknown ones names"
+        )
     return replace(wanted, coupling="simulated", initial="auto")
 
 
@@ -695,7 +698,7 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
     outputs = structure.outputs
     inputs = tuple(s for s in structure.signals if s not in outputs)
     if not inputs:
-        raise ModelError(f"the equations of {', '.join(outputs)} have no input; add what drives them, as in '+ b0 u'")
+        raise ModelError(f"the equations of {', '.join(outputs)} have no input; add an input term, as in '+ b0 u'")
     found = []
     for record in records:
         own = {"output": record.output, "input": record.input}
@@ -823,7 +826,7 @@ def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
 
 
 def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
-    """Fit from the end of a fit of another problem with the same parameters."""
+    """Fit a problem from the optimum of another problem with the same parameters."""
     return _fit(problem, problem.in_problem_units(other.in_seconds(end.values)))
 
 
@@ -835,7 +838,7 @@ def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) 
 
 
 def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
-    """Return ends of the multistart that are nearly as likely as the best, one for each response."""
+    """Return distinct optima of the multistart that are nearly as likely as the best."""
     ranked = sorted(fits, key=lambda f: f.cost)
     kept, seen = [], [problem.residuals(ranked[0].values, slopes=False)[0]]
     for fit in ranked[1:]:

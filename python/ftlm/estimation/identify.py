@@ -16,7 +16,7 @@ from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.alternative_starts import start_not_told_findings
+from ftlm.estimation.alternative_starts import undetermined_start_findings
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
@@ -86,7 +86,7 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         fit = _fit_with_level_decision(structure, estimate)
         if structure.initial != "auto" or structure.offset != "none":
             return fit
-        return replace(fit, findings=[*fit.findings, *start_not_told_findings(fit)])
+        return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit)])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
@@ -94,7 +94,7 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
     twin = constant_input(runs, structure)
     if twin is not None:
-        words = f"none: {twin} is constant on every run, which an offset cannot be told from"
+        words = f"none: {twin} is constant on every run, from which an offset is not separately identifiable"
         return _with_offset_decision(estimate(replace(structure, offset="none")), words)
     fit = estimate(asked)
     if fit.task.structure.offset == "level":
@@ -102,7 +102,7 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
     test = fit_offset_test(fit)
     if test is not None and test.exceeds():
         return _with_offset_decision(fit, test.decision)
-    decision = "none: its test has no finite free run" if test is None else test.decision
+    decision = "none: its test has no finite simulation" if test is None else test.decision
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
 
 
@@ -150,7 +150,7 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
 
 
 def _shows_level(fit: Fit) -> bool:
-    """Whether a fit took runs for motion whose outputs lie far from zero, compared with how they move."""
+    """Whether a fit chose nonzero initial conditions for outputs whose mean is large against their deviation."""
     if fit.joint is None or fit.joint.initial == "rest" or fit.task.structure.initial != "auto":
         return False
     values = [drop_missing(run[o]) for run in fit.task.runs for o in fit.model.outputs]
@@ -332,7 +332,7 @@ def assess_fit(fit: Fit) -> Identification:
     if plant:
         findings = [*plant, *(f for f in findings if f.code not in WHOLE_RUN_CODES)]
     if any(f.code == "plant_unstable_in_pieces" for f in plant):
-        # The residuals of free runs that grow say nothing of the model.
+        # The residuals of simulations that grow say nothing of the model.
         tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is not None:
@@ -361,7 +361,7 @@ def assess_fit(fit: Fit) -> Identification:
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
-    """Return residuals that are not white as colored noise, and a poor fit as noise, where they follow no input.
+    """Replace findings of colored residuals and of a poor fit by findings of noise if no input explains them.
 
     Residual tests leave the first and the last row out: a fit that is poor by these alone has an outlier there.
     """
@@ -375,14 +375,14 @@ def _noise_finding(item: Finding, tests: Residuals) -> Finding:
 
 
 def _coupling_finding(item: Finding, structure: Structure) -> Finding:
-    """Return residuals that follow an input that no equation reads as a coupling that the structure lacks."""
+    """Replace a finding of residuals correlated with an unused input by a finding of a missing coupling."""
     if item.code != "residuals_follow_input" or item.input in structure.signals:
         return item
     return msgspec.structs.replace(item, code="coupling_missing")
 
 
 def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Finding]:
-    """Return a finding on what a flexible link leaves out of an arm, if residuals show that something is missing."""
+    """Return a finding on the effects that a flexible link omits, if residual tests fail."""
     if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in LEFT_OUT_CODES for f in findings):
         return []
     parts = [] if structure.has_friction else ["dry friction of the hubs"]
@@ -393,7 +393,7 @@ def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Find
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
-    """Return the tests with the bias that found feedback can make of a joint fit."""
+    """Return the residual tests with the bias of a joint fit that detected feedback can cause."""
     fed = {
         signal: test.response
         for o in tests.outputs.values()

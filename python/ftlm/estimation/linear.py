@@ -167,7 +167,7 @@ class MultiInnovationTrace:
     coefficients
         By name, after each of these steps.
     error
-        Error (45) of the free run of the model after each of these steps, at rest; infinite where it diverged.
+        Error (45) of the simulation of the model after each of these steps, at rest; infinite where it diverged.
     innovation_length
         p.
     """
@@ -284,7 +284,7 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
         [(name, trace.error) for name, trace in traces],
         title=title,
         x_label="step of the recursion",
-        y_label="error (45) of the free run",
+        y_label="error (45) of the simulation",
         log_x=log_x,
         log_y=True,
     )

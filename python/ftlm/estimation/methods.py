@@ -60,8 +60,8 @@ class OutputError:
         outliers decide nothing; without any it has 95 % of the precision. Figures stay those of all samples.
     intervals
         ``"quadratic"``: estimate ± 1.96 standard errors, true where the cost is a parabola. ``"profile"``: by profile
-        likelihood for every parameter, some ten to a hundred free runs each. ``"auto"``: by profile likelihood for the
-        parameters for which two free runs each say that the quadratic picture is off by over a tenth. See
+        likelihood for every parameter, some ten to a hundred simulations each. ``"auto"``: by profile likelihood for
+        the parameters whose Wald interval is off by over a tenth, from two simulations each. See
         :meth:`ftlm.Identification.profile`.
     start
         Initial guess besides the automatic ones, so that the fit never ends with a larger cost than one gets from

@@ -168,7 +168,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
 
 
 def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
-    """Return the optima from some starts that are models of their own and almost as likely as that from the best one.
+    """Return other optima that are almost as likely as the best one and simulate other outputs.
 
     Each comes with the fall of the log likelihood.
     """
@@ -247,7 +247,7 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
 
 
 def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on runs that were taken to rest before their first row, and on what tells that they did."""
+    """Return findings on runs that are assumed to rest before their first row, with the evidence."""
     resolved = resolve_start(runs, structure)
     findings = []
     for run in runs if resolved.initial == "rest" or resolved.offset == "level" else ():
@@ -340,14 +340,14 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
 
 
 def _simulated_speeds(measured: Floats, residuals: Floats) -> Floats:
-    """Change of a simulated output around each inner sample, which outliers of the measured one do not move."""
+    """Absolute change of the simulated output around each inner sample; measured outliers do not affect it."""
     simulated = interpolate_gaps(measured[1 : 1 + residuals.size] - residuals)
     steps = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
     return np.maximum(steps[:-1], steps[1:])
 
 
 def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
-    """Deviation of the residuals of each row, robustly: of all rows, or if it is larger, of those of its speed.
+    """Robust standard deviation of the residuals by row: of all rows, or that of rows of similar speed if larger.
 
     Noise that grows with speed (an error of timing, a rate, a gain) is no outlier. Nor is all that moves, where a
     machine stands still for a part of the run.
@@ -423,7 +423,7 @@ def excitation_findings(runs: Sequence[Run], structure: Structure) -> list[Findi
 
 
 def dead_channel_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on measured channels that are dead, which a fit would take for motion."""
+    """Return findings on measured outputs that stay constant for a time although they vary otherwise."""
     channels = [(r.with_interpolated_gaps(), n) for r in runs for n in r.outputs if n in structure.signals]
     return [item for run, name in channels for item in find_dead_channel(run, name)]
 

@@ -64,7 +64,7 @@ def search_orders(
     order_grid
         Intervals and increment; see :func:`ftlm.order_grid`.
     criterion
-        ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
+        ``"output-error"``: the simulation, each equation driven by the measured other outputs. ``"equation-error"``:
         measured signals on the right-hand side; it prefers near-identities.
     coefficients
         ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``:

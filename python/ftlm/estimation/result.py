@@ -236,7 +236,7 @@ class Identification:
         followed continuously from the optimum, so another optimum beyond a ridge is not found.
 
         It takes two to four refits an end where the picture is nearly quadratic, up to forty in a valley without end:
-        some ten to two hundred free runs a number, each as long as one evaluation on the fit's finest grid. Ends are
+        some ten to two hundred simulations a number, each as long as one evaluation on the fit's finest grid. Ends are
         found by several threads, with the same figures for any number of them; Ctrl-C ends it within a refit.
 
         Parameters

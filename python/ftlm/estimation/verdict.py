@@ -381,7 +381,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     }
     following = {o: signals for o, signals in following.items() if signals}
     if following:
-        shown = ", ".join(f"{o} still follow {join_names(signals)}" for o, signals in following.items())
+        shown = ", ".join(f"{o} with {join_names(signals)}" for o, signals in following.items())
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
         yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
     yield from coupled

@@ -301,7 +301,7 @@ def _check_parts(found: Mapping[str, _ResponseColumn], pool: Pool) -> None:
     known = ", ".join(f"{i.part} {i.column.name!r}" for i in found.values()) or "none"
     missing = "the frequency" if "frequency" not in found else "real and imaginary part, or magnitude and phase"
     raise DataError(
-        f"{missing} cannot be told from the names of the columns (known are: {known}); name them with "
+        f"{missing} cannot be recognized by column names (recognized: {known}); name the columns with "
         f"{parameter('columns', PART_COLUMNS)}, parts frequency, real and imag, or frequency, magnitude and phase; "
         f"{pool.describe()}"
     )
@@ -441,8 +441,8 @@ def _polar(
     )
     if decibels == "dB" and "deviation" in found:
         raise DataError(
-            f"column {found['deviation'].column.name!r} is taken for the standard deviation of the real and of the "
-            "imaginary part, and sizes in dB have another; give real and imaginary part, or name the others with "
+            f"column {found['deviation'].column.name!r} is read as the standard deviation of real and imaginary "
+            "part, which does not apply to magnitudes in dB; give real and imaginary part, or name the columns with "
             f"{parameter('columns', PART_COLUMNS)}"
         )
     written = _PHASE_UNIT_FACTORS.get(angle.unit.casefold())

@@ -458,7 +458,7 @@ def landscape(
     names = orders or tuple(list(axes)[:2])
     if len(names) != 2 or names[0] == names[1] or any(n not in axes for n in names):
         free = ", ".join(axes) or "none"
-        raise ModelError(f"a landscape needs two different orders with several values each; this lattice has {free}")
+        raise ModelError(f"a landscape needs two different orders with several values each; this order grid has {free}")
     x, y = (np.array(axes[n]) for n in names)
     fixed = structure.with_orders({n: v for n, v in best.items() if n not in names})
     table = rank_orders(

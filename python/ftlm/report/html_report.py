@@ -244,7 +244,7 @@ def identification_page(
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
     details.append(frequency_section(model, steps))
     details += _search_sections(result)
-    titled = ((f"Initial terms of the free runs, {label}", c) for label, c in compared)
+    titled = ((f"Initial terms of the simulations, {label}", c) for label, c in compared)
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.fit)] if result.fit is not None and result.fit.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
@@ -269,7 +269,7 @@ def first_sections(
     """
     units = model.units
     words = [
-        "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
+        "No check raised a warning. Checked: simulation against equation error, orders close to one another or on the "
         "edge of their interval, pull of the prior, coefficient law, residuals, stability of the discretisation, the "
         "data."
     ]
@@ -395,7 +395,7 @@ def _search_sections(result: Identification) -> list[Section]:
     traces = _traces(result)
     if traces:
         words = (
-            "Error (45) of the free run after every step of the recursion, at the orders found. p weighs the data "
+            "Error (45) of the simulation after every step of the recursion, at the orders found. p weighs the data "
             "against the prior; all lines end where the closed form is."
         )
         sections.append(Section("Convergence of the recursion", words, figures=traces))
@@ -463,7 +463,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     for label, comparison in compared:
         fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit_percent.items())
         runs = ", ".join(name for name, _, _ in comparison.per_run)
-        sentences.append(f"Fit of the free run, {label} ({runs}): {fits}.")
+        sentences.append(f"Fit of the simulation, {label} ({runs}): {fits}.")
     return " ".join(sentences)
 
 
@@ -509,7 +509,7 @@ def settings_table(result: Identification, *, title: str = "What the result depe
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
         ["structure", structure.name],
-        ["coupling in free runs", structure.coupling],
+        ["coupling in simulations", structure.coupling],
         ["estimator", result.method],
         *settings_rows(result.settings, searched=bool(result.searches)),
     ]
@@ -601,7 +601,10 @@ def model_page(
     if tests := tests_on(model, others):
         details.append(residual_section(tests, None, compared, model.units))
     details.append(frequency_section(model, [(r.step, r.duration) for r in others]))
-    about: list[list[Cell]] = [["structure", model.structure.name], ["coupling in free runs", model.structure.coupling]]
+    about: list[list[Cell]] = [
+        ["structure", model.structure.name],
+        ["coupling in simulations", model.structure.coupling],
+    ]
     if known is not None:
         about += [["estimator", known.method], ["identified from", ", ".join(known.runs)]]
         about += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in known.fit.items()]

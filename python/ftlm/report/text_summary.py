@@ -142,7 +142,7 @@ def describe_order(state: SteadyState) -> str:
 def fit_lines(result: Identification, validation: Comparison | None) -> list[str]:
     """Return lines on the simulation fit on estimation and validation data, and on the equation error."""
     width = max(len(o) for o in result.output_error) + 2
-    lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
+    lines = [f"{'simulation fit, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
     for output, own in result.output_error.items():
         unit = result.model.units.get(output, "")
         other = "not tried" if validation is None else f"{validation.output_error[output].fit:.4g}"

@@ -163,9 +163,8 @@ def select(
         )
     if not isinstance(candidates, (str, Structure)) and len(candidates) > MAX_CANDIDATES:
         raise ModelError(
-            f"{len(candidates)} candidates are more than {MAX_CANDIDATES}; give one structure instead, whose inside "
-            "is grown "
-            "step by step"
+            f"{len(candidates)} candidates are more than {MAX_CANDIDATES}; give one structure instead, from which "
+            "terms are selected stepwise"
         )
     every = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
     if isinstance(candidates, str) and candidates != "auto":
