@@ -381,7 +381,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "significantly; {remedy}",
         "the interval of {parameter} is unbounded",
     ),
-    "number_vague": _rule("vague", LEVEL_WITH_CARE, "poorly determined by the runs: {shown}"),
+    "number_vague": _rule("vague", LEVEL_WITH_CARE, "poorly identifiable from the runs: {shown}"),
     "coefficient_law_broken": FindingKind(
         "law",
         LEVEL_WITH_CARE,
@@ -874,8 +874,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "response_number_vague": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "poorly determined by the data: {parameter} = {value:.4g} ± {error:.2g}; fix it, or leave it out",
-        "poorly determined by the data: {parameter} = {value:.4g} ± {error:.2g}",
+        "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}; fix it, or leave it out",
+        "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}",
     ),
     # Selection, consistency, design
     "other_optimum": FindingKind(

@@ -442,6 +442,7 @@ DECIBELS = 20 * np.log10(np.abs(Z))
 #: Header, columns, how it is written, what must be said; all hold the same spectrum.
 STRANGERS = {
     "Zreal Zimag": (("Freq", "Zreal", "Zimag"), (F, Z.real, Z.imag), {}, "'Freq' taken for Hz"),
+    "Zreal Zimg": (("Freq/Hz", "Zreal/Ohm", "Zimg/Ohm"), (F, Z.real, Z.imag), {}, None),
     "potentiostat": (
         ("freq/Hz", "Re(Z)/Ohm", "-Im(Z)/Ohm", "|Z|/Ohm", "Phase(Z)/deg"),
         (F, Z.real, -Z.imag, np.abs(Z), DEGREES),

@@ -149,7 +149,7 @@ def test_page_says_what_it_must(page, identified):
     for name in ("M", "initial terms", "estimator"):
         assert name in text
     assert "standard error" in text  # that there are none
-    heads = [text.index(head) for head in ("on runs that were not fitted", "Equations", "Warnings", "Errors")]
+    heads = [text.index(head) for head in ("Validation: measured and simulated", "Equations", "Warnings", "Errors")]
     assert heads == sorted(heads)
     assert f"{identified.fit_percent['theta12']:.4g}\u00a0%" in text
 

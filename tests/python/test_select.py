@@ -493,7 +493,7 @@ def test_none_wins_that_fails_where_another_does_not():
     assert _rank_trials([failing, steady]) == [steady, failing]
     assert failing.worst_fold == -3e7
     said = _reason(steady, steady, [steady, failing])
-    assert "steady (5 numbers, 75.00 % where unseen), which predicts best" in said
+    assert "steady (5 parameters, validation fit 75.00 %), which predicts best" in said
     assert said.endswith(
         "failing leaves 25 % less on the mean and is not chosen: it fails on y of run 3, with < -1000 % where the "
         "chosen one has 60.00."
@@ -539,8 +539,8 @@ def test_the_first_rows_of_a_run_in_motion_are_judged_with_its_own_initial_terms
 
 def test_the_page_and_the_figures(chosen, tmp_path):
     page = chosen.report(tmp_path / "choice.html").read_text("utf-8")
-    assert "What each number is worth" in page
-    assert "not told from 0" in page
+    assert "Fit by number of parameters" in page
+    assert "insignificant" in page
     # What is chosen is a dot on the line, not a line of one point that nobody sees.
     assert "are not finite" not in page
     with pytest.raises(ftlm.DataError, match="exists"):

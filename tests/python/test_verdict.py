@@ -64,7 +64,7 @@ def checked(found, other):
 def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
     judged = verdict(found, checked)
     assert (judged.level, judged.reasons, judged.trusted) == ("trust", (), True)
-    assert judged.reason.startswith("it predicts runs it was not fitted to (y 99")
+    assert judged.reason.startswith("it predicts validation runs (y 99")
     assert checked.verdict == judged == found.verdict(checked)
     assert found.verdict() == found.verdict
     assert str(checked).startswith("TRUST: ")
@@ -206,10 +206,10 @@ def test_a_number_is_vague_by_its_own_size(found, checked):
         spread[a1, a1] = (share * found.coefficients["a1"]) ** 2
         judged = verdict(worse(found, fit=replace(found.fit, covariance=spread, profiles={})), checked)
         assert judged.trusted != vague
-        assert not vague or judged.reason.startswith("poorly determined by the runs: a1 = -0.6")
+        assert not vague or judged.reason.startswith("poorly identifiable from the runs: a1 = -0.6")
     spread[a1, a1], spread[alpha, alpha] = 0.0, 0.3**2
     judged = verdict(worse(found, fit=replace(found.fit, covariance=spread, profiles={})), checked)
-    assert judged.reason == f"poorly determined by the runs: alpha = {found.orders['alpha']:.3g} ± 0.3"
+    assert judged.reason == f"poorly identifiable from the runs: alpha = {found.orders['alpha']:.3g} ± 0.3"
 
 
 def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, checked):
@@ -217,7 +217,7 @@ def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, chec
     for name, low, high, reason in (
         ("delay_u", -math.inf, 0.3, ""),  # it may well be 0
         ("delay_u", 0.05, math.inf, "the runs do not bound delay_u"),
-        ("alpha", 1.5, math.inf, f"poorly determined by the runs: alpha = {found.orders['alpha']:.3g} ± "),
+        ("alpha", 1.5, math.inf, f"poorly identifiable from the runs: alpha = {found.orders['alpha']:.3g} ± "),
     ):
         open_ended = replace(found.fit, profiles={name: ProfileInterval(low, high, 0.95)})
         judged = verdict(worse(found, fit=open_ended, model=late), checked)
@@ -360,7 +360,7 @@ def test_a_hidden_offset_is_named(found, checked):
 
 def test_a_run_in_motion_says_so(found):
     moving = worse(found, comparison=replace(found.comparison, initial=[{"y": {0.0: 1.0, 1.0: 2.0}}]))
-    assert "in motion at its start, initial terms estimated with it: square (2)" in str(moving)
+    assert "nonzero initial conditions, initial terms estimated (their number): square (2)" in str(moving)
     assert "in motion" not in str(found)
 
 
@@ -591,7 +591,7 @@ def test_the_command_line_has_verdict_validation_and_more(run, other, tmp_path):
     assert alone.output.startswith("WITH CARE: the model was not validated on another run")
     assert len(alone.output.splitlines()) < 24
     both = CliRunner().invoke(cli.app, [*words, "--validation", str(tmp_path / "other.csv"), "-v"])
-    assert both.output.startswith("TRUST: it predicts runs it was not fitted to (y ")
+    assert both.output.startswith("TRUST: it predicts validation runs (y ")
     assert "equation error" in both.output
     assert "validation on chirp" in both.output
     document = json.loads(CliRunner().invoke(cli.app, [*words, "--json"]).output)

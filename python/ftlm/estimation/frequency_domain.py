@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
@@ -41,6 +42,8 @@ from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
 
 
+#: Circuit in the notation of impedance tools, such as ``R0-p(R1,CPE1)``.
+_CIRCUIT_PATTERN = re.compile(r"\s*(?:R|C|L|CPE|W|Wo|Ws|G|Q|p\s*\()[0-9_]*\s*(?:-|\(|[RCLWQ]|$)")
 #: Largest exponent of a constant-phase element: that of a capacitor.
 MAX_EXPONENT = 1.0
 
@@ -667,6 +670,11 @@ def _structure(
     delay: Mapping[str, float | tuple[float, float]] | None,
 ) -> Structure:
     """Return the structure to identify; raise for what a frequency response cannot represent."""
+    if isinstance(structure, str) and _CIRCUIT_PATTERN.match(structure):
+        raise ModelError(
+            f"structure {structure!r} is a circuit; give its equation, such as 'D^alpha U = a U + r D^alpha I + b I' "
+            "for R0 - p(R1, CPE1) and 'D U = a U + r D I + b I' for R0 - p(R1, C1)"
+        )
     wanted = equation(structure) if isinstance(structure, str) else structure
     if not isinstance(wanted, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; give an equation: 'D^alpha y = a0 y + b0 u'")

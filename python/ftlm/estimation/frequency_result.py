@@ -323,7 +323,7 @@ class FrequencyIdentification:
         if against is not None:
             return against
         shown = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
-        return Verdict(TRUST_LEVEL, f"it predicts what it was not fitted to (error {shown}), residuals are noise")
+        return Verdict(TRUST_LEVEL, f"it predicts validation responses (error {shown}), residuals are noise")
 
     def _unstable_poles(self) -> list[Finding]:
         """Return a finding on poles with a positive real part, if there are any."""
@@ -350,7 +350,7 @@ class FrequencyIdentification:
         same, tried = self.start_counts
         lines.append(
             f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {tried} "
-            "starts ended here"
+            "initial guesses ended here"
         )
         return "\n".join(
             [

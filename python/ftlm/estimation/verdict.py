@@ -145,7 +145,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
     return Verdict(
-        TRUST_LEVEL, f"it predicts runs it was not fitted to ({fits}), residuals are noise, every number is known"
+        TRUST_LEVEL, f"it predicts validation runs ({fits}), residuals are noise, all parameters are well determined"
     )
 
 
@@ -186,7 +186,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     if judged is not None:
         return judged
     fits = ", ".join(f"{o} {f.fit:.3g} %" for c in validation for o, f in c.output_error.items())
-    return Verdict(TRUST_LEVEL, f"it predicts runs it was not fitted to ({fits}), and nothing spoke against its fit")
+    return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), and no finding speaks against its fit")
 
 
 def saved_findings(known: Estimate) -> list[Finding]:

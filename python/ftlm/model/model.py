@@ -415,6 +415,13 @@ class Model:
         return to_tf(self)
 
     @check_arguments
+    def to_ss(self, *, step: float | None = None) -> Any:
+        """Convert a model of integer orders to a state space of python-control; see :func:`ftlm.analysis.to_ss`."""
+        from ftlm.analysis.conversion import to_ss
+
+        return to_ss(self, step=step)
+
+    @check_arguments
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model as JSON, atomically.
 

@@ -69,7 +69,7 @@ def comparison_charts(
             points=points,
             slider=True,
             bands=_behind_measured(known[name]) if name in known else (),
-            caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
+            caption=f"Simulation: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
             + (" Shade: 95 % confidence band of the simulation." if name in known else ""),
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)

@@ -187,7 +187,7 @@ SERIES_POINTS = 600
 #: Points of a convergence curve.
 TRACE_POINTS = 64
 #: Text for models with friction, in place of their stability.
-FRICTION_STABILITY_NOTE = "The body rests while friction holds it, so that no poles say how it comes to rest."
+FRICTION_STABILITY_NOTE = "A model with friction is not linear, so it has no poles."
 
 
 def identification_page(
@@ -270,11 +270,11 @@ def first_sections(
     units = model.units
     words = [
         "No check raised a warning. Checked: simulation against equation error, orders close to one another or on the "
-        "edge of their interval, pull of the prior, coefficient law, residuals, stability of the discretisation, the "
+        "edge of their interval, influence of the prior, coefficient law, residuals, stability of the scheme, the "
         "data."
     ]
     if not validated:
-        words.append("No validation run was given: how well the model predicts other data is not known.")
+        words.append("No validation run was given, so the prediction of other data is unknown.")
     warned = unique(findings)
     shown, left = first_findings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
@@ -294,7 +294,7 @@ def first_sections(
     sections = []
     if first:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table of errors has every run."
-        heading = "Measured and simulated, on runs that were not fitted" if new else "Measured and simulated"
+        heading = "Validation: measured and simulated" if new else "Measured and simulated"
         sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
     sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint)]),
@@ -307,9 +307,7 @@ def first_sections(
         sections.append(Section("Errors", tables=[errors_table(compared, units=units)], collapsed=True))
     if new and known:
         figures = known[: max(PAGE_CHARTS - len(new), 0)]
-        sections.append(
-            Section("Measured and simulated, on the runs that were fitted", figures=figures, collapsed=True)
-        )
+        sections.append(Section("Estimation: measured and simulated", figures=figures, collapsed=True))
     return sections
 
 
@@ -463,7 +461,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     for label, comparison in compared:
         fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit_percent.items())
         runs = ", ".join(name for name, _, _ in comparison.per_run)
-        sentences.append(f"Fit of the simulation, {label} ({runs}): {fits}.")
+        sentences.append(f"Fit on {label} data ({runs}): {fits}.")
     return " ".join(sentences)
 
 

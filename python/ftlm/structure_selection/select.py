@@ -413,16 +413,19 @@ def _with_validated_initial_conditions(trial: Trial, folds: Folds) -> Structure:
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
     """Describe why the winner was chosen."""
-    lead = f"Chosen: {winner.name} ({winner.parameters} numbers, {format_fit(winner.validation_fit)} % where unseen)"
+    lead = (
+        f"Chosen: {winner.name} ({winner.parameters} parameters, validation fit {format_fit(winner.validation_fit)} %)"
+    )
     peers = [ranked[k] for k in _peer_indices(ranked)]
     if winner is best:
         lead += ", which predicts best"
     else:
         more = best.parameters - winner.parameters
         lead += (
-            f", which leaves {100 * (math.exp(winner.score - best.score) - 1):.2g} % more than the best prediction"
-            + (f" with {more} number{'s' * (more > 1)} fewer" if more > 0 else "")
-            + " and has the least Schwarz criterion of those that predict alike"
+            f", whose residuals are {100 * (math.exp(winner.score - best.score) - 1):.2g} % larger than those "
+            f"of the best prediction"
+            + (f" with {more} parameter{'s' * (more > 1)} fewer" if more > 0 else "")
+            + " and which has the lowest Schwarz criterion of those that predict equally well"
         )
     for word, others in (
         ("fewer", [t for t in peers if t.parameters < winner.parameters]),
@@ -431,8 +434,8 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
         if others:
             near = min(others, key=lambda t: t.score)
             share = 100 * (math.exp(near.score - winner.score) - 1)
-            side = "more" if share >= 0 else "less"
-            lead += f"; the best with {word} ({near.parameters}) leaves {abs(share):.3g} % {side}"
+            side = "larger" if share >= 0 else "smaller"
+            lead += f"; the best with {word} ({near.parameters}) has {abs(share):.3g} % {side} ones"
     return lead + "." + _failure_text(winner, ranked)
 
 
@@ -445,7 +448,8 @@ def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
         other = min(ahead, key=lambda t: t.score)
         name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
         told += (
-            f" {other.name} leaves {share:.2g} % less on the mean and is not chosen: it fails on {name}, with "
+            f" {other.name} has {share:.2g} % smaller residuals on the mean and is not chosen: it fails on "
+            f"{name}, with "
             f"{format_fit(other.parts[name])} % where the chosen one has {format_fit(winner.parts[name])}."
         )
     for name in failures[id(winner)]:
