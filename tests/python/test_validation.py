@@ -167,9 +167,9 @@ def test_comparison_prints_and_is_json(small_model, small_run, with_noise):
     lines = str(found).splitlines()
     assert lines[0].split() == ["output", "error", "RMSE", "NR", "fit", "%"]
     assert [line.split()[:3] for line in lines[1:3]] == [["y", "equation", "error"], ["y", "output", "error"]]
-    assert lines[3] == "output error over 1026 samples, equation error over 64 block pulses a run"
+    assert lines[3] == "output error over 1026 samples, equation error over 64 block pulses per run"
     means = str(compare_means(small_model, small_run, m=64)).splitlines()
-    assert means[3] == "over 64 block pulses a run"
+    assert means[3] == "over 64 block pulses per run"
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["m"] == 64
     assert document["output_error"]["y"]["fit"] == found.fit_percent["y"]

@@ -290,8 +290,8 @@ def flexible_link(
         ``"stock"`` for the 2 Hz low-pass that the arm's stock real-time model puts on both deflections, whether they
         are modelled or drive a model, or a filter.
     offset
-        ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one a run, such as the current
-        that it takes to hold the arm still; see :func:`ftlm.equation`.
+        ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one per run, such as the
+        current that holds the arm still; see :func:`ftlm.equation`.
 
     Returns
     -------

@@ -52,7 +52,7 @@ STEP_TOLERANCE_ERRORS = 1e-3
 INSTRUMENT_RANK_TOLERANCE = 1e-12
 #: Score of the best candidate under a prior, relative to that of a zero output, that is not reported.
 MAX_PRIOR_SCORE_RATIO = 0.5
-#: Fewest pulses a sample interval. The estimates are those of one grid.
+#: Fewest pulses per sampling interval. The estimates are those of one grid.
 MIN_PULSES_PER_SAMPLE = 2
 
 
@@ -155,7 +155,7 @@ def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
     return _core.long_run_covariance(influence, series)
 
 
-#: Largest number of block pulses a run for the final instrumental-variable fit if m is not given.
+#: Largest number of block pulses per run for the final instrumental-variable fit if m is not given.
 MAX_IV_PULSES = 1 << 14
 
 

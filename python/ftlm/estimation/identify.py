@@ -242,8 +242,8 @@ def identify(
         once with the constant and, where none is asked for, once without. Default what the structure says. Where it
         says none and a constant would explain much, a warning does.
     m
-        Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows). Instrumental variables
-        search on these and, without m, end on all samples (at most 16 384 pulses).
+        Block pulses per run; default 2 048, or what the runs carry (a power of two for Haar rows). Without `m`,
+        instrumental variables search on these and estimate on all samples (at most 16 384 pulses).
     threads, progress
         Threads, by default all cores, and what is called with (work done, work in all).
 

@@ -32,7 +32,7 @@ from ftlm.validation.data_advice import check_excitation, find_dead_channel
 
 #: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
-#: Least number of samples a period of a mode whose numbers do not rest on the inputs between samples, and damping
+#: Least number of samples per period of a mode whose numbers do not rest on the inputs between samples, and damping
 #: ratio from which on a mode is no swing.
 MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
@@ -385,7 +385,7 @@ def quantization_step(values: Floats) -> float:
 
 
 def correlation_findings(joint: JointFit) -> list[Finding]:
-    """Return findings on groups of parameters that are not separately identifiable, one a group."""
+    """Return findings on groups of parameters that are not separately identifiable, one per group."""
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
     sizes = {n: abs(v) for n, v in joint.values_by_name.items()}
     # Negated so that a standard error that is not a number counts as too large.
@@ -525,7 +525,7 @@ def stability_findings(model: Model) -> list[Finding]:
 
 
 def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
-    """Return a finding on the fastest oscillation that has too few samples a period."""
+    """Return a finding on the fastest oscillation that has too few samples per period."""
     if model.structure.has_friction:
         return []
     try:

@@ -40,7 +40,7 @@ from ftlm.utils.statistics import (
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
 
-#: Block pulses a sample interval if the fit does not state its refinement.
+#: Block pulses per sampling interval if the fit does not state its refinement.
 DEFAULT_PULSES_PER_SAMPLE = 2
 #: Relative size of the offset sensitivity below which it is collinear with the other parameters.
 OFFSET_COLLINEARITY_TOLERANCE = 1e-6

@@ -78,7 +78,7 @@ def search_orders(
         (``"time"``). Without K0 the prior is weak in any units; see :class:`ftlm.MultiInnovation`. Of
         ``"multi-innovation"`` alone; with other coefficients a change of them is refused.
     m
-        Block pulses a run; default 2 048, or what the runs carry.
+        Block pulses per run; default 2 048, or what the runs carry.
     top
         Rows of the table.
     threads

@@ -138,8 +138,8 @@ class JointFit:
     samples
         Number of residuals, without missing samples.
     refinement
-        Block pulses a sample interval on the finest grid. The estimates are extrapolated from it and the next coarser
-        one.
+        Block pulses per sampling interval on the finest grid. The estimates are extrapolated from it and the
+        next coarser one.
     step_converged
         Whether halving the step moved every estimate by less than a tenth of its standard error.
     converged

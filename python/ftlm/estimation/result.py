@@ -202,7 +202,7 @@ class Identification:
         Parameters
         ----------
         **known
-            One parameter a stage by name, such as ``J_12=0.1704``.
+            One parameter per stage by name, such as ``J_12=0.1704``.
 
         Returns
         -------
@@ -235,9 +235,9 @@ class Identification:
         noise variance, widened for colored residuals; a robust loss keeps the weights of the fit. Each bound is
         followed continuously from the optimum, so another optimum beyond a ridge is not found.
 
-        It takes two to four refits an end where the picture is nearly quadratic, up to forty in a valley without end:
-        some ten to two hundred simulations a number, each as long as one evaluation on the fit's finest grid. Ends are
-        found by several threads, with the same figures for any number of them; Ctrl-C ends it within a refit.
+        A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley: ten to two
+        hundred simulations per parameter, each as long as one evaluation on the fit's finest grid. The result does not
+        depend on the number of threads. Ctrl-C ends the search within a refit.
 
         Parameters
         ----------

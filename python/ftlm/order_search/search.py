@@ -301,7 +301,7 @@ def resume_search(
     executor: Executor | None = None,
     recover: bool = False,
 ) -> dict[str, SearchResult]:
-    """Go on with the searches of a store; it holds all that they are computed from.
+    """Resume the searches of a checkpoint file, which contains their data and settings.
 
     Parameters
     ----------
@@ -345,7 +345,7 @@ def resume_job(
     progress: Callable[[int, int], None] | None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Go on with one search of a store."""
+    """Resume one search of a checkpoint file."""
     check_executor(executor)
     job = replace(job_of(store, number, threads_per_task(threads, executor)), progress=_core_callback(progress))
     with _usable(store.path, store.contents.requests[number]):

@@ -112,8 +112,8 @@ def pole_charts(model: Model) -> list[Figure]:
     found = modes(model)
     plane = "s" if q == 1 else f"s^{q:.4g}"
     inside = sum(m.unstable for m in found)
-    words = "none is in it" if not inside else f"{inside} of {len(found)} modes in it: the model is not stable"
-    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, where poles make a simulation grow; {words}."
+    words = "it has no pole" if not inside else f"it has {inside} of {len(found)} modes, so the model is not stable"
+    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, the unstable sector; {words}."
     if q != 1:
         caption += f" A relaxation is drawn at −T^−{q:.4g}."
     unit = "rad/s" if q == 1 else f"(rad/s)^{q:.4g}"

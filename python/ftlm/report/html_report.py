@@ -156,7 +156,8 @@ def behavior_tables(model: Model) -> list[Table]:
             for k, m in enumerate(found)
         ]
         note = (
-            "A swing has the time constant 1/|Re s|, a relaxation 1/|s|; standard errors are to first order from the "
+            "The time constant is 1/|Re s| of an oscillation and 1/|s| of a relaxation; standard errors are to "
+            "first order from the "
             "covariance of the fit."
         )
         columns = ("mode", "pole s [rad/s]", "frequency [rad/s]", "±", "damping", "±", "time constant [s]", "±")

@@ -232,13 +232,13 @@ class Comparison:
         if self.output_samples:
             count = max(sum(drop_missing(y).size for y in parts) for parts in self.measured.values())
             known = (
-                f", equation error over {self.m} block pulses a run"
+                f", equation error over {self.m} block pulses per run"
                 if set(self.measured) - set(self.without_equation_error)
                 else ""
             )
             lines.append(f"output error over {count} samples{known}")
         else:
-            lines.append(f"over {self.m} block pulses a run")
+            lines.append(f"over {self.m} block pulses per run")
         lines += describe_missing_equation_errors(self.without_equation_error)
         lines += describe_offsets(self)
         lines += [f"warning: {w}" for w in self.warnings]
@@ -271,7 +271,7 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
     runs
         One run or several with the same names and units.
     m
-        Number of block pulses a run for the equation error; default that of the identification, or what the runs carry.
+        Number of block pulses per run for the equation error; default as in the identification, or what runs carry.
 
     Returns
     -------

@@ -58,7 +58,7 @@ RIDGE_SHARE = 1e-10
 
 @dataclass(frozen=True)
 class FeedbackTest:
-    """Test whether an input answers what an output did before.
+    """Test whether an input depends on past values of an output (feedback).
 
     Parameters
     ----------
