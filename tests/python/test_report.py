@@ -737,7 +737,7 @@ def test_a_pole_map_has_every_pole_and_its_sector():
     assert "it has no pole" in figure.caption
     (grown,) = pole_charts(ftlm.Model(ftlm.equation("D^2 y = 0.6 D y - 9 y + u")))
     assert grown.title == "Poles in the plane of s"
-    assert "1 of 1 modes in it: the model is not stable" in grown.caption
+    assert "it has 1 of 1 modes, so the model is not stable" in grown.caption
     assert "2 in the shaded sector" in grown.svg
     # A relaxation of fractional order stands on the negative axis.
     (slow,) = pole_charts(ftlm.Model(ftlm.equation("D^0.5 y = -2 y + u")))

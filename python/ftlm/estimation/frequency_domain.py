@@ -669,7 +669,7 @@ def _structure(
     fixed: Mapping[str, float] | None,
     delay: Mapping[str, float | tuple[float, float]] | None,
 ) -> Structure:
-    """Return the structure to identify; raise for what a frequency response cannot represent."""
+    """Return the structure to identify; raise for nonlinear terms, offsets, sensor filters and laws."""
     if isinstance(structure, str) and _CIRCUIT_PATTERN.match(structure):
         raise ModelError(
             f"structure {structure!r} is a circuit; give its equation, such as 'D^alpha U = a U + r D^alpha I + b I' "

@@ -478,9 +478,9 @@ class GeneticAlgorithm:
     norm
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     seeds
-        One run of the algorithm a seed; the best of all is the result, and the errors of all are kept.
+        The algorithm runs once per seed; the result is the best run, with the errors of all.
     evaluations
-        Evaluations a seed, rounded up to a whole generation; by default as many as the order grid has candidates.
+        Evaluations per seed, rounded up to a whole generation; by default as many as the order grid has candidates.
     population
         Candidates of one generation, at least 8.
     bounds
@@ -490,8 +490,8 @@ class GeneticAlgorithm:
     Raises
     ------
     ModelError
-        Seeds that are none or too many, a population outside [8, 100000], evaluations of less than two generations,
-        bounds that are no interval, an order grid or a norm that is none.
+        No seeds or too many, a population outside [8, 100000], evaluations of less than two generations, bounds that
+        are no interval, an invalid order grid or norm.
     """
 
     name: ClassVar[str] = "genetic"

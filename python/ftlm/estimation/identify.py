@@ -235,34 +235,33 @@ def identify(
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
         friction that the model lacks; ``"level"``: a constant that is added to each output; ``"ramp"``: a constant and
-        a drift in proportion to time. One each run, in ``.comparison.offsets``, estimated anew on any run that the
-        model is judged on; beside a history (a run that starts in motion) it is estimated, but cannot be told from it.
-        A run that rests at its own level before an input moves has a level by default. ``"auto"``: a constant where the
-        runs ask for one at 99 %, none where they do not, with the statistic in ``.settings["offset_test"]``; it fits
-        once with the constant and, where none is asked for, once without. Default what the structure says. Where it
-        says none and a constant would explain much, a warning does.
+        a linear drift. Each run has its own, in ``.comparison.offsets``, also in validation. It is not separately
+        identifiable from a history of nonzero initial conditions. A run that rests at its own level before an input
+        changes has a level by default. ``"auto"``: a constant if it is significant at 99 %, with the statistic in
+        ``.settings["offset_test"]``; it fits once with the constant and, if it is not significant, once without.
+        Default that of the structure. A finding reports a missing constant that would explain much.
     m
         Block pulses per run; default 2 048, or what the runs carry (a power of two for Haar rows). Without `m`,
         instrumental variables search on these and estimate on all samples (at most 16 384 pulses).
     threads, progress
-        Threads, by default all cores, and what is called with (work done, work in all).
+        Threads, by default all cores; and a function that is called with (work done, total work).
 
     Returns
     -------
     Identification
-        Prints well; ``.model`` simulates, compares and saves.
+        Prints its summary; ``.model`` simulates, compares and saves, ``.validate`` and ``.report`` follow.
 
     Raises
     ------
     DataError
-        Runs that do not fit the structure, or a constant output; a reference that is not there or does not move; a
-        store of other searches, in use, damaged, or that cannot be written.
+        Runs that do not fit the structure, or a constant output; a missing or constant reference; a checkpoint file of
+        other searches, in use, damaged, or not writable.
     ModelError
-        A method that is not known, an order grid without or with too many candidates, settings out of range, options of
-        an order search without a free order, a store with ``offset="auto"``, a start that has none of the free
-        parameters, others, or values out of their bounds.
+        An unknown method, an order grid without or with too many candidates, settings out of range, options of an
+        order search without a free order, a store with ``offset="auto"``, an initial guess without free parameters,
+        with unknown ones, or out of bounds.
     ConvergenceError
-        Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
+        Linearly dependent regressors at the given orders, or an executor that has lost its workers.
     """
     several = as_runs(runs)
     chosen = resolve_method(method)

@@ -293,7 +293,7 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
 class Streaming:
     """Online estimator of the coefficients of a structure for a run that starts at rest.
 
-    Each sample costs the same, whatever the length of the run: the past is held by about a hundred numbers per signal.
+    The cost of a sample does not depend on the length of the run: about a hundred states per signal represent the past.
     After the last sample the coefficients are those of ``identify(method=MultiInnovation(row_basis="time"))`` at
     the same orders on the run's own grid, to rounding.
 

@@ -285,8 +285,8 @@ class Identification:
         Returns
         -------
         Validation
-            A :class:`ftlm.Comparison` whose ``.verdict`` says whether to trust the model. Its warnings name a fit that
-            is lost, and runs that the model was identified from.
+            A :class:`ftlm.Comparison` with a ``.verdict``. Its findings name a fit that falls, and runs from which the
+            model was identified.
 
         Raises
         ------
@@ -309,7 +309,7 @@ class Identification:
         path
             File to write.
         validation
-            Runs that the model was not identified from; without any, the page says that it was not validated.
+            Validation runs; without them the page says that the model was not validated.
         force
             Overwrite an existing file.
 
@@ -391,7 +391,7 @@ class Identification:
         Parameters
         ----------
         validation
-            What :meth:`validate` said of runs that the model was not identified from.
+            Result of :meth:`validate`; None for the summary without a validation.
 
         Raises
         ------

@@ -280,7 +280,7 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
 
 
 def is_degenerate(result: Identification) -> bool:
-    """Whether a fit must not be used by itself, so that no comparison with it says anything."""
+    """Whether the verdict on a fit without validation is "do not use", so that comparisons with it are meaningless."""
     return result.verdict.level == LEVEL_DO_NOT_USE
 
 
@@ -315,9 +315,9 @@ def improves_prediction(
 
 
 def is_buried(residuals: OutputResiduals) -> bool:
-    """Whether the residuals of an output are white or colored noise in which nothing of the inputs is left.
+    """Whether the residuals of an output are noise that is uncorrelated with the inputs.
 
-    A model that says nothing passes too where nothing of the input is in the output: it must explain something.
+    The model must also explain a part of the output: a zero model of an output without response passes the tests.
     """
     moving = [t for t in residuals.informative_tests.values() if t.conclusive]
     explained = residuals.nr < MAX_BURIED_RESIDUAL

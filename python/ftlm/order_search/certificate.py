@@ -65,7 +65,7 @@ def certify_orders(
     tolerance
         Tolerance: how much smaller than the best error found that of other orders may be, as a fraction below 1.
     start
-        Tuples of orders by name, such as those of another optimizer. The certificate has the error of each, and tells
+        Tuples of orders by name, such as those of another optimizer. The certificate has the error of each, and shows
         which of them other orders may still beat.
     min_separation
         Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.

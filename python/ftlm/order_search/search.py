@@ -310,14 +310,14 @@ def resume_search(
     threads, progress, executor
         As for :func:`search_orders`.
     recover
-        Whether to go on with a damaged store: what stands before the damage is kept, the rest is computed again, and
-        the damaged file stays beside it as ``….damaged``.
+        Whether to continue a damaged file: the part before the damage is kept, the rest is computed again, and the
+        damaged file is renamed to ``….damaged``.
 
     Returns
     -------
     dict of SearchResult
-        By output, or under ``"stage"`` for a search under an order law; those of the uninterrupted searches to the last
-        bit. A store that is complete is only read.
+        By output, or under ``"stage"`` for a search under an order law. The results equal those of uninterrupted
+        searches bit for bit. A complete file is only read.
 
     Raises
     ------
@@ -440,7 +440,7 @@ def landscape(
     search
         What was found.
     orders
-        Names of the two; by default the first two free orders that the lattice gives several values.
+        Names of the two; by default the first two free orders with several values in the order grid.
     threads
         See :func:`ftlm.search_orders`.
 

@@ -106,8 +106,8 @@ class RestEvidence:
     Parameters
     ----------
     rows
-        Number of rows in which inputs and outputs stand still before an input moves; 1 if only the outputs do, at zero,
-        and 0 if the inputs are constant from the first or second row on, so that rest is an assumption.
+        Number of rows in which inputs and outputs are constant before an input changes; 1 if only the outputs are, at
+        zero; 0 if the inputs are constant from the first or second row on, so that rest is an assumption.
     levels
         Level of each output before the run.
     inputs
@@ -366,7 +366,7 @@ def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Flo
     """Return the Bayesian information criterion of a fit with this number of initial terms, from its residuals.
 
     The residuals count as white ones by the color of `reference`: all starts are allowed the same smooth misfit, so
-    that none wins by what the structure lacks.
+    that the choice does not depend on missing terms.
     """
     score, total = 0.0, 0
     for own, other in zip(residuals, reference, strict=True):

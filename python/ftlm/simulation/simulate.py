@@ -107,7 +107,7 @@ def simulate(
         An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); the level of an
         output is the exponent infinity, and inputs then count from their values in quiet rows; default none. Initial
         values y(0), y'(0) by Caputo's definition bring further powers of t where a term of the output has a fractional
-        order; a call that leaves these out is refused, and says them.
+        order; a call without these powers raises an error that lists them.
     max_m
         Maximum number of pulses; a larger remaining change raises ConvergenceError.
 

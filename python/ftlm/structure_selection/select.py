@@ -111,7 +111,7 @@ def select(
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
         ``"auto"``: one output, every input, integer orders 1 to 4 with zeros, delays, direct feedthrough, an
-        integrator and an output level, then fractional orders. These are chosen where they predict better, or alike
+        integrator and an output level, then fractional orders. These are chosen if they predict better, or as well
         with a Schwarz criterion lower by 10.
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
@@ -135,7 +135,7 @@ def select(
     Raises
     ------
     DataError
-        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing; a store
+        Runs that do not fit together or the structure, that are too short to be cut, or without excitation; a store
         of another selection, in use, damaged, or that cannot be written.
     ModelError
         No candidates, two that differ in parameter names only, more than 10 000, no validation run, an unknown option,
@@ -354,8 +354,8 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
 def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
     """Indices of trials that may be chosen beside integer orders, and a sentence on the fractional ones.
 
-    Fractional orders predict better only if they leave 1 % less than the best integer orders, beyond the scatter over
-    the folds. They are eligible as well if they predict alike and their criterion is lower by very strong evidence.
+    Fractional orders predict better only if their residuals are 1 % smaller than those of the best integer orders, and
+    significantly over the folds. They are also eligible if they predict as well and their criterion is much lower.
     """
     whole = [k for k in _peer_indices(ranked) if not is_fractional(ranked[k].structure)]
     other = [k for k in near if is_fractional(ranked[k].structure)]
@@ -374,7 +374,7 @@ def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[lis
 
 
 def _predicts_better(trial: Trial, other: Trial) -> bool:
-    """Whether a trial leaves 1 % less than another one, beyond the scatter over the folds."""
+    """Whether the residuals of a trial are smaller than another's by 1 %, and significantly over folds."""
     apart = np.array(trial.scores) - np.array(other.scores)
     if apart.size < MIN_SCATTER_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
         return False

@@ -63,9 +63,9 @@ class FeedbackTest:
     Parameters
     ----------
     state
-        ``"command"``: the input was made beforehand, or its own past determines it. ``"none"``: nothing comes back.
-        ``"found"``: past outputs determine what is new in the input. An input that was read with noise looks alike.
-        ``"undecided"``: the reason is in ``reason``.
+        ``"command"``: the input repeats itself, has few levels, or is determined by its own past. ``"none"``: no
+        feedback. ``"found"``: past outputs explain innovations of the input, as they do if it was measured with noise.
+        ``"undecided"``: see ``reason``.
     reason
         Reason in words; empty if there is none.
     ratio
@@ -75,9 +75,9 @@ class FeedbackTest:
     rows
         Rows that were tested.
     bias
-        Largest bias that the answer can make of a parameter, in its standard errors; None if it is not known.
+        Largest bias of a parameter by the feedback, in its standard errors; None if it is not known.
     response
-        Part of the input that answers the residuals, one array per run in the unit of the input; empty unless found.
+        Part of the input that past residuals explain, one array per run in the unit of the input; empty unless found.
     """
 
     state: FeedbackState
@@ -90,7 +90,7 @@ class FeedbackTest:
 
     @property
     def has_feedback(self) -> bool:
-        """Whether the input answers the output."""
+        """Whether the input depends on past outputs."""
         return self.state == "found"
 
     def to_dict(self) -> dict[str, Any]:
@@ -425,9 +425,9 @@ class _Innovations:
         return result("found")
 
     def _present_ratio(self, clipped: Floats) -> float:
-        """Statistic over its limit of the output's innovation of the same row, which an integral controller answers.
+        """Statistic over its limit of the output's innovation of the same row, for integral controllers.
 
-        Such an input shows in its own past all that it answered before, so that past outputs add nothing to it.
+        The past of such an input contains the past outputs already, so that they explain no more of it.
         """
         size = max(robust_deviation(self.present), 1e-300)
         present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)
