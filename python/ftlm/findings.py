@@ -377,9 +377,9 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "interval_open": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "the interval of {sides} is unbounded: with all other parameters refitted the cost never rises "
-        "significantly; {remedy}",
-        "the interval of {parameter} is unbounded",
+        "unbounded intervals ({sides}): with all other parameters refitted the cost never rises significantly; "
+        "{remedy}",
+        "unbounded intervals: {parameter}",
     ),
     "number_vague": _rule("vague", LEVEL_WITH_CARE, "poorly identifiable from the runs: {shown}"),
     "coefficient_law_broken": FindingKind(

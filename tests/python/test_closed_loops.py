@@ -364,10 +364,10 @@ def test_a_reference_is_told(tmp_path):
     words += ["--reference", "r", "--report", str(tmp_path / "r.html"), "--verbose"]
     said = CliRunner().invoke(cli.app, words)
     assert said.exit_code == 0, said.output
-    assert "instrument: what of the inputs follows r" in said.output.replace("\n", " ")
+    assert "instrument: the part of the inputs that r explains" in said.output.replace("\n", " ")
     # The loop is known, so its colour is no reason.
     assert said.output.startswith("WITH CARE: the model was not validated on another run")
-    assert "instrument: what of the inputs follows it" in (tmp_path / "r.html").read_text()
+    assert "instrument: the part of the inputs that it explains" in (tmp_path / "r.html").read_text()
 
 
 def test_a_weak_reference_is_named():

@@ -223,7 +223,7 @@ def test_a_second_record_decides_the_verdict():
     assert found.validate(arc(2)).verdict.level == "trust"
     assert found.validate(arc(1)).verdict.level == "with care"
     other = ftlm.FrequencyData.from_arrays(W, 1.2 * circuits_of_arc(), name="older")
-    assert "of its own data and 16.7 % of older" in found.validate(other).verdict.reason
+    assert "of the estimation data and 16.7 % of older" in found.validate(other).verdict.reason
 
 
 def test_weights_are_what_they_are_called():
@@ -569,7 +569,8 @@ def test_data_are_never_changed():
     ("options", "error", "words"),
     [
         ({"structure": 3}, ftlm.ModelError, r"structure is int; give an equation"),
-        ({"structure": "D^0.5 U = 2 I"}, ftlm.ModelError, r"nothing is free"),
+        ({"structure": "R0 - p(R1, CPE1)"}, ftlm.ModelError, r"is a circuit; give its equation, such as 'D\^alpha U"),
+        ({"structure": "D^0.5 U = 2 I"}, ftlm.ModelError, r"no parameter is free"),
         ({"structure": "D^2 U = a U - fc*sign(D U) + b I"}, ftlm.ModelError, r"have friction, which a frequency resp"),
         ({"structure": "D U = a U + b sat(I, 3)"}, ftlm.ModelError, r"I saturates or has a dead zone, which a frequ"),
         ({"structure": "D U = a U + b I + c"}, ftlm.ModelError, r"have an offset, which a frequency response does not"),

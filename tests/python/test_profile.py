@@ -256,7 +256,7 @@ def test_terminal_json_frame_page_and_file_say_the_same(found: ftlm.Identificati
     text = found.details()
     assert f"−∞ to {own.high:.6g}" in text
     assert "but those written out: by profile likelihood" in text
-    assert [w for w in found.warnings if "do not bound c below" in w]
+    assert [w for w in found.warnings if "unbounded intervals (c below" in w]
     assert not [w for w in found.warnings if "coefficient c = " in w]
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["intervals"]["c"] == [None, own.high]

@@ -495,7 +495,8 @@ def test_none_wins_that_fails_where_another_does_not():
     said = _reason(steady, steady, [steady, failing])
     assert "steady (5 parameters, validation fit 75.00 %), which predicts best" in said
     assert said.endswith(
-        "failing leaves 25 % less on the mean and is not chosen: it fails on y of run 3, with < -1000 % where the "
+        "failing has 25 % smaller residuals on the mean and is not chosen: it fails on y of run 3, with < -1000 "
+        "% where the "
         "chosen one has 60.00."
     )
     # It is none of the best with more numbers either.

@@ -144,7 +144,7 @@ def test_any_known_parameter_gives_the_same_arm(fitted: ftlm.Identification) -> 
 @pytest.mark.parametrize(
     ("known", "words"),
     [
-        ({}, "one a stage must be known"),
+        ({}, "one per stage must be known"),
         ({"J11": 1.0}, "'J11' is no physical parameter"),
         ({"J_11": 1.0, "K_s1": 2.0}, "one too many"),
         ({"J_11": -1.0}, "is not positive"),

@@ -216,7 +216,7 @@ def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, chec
     late = replace(found.model, structure=found.model.structure.with_delays({"u": 0.1}))
     for name, low, high, reason in (
         ("delay_u", -math.inf, 0.3, ""),  # it may well be 0
-        ("delay_u", 0.05, math.inf, "the runs do not bound delay_u"),
+        ("delay_u", 0.05, math.inf, "unbounded intervals: delay_u"),
         ("alpha", 1.5, math.inf, f"poorly identifiable from the runs: alpha = {found.orders['alpha']:.3g} ± "),
     ):
         open_ended = replace(found.fit, profiles={name: ProfileInterval(low, high, 0.95)})
