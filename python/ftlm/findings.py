@@ -52,47 +52,54 @@ class Topic:
 #: Topics by name, most serious first within a level.
 FINDING_TOPICS: dict[str, Topic] = {
     "unstable": Topic(
-        "the free run grows without bound",
-        "leave out the term that pushes, bound its coefficient, or, in a closed loop, name what drives it with "
-        "{ask[reference]}",
+        "the simulation grows without bound",
+        "leave out the term that makes it unstable, bound its coefficient, or, in a closed loop, name the "
+        "reference signal with {ask[reference]}",
     ),
-    "range": Topic("the free run leaves the range of numbers", "take other orders, or fewer terms"),
+    "range": Topic("the simulation overflows", "choose other orders, or fewer terms"),
     "unseen": Topic(
-        "the runs do not tell some numbers apart", "leave a term out, fix one of them, or record a richer input"
+        "some parameters are not separately identifiable from the runs",
+        "leave a term out, fix one of them, or record a richer input",
     ),
     "identity": Topic(
         "its equation nearly says that an output equals itself", "keep own orders well below the highest one"
     ),
     "useless": Topic(
-        "the free run explains little of an output",
-        "add what drives it, a delay or a term",
+        "the simulation explains little of an output",
+        "add a missing input, a delay or a term",
         "or use {ask[method is output-error]}",
         "output-error",
     ),
-    "lost": Topic("it predicts other runs worse than its own", "fewer free numbers, or more runs in one fit"),
-    "offset": Topic("a constant is missing, or hidden", "{ask[offset is constant]} or {ask[offset is auto]}"),
-    "loop": Topic("the runs were made in a closed loop", "name what drives the loop with {ask[reference]}, or open it"),
-    "instrument": Topic("what drives the loop tells little of its input", "record a stronger reference"),
-    "untold": Topic("the runs do not tell a number at all", "fix it, leave it out, or record a richer input"),
-    "residuals": Topic("the model leaves something out", "add a term, a delay or a free order; ftlm select compares"),
-    "provisional": Topic("the fit is provisional", "give {ask[start]} another result, or fewer free numbers"),
-    "vague": Topic("the runs hardly tell some numbers", "fix a number, leave a term out, or record a richer input"),
-    "rough": Topic("some intervals are rough", "{ask[intervals is profile]} finds them"),
+    "lost": Topic(
+        "the model predicts other runs worse than its own", "use fewer free parameters, or more runs in one fit"
+    ),
+    "offset": Topic("a constant is missing, or not identifiable", "{ask[offset is constant]} or {ask[offset is auto]}"),
+    "loop": Topic(
+        "the runs were recorded in a closed loop", "name the reference signal with {ask[reference]}, or open the loop"
+    ),
+    "instrument": Topic("the reference explains little of the input", "record a stronger reference"),
+    "untold": Topic("a parameter is not identifiable from the runs", "fix it, leave it out, or record a richer input"),
+    "residuals": Topic("the model is incomplete", "add a term, a delay or a free order; ftlm select compares them"),
+    "provisional": Topic("the fit is provisional", "give {ask[start]} another result, or free fewer parameters"),
+    "vague": Topic(
+        "some parameters are poorly determined", "fix a parameter, leave a term out, or record a richer input"
+    ),
+    "rough": Topic("some intervals are approximate", "{ask[intervals is profile]} computes them"),
     "step": Topic("the sampling is coarse for this model", "sample faster, raise m, or trust its fast poles less"),
     "prior": Topic(
-        "the prior pulls its coefficients",
+        "the prior shifts the coefficients",
         "raise {ask[prior_covariance]}, or use {ask[method is least-squares]}",
     ),
-    "law": Topic("it breaks the law of its coefficients", "", "use {ask[method is output-error]}", "output-error"),
-    "edge": Topic("an order or a number is on its bound", "widen the bound"),
+    "law": Topic("the coefficient law is violated", "", "use {ask[method is output-error]}", "output-error"),
+    "edge": Topic("an order or another parameter is on its bound", "widen the bound"),
     "search": Topic("the table of orders", "record a longer run, or fix an order"),
-    "history": Topic("what the run did before its start counts", "begin the run at rest"),
-    "samples": Topic("the samples harm the figures", "see the warning"),
-    "same": Topic("a validation run is one of its own", "give another run"),
-    "errors": Topic("nothing says how sure its numbers are", "", "use {ask[method is output-error]}", "output-error"),
-    "validation": Topic("how well it predicts other data is not known"),
-    "noise": Topic("the noise has a colour"),
-    "other": Topic("to know"),
+    "history": Topic("the result depends on initial conditions", "begin the run at rest"),
+    "samples": Topic("some samples are unreliable", "see the warning"),
+    "same": Topic("a validation run is an estimation run", "give another run"),
+    "errors": Topic("the parameters have no standard errors", "", "use {ask[method is output-error]}", "output-error"),
+    "validation": Topic("the prediction of other data is not known"),
+    "noise": Topic("the noise is colored"),
+    "other": Topic("note"),
 }
 #: Texts of Python and of the command line by name, for templates.
 INTERFACE_TEXTS = {
@@ -142,144 +149,146 @@ def _rule(topic: str, level: str, text: str, remedy: str = "") -> FindingKind:
     return FindingKind(topic, level, text, text, remedy)
 
 
-_LEFT_OUT = "it leaves something out"
 #: The catalogue by code.
 FINDING_CATALOGUE: dict[str, FindingKind] = {
     # Simulation
     "free_run_grows": FindingKind(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "the model is {stability}: its free run grows without bound, however well it fits a run of this length",
-        "the free run grows without bound ({poles})",
+        "the model is {stability}: its simulation grows without bound, however well it fits a run of this length",
+        "the simulation grows without bound ({poles})",
     ),
     "plant_unstable": FindingKind(
         "unstable",
         LEVEL_FACT,
-        "the model is unstable, and so is the plant: free runs that start anew every {seconds:.2g} s explain "
-        "{fit:.3g} % of the outputs, and the outputs stay bounded as a controller holds them",
-        remedy="record how the controller moves it, and validate on short pieces",
+        "the model is unstable, and so is the plant: simulations restarted every {seconds:.2g} s explain "
+        "{fit:.3g} % of the outputs, and the outputs stay bounded as under a controller",
+        remedy="record the reference signal of the controller, and validate on short pieces",
     ),
     "plant_unstable_in_pieces": FindingKind(
         "loop",
         LEVEL_WITH_CARE,
-        "the model is unstable, and so is the plant, which a controller holds: free runs that start anew every "
-        "{seconds:.2g} s explain {fit:.3g} % of the outputs, though that of a whole run grows; noise that the "
-        "controller feeds back biases this method",
-        "the plant is unstable, as the model is: free runs that start anew every {seconds:.2g} s explain {fit:.3g} %",
+        "the model is unstable, and so is the plant, which a controller stabilizes: simulations restarted "
+        "every {seconds:.2g} s explain {fit:.3g} % of the outputs, while that of a whole run grows; noise in "
+        "the feedback biases this method",
+        "the plant is unstable, as the model is: simulations restarted every {seconds:.2g} s explain {fit:.3g} %",
         "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, which "
         "noise does not bias",
     ),
     "plant_needs_pieces": FindingKind(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "no free run of a whole run follows this plant, which is unstable and held by a controller: least squares at "
-        "these orders gives an unstable model whose free runs, started anew every {seconds:.2g} s, explain {fit:.3g} %",
-        "the plant is unstable and held by a controller, and no free run of a whole run follows it",
+        "no simulation of a whole run follows this plant, which is unstable and stabilized by a controller: "
+        "least squares at these orders gives an unstable model whose simulations, restarted every "
+        "{seconds:.2g} s, explain {fit:.3g} %",
+        "the plant is unstable and stabilized by a controller, and no simulation of a whole run follows it",
         "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, or use "
         "{ask[method is least-squares]}, which noise in the loop biases",
     ),
     "growth_not_told": FindingKind(
         "unstable",
         LEVEL_FACT,
-        "the model is {stability}, but not significantly: its standard errors do not tell its growth from none",
-        remedy="leave the term out that makes it grow, or record a longer run",
+        "the model is {stability}, but not significantly: stability is within its standard errors",
+        remedy="leave the unstable term out, or record a longer run",
     ),
-    "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether its free run grows cannot be told"),
+    "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether the simulation grows is unknown"),
     "unstable_optimum_kept": FindingKind(
         "unstable",
         LEVEL_WITH_CARE,
-        "the free run of this optimum grows; the best stable one found has residuals {excess:.2g} % larger, which the "
-        "runs refuse at 99 %: an unstable machine in a closed loop, or a term that is missing",
+        "this optimum is unstable; the best stable one found has residuals {excess:.2g} % larger, which is "
+        "significant at 99 %: the machine is unstable in a closed loop, or a term is missing",
     ),
     "no_stable_optimum": FindingKind(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "no stable optimum was found beside this one, whose free run grows",
+        "this optimum is unstable, and no stable one was found",
     ),
     "unstable_optimum_discarded": FindingKind(
         "other",
         LEVEL_FACT,
-        "an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the run did "
-        "before its start takes a growing mode away until its end; the stable one was kept",
+        "an optimum that is not stable has residuals {smaller:.2g} % smaller, which is not significant: the "
+        "free initial conditions cancel its growing mode until the end of the run; the stable one was kept",
     ),
     "damping_not_told": FindingKind(
         "untold",
         LEVEL_WITH_CARE,
-        "an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the run did "
-        "before its start takes a growing mode away until its end|; the stable one was kept, which stands where free "
-        "runs begin to grow: the runs do not tell its damping",
+        "an optimum that is not stable has residuals {smaller:.2g} % smaller, which is not significant: the "
+        "free initial conditions cancel its growing mode until the end of the run|; the stable one was kept, "
+        "which is on the limit of stability: its damping is not identifiable from the runs",
     ),
     "instruments_unstable": FindingKind(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "{output}: the free run of these coefficients is unstable|; do not trust them",
+        "{output}: the simulation with these coefficients is unstable|; do not use them",
     ),
     "swing_may_not_decay": _rule(
         "untold",
         LEVEL_WITH_CARE,
-        "a swing of {frequency:.4g} rad/s may never die away (damping {damping:.2g}{spread})",
-        "add the term that damps it, or record until it has died away",
+        "an oscillation at {frequency:.4g} rad/s may not decay (damping {damping:.2g}{spread})",
+        "add the term that damps it, or record until it has decayed",
     ),
     "out_of_range": FindingKind(
         "range",
         LEVEL_DO_NOT_USE,
-        "{output}: the free run leaves the range of numbers, so its residuals cannot be tested",
-        "the free run leaves the range of numbers",
+        "{output}: the simulation overflows, so its residuals cannot be tested",
+        "the simulation overflows",
     ),
     "equation_says_identity": FindingKind(
         "identity",
         LEVEL_DO_NOT_USE,
-        "{output}: {orders} close to alpha = {alpha:g}, so the equation nearly says that {output} equals itself|; its "
-        "free run has NR {nr:.3g} against {equation_nr:.3g} for the equation error. Do not use these orders",
+        "{output}: {orders} close to alpha = {alpha:g}, so the equation nearly says that {output} equals "
+        "itself|; its simulation has NR {nr:.3g} against {equation_nr:.3g} for the equation error. Do not "
+        "use these orders",
         "its equation nearly says that an output equals itself",
     ),
     "flattered_by_equation_error": FindingKind(
         "useless",
         LEVEL_DO_NOT_USE,
-        "{output}: the free run| (NR {nr:.3g}) is far worse than the equation error ({equation_nr:.3g}); the equation "
-        "error flatters this model",
+        "{output}: the simulation| (NR {nr:.3g}) is far worse than the equation error ({equation_nr:.3g}), "
+        "which does not measure the quality of this model",
     ),
     "explains_little": FindingKind(
-        "useless", LEVEL_DO_NOT_USE, "{output}: the free run explains little of the output| (NR {nr:.3g})"
+        "useless", LEVEL_DO_NOT_USE, "{output}: the simulation explains little of the output| (NR {nr:.3g})"
     ),
     "buried_in_noise": FindingKind(
         "useless",
         LEVEL_WITH_CARE,
-        "{output}: the noise is larger than what the input moves (NR {nr:.3g}): nothing of the input is left in the "
-        "residuals, so the model misses nothing that this run shows",
-        "{output} is buried in noise (NR {nr:.3g}), and nothing of the input is left in the residuals",
-        "move the input more, record longer, or average repeated runs",
+        "{output}: the noise exceeds the response to the input (NR {nr:.3g}), and the residuals are not "
+        "correlated with the input: this run shows nothing that the model lacks",
+        "{output} is buried in noise (NR {nr:.3g}), and its residuals are not correlated with the input",
+        "excite the input more, record longer, or average repeated runs",
     ),
     "end_row_far_off": FindingKind(
         "useless",
         LEVEL_WITH_CARE,
-        "{output}: its first or its last row lies so far off that the free run explains little of the output (NR "
-        "{nr:.3g}), and {inner:.3g} % of all other rows: an outlier",
-        "the first or the last row of {output} lies far off (NR {nr:.3g}; {inner:.3g} % of the others is explained)",
+        "{output}: its first or last row is an outlier: with it the simulation explains little of the output "
+        "(NR {nr:.3g}), without it {inner:.3g} %",
+        "the first or last row of {output} is an outlier (NR {nr:.3g} with it; {inner:.3g} % of the other "
+        "rows is explained)",
         "cut that row away, or mark it as missing",
     ),
-    "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the free run explains little of {where}{shown}"),
+    "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the simulation explains little of {where}{shown}"),
     "fit_falls": FindingKind(
         "lost",
         LEVEL_WITH_CARE,
-        "the fit of {output} falls from {before:.3g} % on the estimation data to {after:.3g} %|; the model describes "
-        "the data it was identified from better than the machine",
+        "the fit of {output} falls from {before:.3g} % on the estimation data to {after:.3g} %|: the model "
+        "is overfitted to the estimation data",
         "the fit of {output} falls from {before:.3g} to {after:.3g} % on validation{where}",
         prefix="{run}: ",
     ),
     "sampling_coarse": FindingKind(
         "step",
         LEVEL_WITH_CARE,
-        "the free run on {run} still moves with the step at the finest grid: the model is stiffer than these samples "
-        "can show, and its output error is provisional",
+        "the simulation on {run} still depends on the step at the finest grid: the model is too stiff for "
+        "this sampling interval, and its output error is provisional",
     ),
     "mode_sampled_coarsely": FindingKind(
         "step",
         LEVEL_FACT,
-        "a mode of {frequency:.4g} rad/s has {samples:.2g} samples a period|: its parameters depend on the behavior of "
-        "the inputs between samples, as zero- and first-order hold differ there by half a sample, {phase:.0f} degrees, "
-        "and by {loss:.1g} % of gain",
-        remedy="take at least eight samples a period, or state the behavior between samples with {ask[intersample]}",
+        "a mode of {frequency:.4g} rad/s has {samples:.2g} samples per period|: its parameters depend on the "
+        "inputs between samples; zero- and first-order hold differ there by half a sample, {phase:.0f} "
+        "degrees, and by {loss:.1g} % of gain",
+        remedy="take at least eight samples per period, or state the behavior between samples with {ask[intersample]}",
     ),
     "other_intersample_fits": FindingKind(
         "residuals",
@@ -295,33 +304,34 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "scheme_unstable": FindingKind(
         "step",
         LEVEL_WITH_CARE,
-        "{output}: at {m} pulses the discretisation itself is unstable| (margin {margin:.2g}), whether or not the "
-        "model is; raise m",
+        "{output}: with {m} pulses the discretization itself is unstable| (margin {margin:.2g}), whether or "
+        "not the model is; raise m",
     ),
     # Parameters
     "not_told_apart": FindingKind(
         "unseen",
         LEVEL_DO_NOT_USE,
-        "these runs do not tell {parameter} apart: moved together they change nothing that was measured, so their "
-        "intervals are infinite; {remedy}",
-        "the runs do not tell {shown} apart",
+        "not separately identifiable from these runs: {parameter}; changed together they leave the outputs unchanged, "
+        "so their intervals are infinite; {remedy}",
+        "not separately identifiable from the runs: {shown}",
     ),
     "errors_undefined": FindingKind(
         "unseen",
         LEVEL_DO_NOT_USE,
-        "the standard errors of {parameter} are not defined: the fit's covariance is not finite|; nothing is known of "
-        "how sure these numbers are",
+        "the standard errors of {parameter} are not defined: the covariance of the fit is not finite",
     ),
-    "numbers_correlated": FindingKind("vague", LEVEL_FACT, "{parameter} cannot be told apart in these runs| ({why})"),
+    "numbers_correlated": FindingKind(
+        "vague", LEVEL_FACT, "hardly separately identifiable from these runs: {parameter}| ({why})"
+    ),
     "order_not_told": FindingKind(
         "untold",
         LEVEL_WITH_CARE,
-        "order {parameter} cannot be told from these runs: its standard error exceeds its bounds",
+        "order {parameter} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
     "input_number_not_told": FindingKind(
         "untold",
         LEVEL_WITH_CARE,
-        "the {words} cannot be told from these runs: its standard error exceeds its bounds",
+        "the {words} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
     "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
     "genetic_on_bound": FindingKind(
@@ -330,40 +340,41 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "rows_repeat": FindingKind(
         "search",
         LEVEL_FACT,
-        "{rows} rows hold {models} model{plural}: one number added to all free orders leaves an equation from rest as "
-        "it is; give one order as a number, such as the lowest as 0",
+        "{rows} rows hold {models} distinct model{plural}: adding a constant to all free orders does not "
+        "change an equation from rest; give one order as a number, such as the lowest as 0",
         remedy="give one order as a number, such as the lowest as 0",
     ),
     "ranks_alike": FindingKind(
         "search",
         LEVEL_FACT,
-        "ranks 1 to {last}{every} are alike within noise at 99 % ({shown})",
+        "ranks 1 to {last}{every} are equal within noise at 99 % ({shown})",
     ),
     "noise_decides": FindingKind(
         "search",
         LEVEL_WITH_CARE,
-        "noise decides: ranks 1 to {last}{every} are alike at 99 % ({shown}), so the run does not tell these orders",
-        "noise decides: ranks 1 to {last} are alike ({shown})",
+        "noise decides the ranking: ranks 1 to {last}{every} are equal within noise at 99 % ({shown}), so "
+        "these orders are not identifiable from the run",
+        "noise decides the ranking: ranks 1 to {last} are equal within noise ({shown})",
     ),
     "certified_run_grows": FindingKind(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "the free run of these orders grows without bound ({poles} poles with a positive real part, NR {nr:.3g}): the "
-        "certificate bounds the equation error, not the error of a simulation",
+        "the simulation with these orders grows without bound ({poles} poles with a positive real part, NR "
+        "{nr:.3g}): the certificate bounds the equation error, not the error of a simulation",
         remedy="use {ask[method is output-error]}",
     ),
     "certified_run_fails": FindingKind(
         "useless",
         LEVEL_DO_NOT_USE,
-        "the free run of these orders explains little of the output (NR {nr:.3g}): the certificate bounds the equation "
-        "error, not the error of a simulation",
+        "the simulation with these orders explains little of the output (NR {nr:.3g}): the certificate "
+        "bounds the equation error, not the error of a simulation",
         remedy="use {ask[method is output-error]}",
     ),
     "rank_not_judged": FindingKind(
         "search",
         LEVEL_WITH_CARE,
-        "rank 1 cannot be judged: {text}",
-        "rank 1 cannot be judged: {text}",
+        "rank 1 could not be validated: {text}",
+        "rank 1 could not be validated: {text}",
         "identify at these orders",
     ),
     "on_edge": FindingKind(
@@ -372,16 +383,16 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "not_different_from_0": FindingKind(
         "vague",
         LEVEL_FACT,
-        "coefficient {parameter} = {value:.4g} is not different from 0 in these runs| (standard error {error:.3g})",
+        "coefficient {parameter} = {value:.4g} does not differ significantly from 0| (standard error {error:.3g})",
     ),
     "interval_open": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "these runs do not bound {sides}: with all other numbers fitted anew the cost never rises by what noise "
-        "explains; {remedy}",
-        "the runs do not bound {parameter}",
+        "unbounded intervals ({sides}): with all other parameters refitted the cost never rises significantly; "
+        "{remedy}",
+        "unbounded intervals: {parameter}",
     ),
-    "number_vague": _rule("vague", LEVEL_WITH_CARE, "the runs hardly tell {shown}"),
+    "number_vague": _rule("vague", LEVEL_WITH_CARE, "poorly identifiable from the runs: {shown}"),
     "coefficient_law_broken": FindingKind(
         "law",
         LEVEL_WITH_CARE,
@@ -394,9 +405,9 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "prior_pulls": FindingKind(
         "prior",
         LEVEL_WITH_CARE,
-        "{output}: the prior| (K0 = {prior:g}, coefficients near 0) moves a coefficient by {share:.0f} % from what the "
-        "data alone say; p = {length} only weighs the data against it. Raise prior_covariance or use "
-        "{ask[method is least-squares]}",
+        "{output}: the prior| (K0 = {prior:g}, coefficients near 0) shifts a coefficient by {share:.0f} % "
+        "from the estimate without it; p = {length} only weighs the data against it. Raise prior_covariance "
+        "or use {ask[method is least-squares]}",
     ),
     "prior_ranks": FindingKind(
         "prior",
@@ -407,134 +418,135 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "no_standard_errors": _rule(
         "errors",
         LEVEL_WITH_CARE,
-        "{method} gives no standard errors, so nothing says how sure its numbers are",
+        "{method} gives no standard errors, so the uncertainty of the parameters is unknown",
     ),
     "intervals_rough": FindingKind(
         "rough",
         LEVEL_FACT,
-        "the cost is no parabola along {parameter}, and its profile there would take long: these intervals are rough|; "
-        "{remedy}",
+        "the cost is not quadratic along {parameter}, and its profile would take long: these intervals are "
+        "approximate|; {remedy}",
     ),
     # Fit
     "not_converged": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "the fit ended before it stood still|; its figures are provisional",
-        "the fit ended before it stood still",
+        "the fit has not converged|; its results are provisional",
+        "the fit has not converged",
     ),
     "instruments_not_converged": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "{output}: instrumental variables did not stand still in {iterations} steps|; the coefficients are those of "
-        "the least output error met. Too much noise for these terms: {remedy}",
+        "{output}: instrumental variables did not converge in {iterations} steps|; the coefficients are "
+        "those of the smallest output error found. Too much noise for these terms: {remedy}",
         remedy="use {ask[method is output-error]}",
     ),
     "lower_optimum_found": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "none of {starts} starts led to this optimum, but the search for intervals did| (residuals {before} before, "
-        "{after} now): there may be others",
+        "none of the {starts} initial guesses led to this optimum, but the search for intervals did| "
+        "(residuals {before} before, {after} now): there may be others",
     ),
     "second_optimum": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
         "a second optimum explains the data as well (log likelihood smaller by {difference:.2g}): {shown}",
         "a second optimum explains the data as well: {shown}",
-        "fix or bound one of these, or record what tells the two apart",
+        "fix or bound one of these, or record data that distinguish the two",
     ),
     "seeds_disagree": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "{output}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}|; it has not found "
-        "the optimum of each",
+        "{output}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}|; not every "
+        "seed has found the optimum",
     ),
     "step_moves_estimate": FindingKind(
         "step",
         LEVEL_WITH_CARE,
-        "at {pulses} pulses a sample the step still moves estimates by over a tenth of their standard errors: the "
-        "model is stiffer than the sampling|; sample faster or trust its fast poles less",
+        "at {pulses} pulses per sample the step still changes estimates by over a tenth of their standard "
+        "errors: the model is too stiff for the sampling|; sample faster or trust its fast poles less",
     ),
     "step_bias": FindingKind(
         "step",
         LEVEL_WITH_CARE,
-        "at {m} pulses the step alone moves coefficient {parameter} by {amount} standard errors, which do not count "
-        "it|; {finer}use {ask[method is output-error]}, which refines the step",
+        "with {m} pulses the step alone changes coefficient {parameter} by {amount} standard errors, which "
+        "do not include it|; {finer}use {ask[method is output-error]}, which refines the step",
     ),
     # Residuals
     "residuals_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "residuals of {output} are not white: the model leaves something out|; standard errors allow for the colour, "
-        "not for the bias of what is left out",
-        f"residuals of {{output}} are not white: {_LEFT_OUT}",
+        "residuals of {output} are not white: the model is incomplete|; standard errors include the color of "
+        "the residuals, not the bias of missing terms",
+        "residuals of {output} are not white: the model is incomplete",
     ),
     "noise_coloured": FindingKind(
         "noise",
         LEVEL_FACT,
-        "residuals of {output} are not white, and follow no input: the noise has a colour, for which standard errors "
-        "allow",
+        "residuals of {output} are not white but independent of the inputs: the noise is colored, and "
+        "standard errors include that",
     ),
     "output_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output}: residuals are not white| (statistic {statistic:.3g} over {lags} lags, 99 % limit {limit:.3g}): the "
-        "model leaves something out",
+        "{output}: residuals are not white| (statistic {statistic:.3g} over {lags} lags, 99 % limit "
+        "{limit:.3g}): the model is incomplete",
     ),
     "residuals_follow_input": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output}: residuals still follow {input}| (correlation {value:.2g} at lag {lag}, 99 % limit {limit:.2g}): not "
-        "all of what {input} does is in the model",
-        f"residuals of {{shown}}: {_LEFT_OUT}",
+        "{output}: residuals are correlated with {input}| (correlation {value:.2g} at lag {lag}, 99 % limit "
+        "{limit:.2g}): part of the effect of {input} is not modeled",
+        "residuals are correlated with inputs ({shown}): the model is incomplete",
     ),
     "coupling_missing": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output}: residuals follow {input} (correlation {value:.2g} at lag {lag}, 99 % limit {limit:.2g}), which no "
-        "equation reads: what it drives acts on {output} too",
-        "{output} follows {input}, which no equation reads",
-        "add a term of {input}; of the flexible link {ask[cross_stage is torques]} adds the other link, and "
+        "{output}: residuals are correlated with {input} (correlation {value:.2g} at lag {lag}, 99 % limit "
+        "{limit:.2g}), which is in no equation but acts on {output}",
+        "{output} depends on {input}, which is in no equation",
+        "add a term of {input}; for the flexible link {ask[cross_stage is torques]} adds the other link, and "
         "{ask[friction]} the dry friction of the hubs",
     ),
     "arm_leaves_out": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "residual tests show dynamics that are not modeled, and the equations of the flexible link leave out {parts}",
-        "the equations of the flexible link leave out {parts}",
+        "residual tests show dynamics that are not modeled, and the equations of the flexible link omit {parts}",
+        "the equations of the flexible link omit {parts}",
         "{ask[coupling is simulated]} with {ask[friction]} adds the dry friction of the hubs, and "
         "{ask[cross_stage is inertial]} the other link",
     ),
     "follow_undecided": FindingKind(
         "other",
         LEVEL_FACT,
-        "{output}: whether residuals follow {input} is undecided: its limit is {limit:.3g}: too few samples for "
-        "residuals of this colour; give a longer run",
+        "{output}: whether residuals are correlated with {input} is undecided: the limit is {limit:.3g}, "
+        "because the samples are too few for residuals of this color; give a longer run",
     ),
     "follow_undecided_still": FindingKind(
         "other",
         LEVEL_FACT,
-        "{output}: whether residuals follow {input} is undecided: {input} does not move; give a run in which it does",
+        "{output}: whether residuals are correlated with {input} is undecided: {input} is constant; give a "
+        "run in which it changes",
     ),
     "loop_found": FindingKind(
         "loop",
         LEVEL_WITH_CARE,
-        "{output}: {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
-        "noise: a closed loop, and the noise that comes back with {input} biases estimates{effect}, which their "
-        "intervals do not know; record what drives the loop and name it with {ask[reference]}, or open the loop",
-        "{input} answers {output}, a closed loop, and what comes back biases the numbers",
+        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or "
+        "was measured with noise: a closed loop, whose noise in {input} biases estimates{effect} beyond "
+        "their intervals; record the reference signal and name it with {ask[reference]}, or open the loop",
+        "{input} depends on past values of {output}: a closed loop, which biases the estimates",
     ),
     "loop_harmless": FindingKind(
         "loop",
         LEVEL_FACT,
-        "{output}: {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
-        "noise: a closed loop, which moves estimates of output error{effect} alone; those of equation-error methods "
-        "are biased",
+        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or "
+        "was measured with noise: a closed loop, which changes output-error estimates{effect} only; "
+        "equation-error estimates are biased",
     ),
     "moves_within_row": FindingKind(
         "loop",
         LEVEL_FACT,
-        "{output}: residuals follow {input} of the same row alone (correlation {value:.2g}): {input} answers {output} "
-        "within a row, or feeds through to it directly: then add that term",
+        "{output}: residuals are correlated with {input} of the same row only (correlation {value:.2g}): "
+        "{input} depends on {output} within a row, or has direct feedthrough to it; then add that term",
     ),
     "too_short_for_tests": _rule(
         "residuals", LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run"
@@ -542,28 +554,28 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "reference_weak": FindingKind(
         "instrument",
         LEVEL_WITH_CARE,
-        "{reference} says little of {input} beside the noise in it| (F = {f:.2g}, {needed:g} are needed): a weak "
-        "instrument, with which estimates are biased and their intervals too narrow; move the reference more, or "
-        "longer",
+        "{reference} explains little of {input} beside the noise in it| (F = {f:.2g}, {needed:g} are "
+        "needed): a weak instrument, with which estimates are biased and their intervals too narrow; excite "
+        "the reference more, or longer",
     ),
     # Offset and start
     "offset_missing": FindingKind(
         "offset",
         LEVEL_WITH_CARE,
-        "an unknown constant in the equation of {output} explains {share:.2g} % of what the model misses| ({test}): a "
-        "sensor's zero, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
+        "an unknown constant in the equation of {output} explains {share:.2g} % of the residuals| ({test}): "
+        "a sensor's zero, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
     ),
     "constant_instead_of_past": FindingKind(
         "offset",
         LEVEL_FACT,
-        "what {output} did before the runs is estimated with {terms} powers of time|; an unknown constant in the "
-        "equation explains as much with {fewer} numbers fewer: if a sensor's zero, a load or a mean may be there, "
-        "{ask[offset is auto]} estimates it",
+        "the initial conditions of {output} are estimated with {terms} powers of time|; an unknown constant "
+        "in the equation explains as much with {fewer} parameters fewer: if a sensor's zero, a load or a "
+        "mean may be there, {ask[offset is auto]} estimates it",
     ),
     "offset_hidden": _rule(
         "history",
         LEVEL_WITH_CARE,
-        "the offset of {shown} is not told apart from what a run did before its start",
+        "the offset of {shown} is not separately identifiable from the initial conditions",
     ),
     "rests_at_level": FindingKind(
         "other",
@@ -575,16 +587,16 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "level_estimated": FindingKind(
         "other",
         LEVEL_FACT,
-        "{output} does not start at zero, and a level that is added to it explains the runs better than what came "
-        "before them alone|: the plant {was} about a level of its own before the start; {ask[offset]} and "
+        "{output} does not start at zero, and a level of the output explains the runs better than initial "
+        "terms alone|: the plant {was} about a level of its own before the start; {ask[offset]} and "
         "{ask[initial]} overrule it",
         prefix="{run}: ",
     ),
     "rest_assumed": FindingKind(
         "history",
         LEVEL_WITH_CARE,
-        "{input} is constant from row {row} on, so nothing tells whether the plant rested before|: the gain assumes "
-        "that it rested at {shown}; if it was moving, the gain is not determined",
+        "{input} is constant from row {row} on, so the state of the plant before the run is unknown|: the "
+        "gain assumes that it rested at {shown}; if it was moving, the gain is not determined",
         "{input} is constant from row {row} on: the gain assumes that the plant rested at {shown} before",
         "record some rows before the step, or a second step",
         prefix="{run}: ",
@@ -592,11 +604,11 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "start_not_told": FindingKind(
         "history",
         LEVEL_WITH_CARE,
-        "the initial state cannot be told|: if the run begins {taken}, the gain of {output} from {input} is "
-        "{gain:.4g} ± {error:.2g}; if it begins {other}, it is {other_gain:.4g} ± {other_error:.2g}, with {ratio:.3g} "
-        "times the sum of squared residuals",
-        "the initial state cannot be told: the gain of {output} from {input} is {gain:.4g} if the run begins {taken}, "
-        "and {other_gain:.4g} if it begins {other}",
+        "the initial state is not identifiable|: if the run begins {taken}, the gain of {output} from "
+        "{input} is {gain:.4g} ± {error:.2g}; if it begins {other}, it is {other_gain:.4g} ± "
+        "{other_error:.2g}, with {ratio:.3g} times the sum of squared residuals",
+        "the initial state is not identifiable: the gain of {output} from {input} is {gain:.4g} if the run "
+        "begins {taken}, and {other_gain:.4g} if it begins {other}",
         "record some rows before an input changes, or give {ask[initial]} and {ask[offset]}",
         prefix="{run}: ",
     ),
@@ -613,59 +625,62 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "looked_like_rest": FindingKind(
         "history",
         LEVEL_FACT,
-        "{run}: the first values look like rest, but the residuals of a fit from rest ask for what was before|; "
-        "{ask[initial is history]} was used",
+        "{run}: the first values look like rest, but the residuals of a fit from rest show nonzero initial "
+        "conditions|; {ask[initial is history]} was used",
     ),
     "simulated_from_rest": FindingKind(
         "history",
         LEVEL_WITH_CARE,
-        "{run} starts at zero and is simulated from rest, but what that leaves over dies away like motion from before "
-        "the start|; give the model's structure {ask[initial is history]} to have that estimated",
+        "{run} starts at zero and is simulated from rest, but the residuals decay like motion from before "
+        "the start|; give the model's structure {ask[initial is history]} to estimate it",
     ),
     # Data
     "outliers": FindingKind(
         "samples",
         LEVEL_FACT,
-        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one, {first}: {noun}, "
-        "or moments that the model does not explain|; squares let them cost precision: {ask[loss is huber]} weighs "
-        "them down",
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one, {first}: "
+        "{noun}, or events that are not modeled|; least squares lose precision by them: {ask[loss is huber]} "
+        "reduces their weight",
     ),
     "outliers_dominate": FindingKind(
         "samples",
         LEVEL_WITH_CARE,
-        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one and {holds} "
-        "{power:.0f} % of their squares, {first}: {noun}, or moments that the model does not explain|; squares let "
-        "them cost precision: {ask[loss is huber]} weighs them down",
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one and "
+        "{holds} {power:.0f} % of their squares, {first}: {noun}, or events that are not modeled|; least "
+        "squares lose precision by them: {ask[loss is huber]} reduces their weight",
     ),
     "quantised": FindingKind(
         "samples",
         LEVEL_WITH_CARE,
-        "{output} is quantised in steps of {step:.3g} in {run}, and its residuals are {noise:.3g}: rounding, which "
-        "repeats where the signal does and is no noise|; intervals do not allow for it; use a finer converter or scale",
+        "{output} is quantized in steps of {step:.3g} in {run}, and its residuals are {noise:.3g}: rounding "
+        "errors, which repeat with the signal and are not noise|; intervals do not include them; use a finer "
+        "converter or scale",
     ),
     "times_not_honoured": FindingKind(
         "samples",
         LEVEL_WITH_CARE,
-        "{run}: outputs were read at times of their own, but a free delay, or signals taken behind a sensor filter, "
-        "need them on a grid: straight lines were drawn between them, and the intervals do not know what that costs",
+        "{run}: outputs have sample times of their own, but a free delay, or signals behind a sensor filter, "
+        "require a regular grid: outputs were interpolated linearly, and the intervals do not include that "
+        "error",
     ),
     "friction_unsigned": FindingKind(
         "samples",
         LEVEL_WITH_CARE,
-        "the velocity of {output} never changes its sign in a run: while it slides, friction is a constant like the "
-        "offset, and only the rests tell them apart|; add a run that moves both ways, or use {ask[offset is none]}",
+        "the velocity of {output} never changes its sign in a run: while it slides, friction is a constant "
+        "like the offset, and only phases at rest distinguish them|; add a run that moves both ways, or use "
+        "{ask[offset is none]}",
     ),
     "stribeck_slow_untold": FindingKind(
         "untold",
         LEVEL_WITH_CARE,
-        "{output} moves at less than {ratio:g} vs = {speed:.3g} per s in {slow} of {total} intervals: nothing tells "
-        "fs and vs, what is seen of friction is fc alone|; add a run that creeps, or leave the Stribeck term out",
+        "{output} moves at less than {ratio:g} vs = {speed:.3g} per s in {slow} of {total} intervals: fs and "
+        "vs are not identifiable, only fc|; add a run that creeps, or leave the Stribeck term out",
     ),
     "stribeck_fast_untold": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "{output} never moves faster than vs = {speed:.3g} per s: what is seen of friction is fc and fs together|; add "
-        "a run that slides faster, or leave the Stribeck term out",
+        "{output} never moves faster than vs = {speed:.3g} per s: fc and fs are not separately "
+        "identifiable|; add a run that slides faster, or leave the Stribeck term out",
     ),
     "rig_stopped": FindingKind(
         "samples",
@@ -679,13 +694,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "twin": FindingKind(
         "samples",
         LEVEL_WITH_CARE,
-        "{other} and {signal} hold the same number in every row: one of them is the wrong column",
+        "{other} and {signal} have equal values in every row: one of them is the wrong column",
     ),
     "constant_input": FindingKind(
         "samples",
         LEVEL_FACT,
-        "input {input} is {level} in all {rows} rows: it excites nothing but one transient from the start; record its "
-        "command, or a run in which it moves",
+        "input {input} is {level} in all {rows} rows: it excites only one transient at the start; record its "
+        "command, or a run in which it changes",
     ),
     "constant_output": FindingKind(
         "samples",
@@ -726,20 +741,22 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "one_sine": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "input {input} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it fixes two numbers of "
-        "an equation and no more; add frequencies (square, PRBS, multisine, chirp), or use this run for validation",
+        "input {input} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it determines "
+        "two parameters of an equation; add frequencies (square, PRBS, multisine, chirp), or use this run "
+        "for validation",
     ),
     "inputs_collinear": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "inputs {other} and {input} move together (correlation {correlation:.4f}): an equation that reads both cannot "
-        "tell their effects apart; drive them one after the other, or by different signals",
+        "inputs {other} and {input} are collinear (correlation {correlation:.4f}): their effects are not "
+        "separately identifiable; excite them one after the other, or by different signals",
     ),
     "excitation_short": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "the equation of {output} has {free} free numbers, but {listed} fixes {known} in steady state: what the run "
-        "tells beyond them comes from its start alone|; add frequencies to the input, or fix orders or coefficients",
+        "the equation of {output} has {free} free parameters, but {listed} determines {known} in steady "
+        "state: the others depend on its transient at the start|; add frequencies to the input, or fix "
+        "orders or coefficients",
     ),
     "few_rows": FindingKind(
         "vague",
@@ -749,27 +766,28 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "short": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "output {output} passes its mean {times} in {duration:.4g} s and is still moving at the end: the run is "
-        "shorter than what dominates it; record several times its slowest period",
+        "output {output} passes its mean {times} in {duration:.4g} s and is still moving at the end: the run "
+        "is shorter than the dominant period; record several times its slowest period",
     ),
     "loop_in_data": FindingKind(
         "loop",
         LEVEL_FACT,
-        "input {input} answers what {output} did before (statistic {ratio:.3g} times its limit), or was read with "
-        "noise: a closed loop, in which equation-error estimates are biased; use the output error, and if you can a "
-        "reference that moves the machine well",
+        "input {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or was "
+        "measured with noise: a closed loop, in which equation-error estimates are biased; use the output "
+        "error, and if possible a reference that excites the machine well",
     ),
     "loop_not_told": FindingKind(
         "loop",
         LEVEL_FACT,
-        "whether input {input} answers output {output} cannot be told: {reason}; if a controller made it, name what "
-        "drives the loop with {ask[reference]}",
+        "whether input {input} depends on past values of output {output} is undecided: {reason}; if a "
+        "controller generated it, name the reference signal with {ask[reference]}",
     ),
     "drift": FindingKind(
         "samples",
         LEVEL_WITH_CARE,
-        "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation) beside what the inputs "
-        "explain; let the sensor settle, or have the line estimated with the model: {ask[offset is ramp]}",
+        "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation), which the "
+        "inputs do not explain; let the sensor settle, or estimate the line with the model: {ask[offset is "
+        "ramp]}",
         remedy="{ask[offset is ramp]} estimates a linear trend with the model",
     ),
     "starts_off_zero": FindingKind(
@@ -790,31 +808,31 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "validates_itself": FindingKind(
         "same",
         LEVEL_FACT,
-        "its outputs are those of {other}, which the model was identified from; it validates nothing",
+        "its outputs are those of {other}, which the model was identified from, so it is no validation",
         prefix="{run}: ",
     ),
     "run_of_its_own": FindingKind(
         "same",
         LEVEL_FACT,
-        "it has the name of a run that the model was identified from",
+        "it has the name of a run from which the model was identified",
         prefix="{run}: ",
     ),
     "not_validated": _rule(
         "validation",
         LEVEL_WITH_CARE,
-        "no run that it was not fitted to has been tried",
+        "the model was not validated on another run",
         "{choose[validate]}",
     ),
     "origin_unknown": _rule(
         "validation",
         LEVEL_WITH_CARE,
-        "its file says nothing of how it was identified",
+        "the model file does not say how it was identified",
         "compare it with measured runs",
     ),
     "sentences_alone": _rule(
         "validation",
         LEVEL_WITH_CARE,
-        "its file is of an earlier version, whose warnings are sentences that are not judged",
+        "the model file is of an earlier version, whose warnings have no levels",
         "identify it again",
     ),
     "earlier_sentence": FindingKind("other", LEVEL_NOTE, "{text}"),
@@ -822,117 +840,116 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "response_missed": _rule(
         "useless",
         LEVEL_DO_NOT_USE,
-        "it misses {rms:.3g} % of {output} from {input} ({run})",
+        "the residuals are {rms:.3g} % of {output} from {input} ({run})",
         "add a term, a delay or a free order",
     ),
     "response_grows": _rule(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "its free run grows without bound ({poles})",
-        "measure a wider band, bound the coefficient that pushes, or take fewer terms",
+        "the simulation grows without bound ({poles})",
+        "measure a wider band, bound the coefficient that makes it unstable, or use fewer terms",
     ),
     "response_lost": _rule(
         "lost",
         LEVEL_WITH_CARE,
-        "it misses {own:.3g} % of its own data and {rms:.3g} % of {run}",
-        "fewer free numbers, or both records in one fit",
+        "the residuals are {own:.3g} % of the estimation data and {rms:.3g} % of {run}",
+        "use fewer free parameters, or both records in one fit",
     ),
     "response_not_validated": _rule(
         "validation",
         LEVEL_WITH_CARE,
-        "no response that it was not fitted to has been tried",
+        "the model was not validated on another response",
         "{choose[validate response]}",
     ),
     "deviations_exceeded": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "residuals are {ratio:.3g} times the standard deviations that the data state (99 %): the model leaves "
-        "something out, or they are too small|; intervals are widened to what is left over",
-        "residuals are {ratio:.3g} times the standard deviations that the data state (99 %): the model leaves "
-        "something out, or they are too small",
+        "residuals are {ratio:.3g} times the standard deviations of the data (99 %): the model is "
+        "incomplete, or the standard deviations are too small|; intervals are widened accordingly",
+        "residuals are {ratio:.3g} times the standard deviations of the data (99 %): the model is "
+        "incomplete, or the standard deviations are too small",
     ),
     "response_not_white": _rule(
         "residuals",
         LEVEL_WITH_CARE,
-        "residuals are not white: from one frequency to the next they follow each other, so the model leaves something "
-        "out",
+        "residuals at neighboring frequencies are correlated: the model is incomplete",
     ),
-    "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit ended before it stood still"),
+    "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit has not converged"),
     "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "an order or a delay is on its bound: {bound}"),
     "response_not_told_apart": FindingKind(
         "unseen",
         LEVEL_DO_NOT_USE,
-        "moved together they change nothing: {parameter}; leave a term out, or fix one of them",
-        "moved together they change nothing: {parameter}",
+        "not separately identifiable from the data: {parameter}; leave a term out, or fix one of them",
+        "not separately identifiable from the data: {parameter}",
     ),
     "response_number_vague": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "the data hardly tell {parameter} = {value:.4g} ± {error:.2g}; fix it, or leave it out",
-        "the data hardly tell {parameter} = {value:.4g} ± {error:.2g}",
+        "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}; fix it, or leave it out",
+        "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}",
     ),
     # Selection, consistency, design
     "other_optimum": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "from automatic starts the chosen structure fits {output} better than where it was judged: another optimum; "
-        ".best is that one",
+        "from automatic initial guesses the chosen structure fits {output} better than in the "
+        "cross-validation: another optimum, which is .best",
     ),
     "none_is_the_machine": FindingKind(
         "useless",
         LEVEL_DO_NOT_USE,
-        "the best candidate predicts unseen runs with {fit} %: none of them is the machine",
+        "the best candidate predicts validation data with {fit} %: no candidate describes the machine",
     ),
     "worse_than_mean": FindingKind(
         "lost",
         LEVEL_WITH_CARE,
-        "the chosen structure predicts worse than the mean of what was left out on {parts}",
+        "the chosen structure predicts worse than the mean of the validation data on {parts}",
     ),
     "fractional_orders_gain": FindingKind(
         "other",
         LEVEL_FACT,
-        "fractional orders earn their place ({parameter}): on {parts} that were not fitted they gain {gain:.2g} points "
-        "of fit over {other}, and no part loses",
+        "fractional orders improve the prediction significantly ({parameter}): on {parts} of validation data "
+        "they gain {gain:.2g} points of fit over {other}, and no part loses",
     ),
     "fractional_orders_gain_nothing": FindingKind(
         "other",
         LEVEL_FACT,
-        "fractional orders gain nothing that counts ({parameter}): {gain:.2g} points of fit over {other}, on {parts} "
-        "that were not fitted",
+        "fractional orders do not improve the prediction significantly ({parameter}): {gain:.2g} points of "
+        "fit over {other}, on {parts} of validation data",
     ),
     "fractional_orders_not_told": FindingKind(
         "other",
         LEVEL_FACT,
-        "whether fractional orders earn their place ({parameter}) cannot be told: {reason}",
+        "whether fractional orders improve the prediction ({parameter}) is undecided: {reason}",
     ),
     "not_told_by_part": FindingKind(
-        "untold", LEVEL_FACT, "{parameter}: not told by some part, so any other agrees with it"
+        "untold",
+        LEVEL_FACT,
+        "{parameter}: not identifiable from some part, so it agrees with every value of the others",
     ),
     "parts_differ_by_delay": _rule(
         "residuals",
         LEVEL_WITH_CARE,
-        "{run} differs by a delay: with its inputs {shown} the model of {other} leaves {after:.3g} % of {output} "
-        "instead of {before:.3g} %",
+        "{run} differs by a delay: with its inputs {shown} the residuals of the model of {other} are "
+        "{after:.3g} % of {output} instead of {before:.3g} %",
         "shift the rows of that run, or give its input a delay",
     ),
-    "part_not_converged": FindingKind(
-        "provisional", LEVEL_WITH_CARE, "the fit ended before it stood still", prefix="{run}: "
-    ),
+    "part_not_converged": FindingKind("provisional", LEVEL_WITH_CARE, "the fit has not converged", prefix="{run}: "),
     "parts_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "residuals are not white: the structure leaves something out, which parts that are excited in other ways may "
-        "answer with other numbers; then it is the structure and not the machine that changes",
+        "residuals are not white: the structure is incomplete, and parts with other excitation may give "
+        "other parameters; then the structure is wrong, and the machine has not changed",
     ),
     "prediction_in_doubt": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "the standard errors are predicted for a model that is right, and of this one it is said: {text}",
-        "the standard errors are predicted for a model that leaves something out",
+        "the predicted standard errors assume a right model, and a finding on this one says: {text}",
+        "the predicted standard errors assume a complete model, and this one is incomplete",
         "add what it leaves out, identify again, and design on that model",
     ),
     "designed_for_white_noise": FindingKind(
-        "residuals", LEVEL_FACT, "predicted for white noise, and of the model it is said: {text}"
+        "residuals", LEVEL_FACT, "predicted for white noise, and a finding on the model says: {text}"
     ),
 }
 

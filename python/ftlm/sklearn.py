@@ -138,7 +138,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
             before = len(self._fitted)
             X = np.concatenate([self._fitted, X])
         rows = len(X)
-        # A free run needs a few instants; what is held beyond the last row changes nothing before it.
+        # A simulation needs a few instants; what is held beyond the last row changes nothing before it.
         X = np.concatenate([X, np.repeat(X[-1:], max(3 - rows, 0), axis=0)])
         run = self._run(X, np.zeros((len(X), len(self._outputs))), "predict")
         free = self.model_.simulate(run, initial={o: {} for o in self._outputs})

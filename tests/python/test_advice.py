@@ -139,11 +139,11 @@ def test_free_numbers_are_counted_against_lines():
         u = sum(np.sin(w * t) for w in waves)
         clean = plant.simulate(made(0.005, u, 0 * t), tolerance=1e-3)
         run = made(0.005, u, clean["y"] + 1e-3 * rng.standard_normal(t.size))
-        said = [f.sentence for f in run.advice(wanted) if "free numbers" in f.sentence]
+        said = [f.sentence for f in run.advice(wanted) if "free parameters" in f.sentence]
         assert bool(said) is not enough, waves
         if said:
-            assert f"has 5 free numbers, but u fixes {2 * len(waves)} in steady state" in said[0]
-        assert not [f for f in run.advice(plant.structure) if "free numbers" in f.sentence]
+            assert f"has 5 free parameters, but u determines {2 * len(waves)} in steady state" in said[0]
+        assert not [f for f in run.advice(plant.structure) if "free parameters" in f.sentence]
     arm = ftlm.flexible_link(form="published", stage=1)
     still = ftlm.Run.from_arrays(step=0.005, inputs={"I1": 0 * t + 1}, outputs={"theta11": t, "theta12": t**0.5})
     assert len([f for f in still.advice(arm) if "fixes 1 in steady state" in f.sentence]) == 2
@@ -157,7 +157,7 @@ def test_inputs_that_move_together_are_named():
     other = np.repeat(rng.choice([-1.0, 1.0], 60), 30)
     for second, expected in ((-2 * u, True), (other, False)):
         run = ftlm.Run.from_arrays(step=0.1, inputs={"u": u, "v": second}, outputs={"y": y})
-        assert any("move together" in f.sentence for f in run.advice()) is expected
+        assert any("are collinear" in f.sentence for f in run.advice()) is expected
 
 
 def test_short_runs_are_named(small_model):

@@ -158,10 +158,10 @@ def test_settings_that_mean_nothing_are_refused(options, message):
 
 def test_what_cannot_be_done_is_said(small_run, monkeypatch):
     structure = ftlm.equation(EQUATION)
-    with pytest.raises(ftlm.ModelError, match="bounds of 'q': there is no such number; free are alpha, nu, a, c, b"):
+    with pytest.raises(ftlm.ModelError, match="bounds of 'q': not a free parameter; free are alpha, nu, a, c, b"):
         ftlm.identify(small_run, structure, method=ftlm.GeneticAlgorithm(bounds={"q": (0, 1)}))
     late = small_run.window(2.0, None)
-    with pytest.raises(ftlm.ModelError, match="knows no initial terms and needs runs that start at rest"):
+    with pytest.raises(ftlm.ModelError, match="does not estimate initial terms and needs runs that start at rest"):
         ftlm.identify(late, structure, method=ftlm.GeneticAlgorithm(evaluations=400))
     monkeypatch.setitem(sys.modules, "pygad", None)
     with pytest.raises(ftlm.ModelError, match=r"pip install 'ftlm\[genetic\]'"):

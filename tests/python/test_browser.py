@@ -208,7 +208,7 @@ def test_a_slider_reads_out_measured_and_simulated(browser, folder, width):
     with Opened(browser, folder / "fit.html", viewport={"width": width, "height": 900}) as opened:
         page = opened.page
         kept = np.load(folder / "fit.npz")
-        page.get_by_role("heading", name="on the runs that were fitted").click()
+        page.get_by_role("heading", name="Estimation: measured and simulated").click()
         slide = page.locator(".slide").filter(has=page.get_by_label(re.compile("estimation: run"))).first
         every = page.locator(".slide")
         assert every.count() == 2

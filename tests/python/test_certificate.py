@@ -93,7 +93,7 @@ def test_several_runs_of_their_own_steps_and_threads(run, equation, proved):
 def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
     text = str(proved)
     assert "no orders with alpha from 1.3 to 1.8, beta from 0.5 to 0.9" in text
-    assert "on a lattice or between" in text
+    assert "on the order grid or between" in text
     assert f"{proved.cells} boxes" in text
     assert "asked" not in text
     cut = ftlm.certify_orders(run, equation, LATTICE, tolerance=0.05, m=128, max_cells=proved.cells - 1)

@@ -50,9 +50,9 @@ def test_a_loop_is_found_and_weighs_what_it_moves(kind, state, code):
 def test_the_warning_names_the_way_out():
     found = ftlm.identify(loops.loop("closed, coloured, strong", 1), STRUCTURE)
     (said,) = [f for f in found.findings if f.code == "loop_found"]
-    assert said.text.startswith("y: u answers what y did before")
+    assert said.text.startswith("y: u depends on past values of y")
     assert "name it with reference=" in said.text
-    assert "name what drives the loop with reference=" in said.remedy
+    assert "name the reference signal with reference=" in said.remedy
 
 
 #: Plants as numerator and denominator in s, of loops.STEP; inputs and noises of open loops by name.
@@ -204,7 +204,7 @@ def test_an_integral_controller_is_no_command(gain, deviation, colour, every):
     # Its own past holds all that it answered before: the noise of the same row alone is new.
     for seed in range(3):
         u, noise = integral_loop(seed, gain, deviation, colour, every)
-        assert feedback_test([noise], [u]).state in ("found", "cannot be told")
+        assert feedback_test([noise], [u]).state in ("found", "undecided")
 
 
 def test_several_short_runs_are_pooled():
@@ -236,11 +236,11 @@ def test_two_inputs_beside_each_other():
 @pytest.mark.parametrize(
     ("u", "state", "reason"),
     [
-        (np.zeros(500), "cannot be told", "does not move"),
-        (np.ones(100), "cannot be told", "runs of 100 rows; 150 are needed"),
+        (np.zeros(500), "undecided", "is constant"),
+        (np.ones(100), "undecided", "runs of 100 rows; 150 are needed"),
         (np.sign(np.sin(np.arange(500) * 2 * np.pi / 50 + 0.1)), "command", "repeats itself exactly"),
-        (np.repeat([0.0, 1.0, 0.5, 2.0, -1.0, 3.0, 0.2, -2.0, 0.7, 0.1], 50), "cannot be told", "changes"),
-        (np.sign(np.random.default_rng(1).standard_normal(500)), "cannot be told", "a relay switches"),
+        (np.repeat([0.0, 1.0, 0.5, 2.0, -1.0, 3.0, 0.2, -2.0, 0.7, 0.1], 50), "undecided", "changes"),
+        (np.sign(np.random.default_rng(1).standard_normal(500)), "undecided", "a relay"),
         (np.sin(np.arange(500) * 0.1) + np.sin(np.arange(500) * 0.037), "command", "its own past determines it"),
     ],
 )
@@ -364,10 +364,10 @@ def test_a_reference_is_told(tmp_path):
     words += ["--reference", "r", "--report", str(tmp_path / "r.html"), "--verbose"]
     said = CliRunner().invoke(cli.app, words)
     assert said.exit_code == 0, said.output
-    assert "instrument: what of the inputs follows r" in said.output.replace("\n", " ")
+    assert "instrument: the part of the inputs that r explains" in said.output.replace("\n", " ")
     # The loop is known, so its colour is no reason.
-    assert said.output.startswith("WITH CARE: no run that it was not fitted to has been tried")
-    assert "instrument: what of the inputs follows it" in (tmp_path / "r.html").read_text()
+    assert said.output.startswith("WITH CARE: the model was not validated on another run")
+    assert "instrument: the part of the inputs that it explains" in (tmp_path / "r.html").read_text()
 
 
 def test_a_weak_reference_is_named():

@@ -45,11 +45,17 @@ def test_a_model_without_covariance_has_no_band(found):
 
 def test_the_page_shows_unseen_runs_with_their_band_first(found, tmp_path):
     text = found.report(tmp_path / "r.html", validation=run(2)).read_text(encoding="utf-8")
-    heads = ["on runs that were not fitted</h2>", "Equations</h2>", "Warnings</h2>", "Residuals</h2>", "Settings</h2>"]
+    heads = [
+        "Validation: measured and simulated</h2>",
+        "Equations</h2>",
+        "Warnings</h2>",
+        "Residuals</h2>",
+        "Settings</h2>",
+    ]
     places = [text.index(head) for head in heads]
     assert places == sorted(places)
     assert text.count("95 % confidence band of the simulation") == 1
     assert text.index('<details class="part">') > places[2]
     alone = found.report(tmp_path / "alone.html").read_text(encoding="utf-8")
-    assert "on runs that were not fitted" not in alone
+    assert "Validation: measured and simulated" not in alone
     assert "95 % confidence band of the simulation" not in alone

@@ -326,7 +326,7 @@ BAD = {
     "tolerance of 0": (MODEL, "tolerance = 0 is not positive", lambda: model().simulate(run(), tolerance=0)),
     "unstable model": (
         CONVERGENCE,
-        "the free run of y leaves the range of numbers",
+        "the simulation of y overflows",
         lambda: model("D y = 90 y + u").simulate(run(step=1.0)),
     ),
     "dependent regressors": (

@@ -1,5 +1,6 @@
 """Models in other tools: python-control within its stated error, MATLAB and JSON text, frames; names stay inert."""
 
+import contextlib
 import json
 import re
 import subprocess
@@ -124,8 +125,47 @@ def test_models_of_integer_orders_become_exact_transfer_functions_and_come_back(
         late = np.exp(-1j * w * np.array([[delay.get("u", 0.0)], [0.0]]))
         exact = np.reshape(system(1j * w), (1, 2, -1)) * late
         np.testing.assert_allclose(exact, one.frequency_response(w), rtol=1e-12)
+        with pytest.warns(UserWarning, match="the delay of u") if delay else contextlib.nullcontext():
+            states = one.to_ss()
+        assert states.nstates == order
+        assert states.delay == delay
+        np.testing.assert_allclose(np.reshape(states(1j * w), (1, 2, -1)) * late, one.frequency_response(w), rtol=1e-9)
         back = ftlm.Model.from_control(system)
         np.testing.assert_allclose(back.frequency_response(w), np.reshape(system(1j * w), (1, 2, -1)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3, 0.04, 0.27])
+def test_a_sampled_state_space_simulates_held_inputs_and_their_delays(delay):
+    import control
+
+    words = "D^2 y = -3 y - 0.6 D y + 2 z + 0.5 D^2 u + u\nD z = -z + 2 v - y"
+    options = {"coupling": "simulated", "initial": "rest", "delay": {"u": delay} if delay else {}}
+    one = ftlm.Model(ftlm.equation(words, **options))
+    rng = np.random.default_rng(3)
+    signals = {n: np.repeat(rng.standard_normal(20), 5) for n in "uv"}
+    run = ftlm.Run.from_arrays(step=0.1, inputs=signals, outputs={n: np.zeros(100) for n in "yz"})
+    exact = one.simulate(run)
+    system = one.to_ss(step=0.1)
+    assert system.nstates == 3 + int(np.ceil(delay / 0.1 - 1e-9))
+    assert system.dt == 0.1
+    found = control.forced_response(system, inputs=np.stack([signals[n] for n in system.input_labels]))
+    for k, name in enumerate(system.output_labels):
+        np.testing.assert_allclose(found.outputs[k], exact[name], atol=1e-8)
+
+
+def test_a_state_space_carries_the_sensor_filter_and_refuses_what_it_is_not():
+    w = np.geomspace(0.1, 100, 9)
+    seen = model("D^2 y = -D y - 4 y + u", sensor_filter=ftlm.SensorFilter.low_pass(["y"]))
+    np.testing.assert_allclose(seen.to_ss()(1j * w), seen.frequency_response(w)[0, 0], rtol=1e-10)
+    for text, options, words in (
+        ("D^1.5 y = -y + u", {}, r"order 1\.5 is no whole number"),
+        ("D^2 y = -D y + u - sign(D y)", {}, "has friction"),
+        ("D y = -y + u", {"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "the input u passes a sensor filter"),
+    ):
+        with pytest.raises(ftlm.ModelError, match=words):
+            model(text, **options).to_ss()
+    with pytest.raises(ftlm.DataError, match="step"):
+        seen.to_ss(step=-1.0)
 
 
 def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_not():

@@ -169,7 +169,7 @@ def test_deviations_that_are_too_small_are_found_out_and_intervals_widened():
     assert honest.warnings == ()
     boast = ftlm.identify_frequency(arc(1, deviation=0.002 * np.abs(exact)), ARC)
     assert boast.chi_squared == pytest.approx(25 * honest.chi_squared)
-    assert "times the standard deviations that the data state" in boast.warnings[0]
+    assert "times the standard deviations of the data" in boast.warnings[0]
     for name in TRUTH:
         assert boast.standard_errors[name] > 0.7 * honest.standard_errors[name]
 
@@ -188,7 +188,7 @@ def test_numbers_that_move_together_are_named():
     words = "D^alpha y = a0 y + b0 u + b1 D^0 u"
     found = ftlm.identify_frequency(ftlm.FrequencyData.from_arrays(W, circuits.cpe(W, 2.0, 0.7)), words)
     assert not math.isfinite(found.standard_errors["b0"])
-    assert any(w.startswith("moved together they change nothing: b0, b1") for w in found.warnings)
+    assert any(w.startswith("not separately identifiable from the data: b0, b1") for w in found.warnings)
     assert found.verdict.level == "do not use"
     assert json.dumps(found.to_dict(), allow_nan=False)
     assert found.model.estimate.covariance is None
@@ -219,11 +219,11 @@ def test_a_number_that_another_hides_is_said_and_their_ratio_holds():
 
 def test_a_second_record_decides_the_verdict():
     found = ftlm.identify_frequency(arc(1), ARC)
-    assert "has been tried" in found.verdict.reason
+    assert "was not validated" in found.verdict.reason
     assert found.validate(arc(2)).verdict.level == "trust"
     assert found.validate(arc(1)).verdict.level == "with care"
     other = ftlm.FrequencyData.from_arrays(W, 1.2 * circuits_of_arc(), name="older")
-    assert "of its own data and 16.7 % of older" in found.validate(other).verdict.reason
+    assert "of the estimation data and 16.7 % of older" in found.validate(other).verdict.reason
 
 
 def test_weights_are_what_they_are_called():
@@ -400,7 +400,7 @@ def test_the_model_runs_over_time_as_the_circuit_does(tmp_path):
 def test_it_prints_draws_and_reports(tmp_path):
     found = ftlm.identify_frequency(arc(1), ARC)
     text = str(found)
-    assert text.splitlines()[0].startswith("WITH CARE: no response that it was not fitted to has been tried")
+    assert text.splitlines()[0].startswith("WITH CARE: the model was not validated on another response")
     assert "V/A" in text
     assert "alpha" in text
     assert len(text.splitlines()) < 30
@@ -442,6 +442,7 @@ DECIBELS = 20 * np.log10(np.abs(Z))
 #: Header, columns, how it is written, what must be said; all hold the same spectrum.
 STRANGERS = {
     "Zreal Zimag": (("Freq", "Zreal", "Zimag"), (F, Z.real, Z.imag), {}, "'Freq' taken for Hz"),
+    "Zreal Zimg": (("Freq/Hz", "Zreal/Ohm", "Zimg/Ohm"), (F, Z.real, Z.imag), {}, None),
     "potentiostat": (
         ("freq/Hz", "Re(Z)/Ohm", "-Im(Z)/Ohm", "|Z|/Ohm", "Phase(Z)/deg"),
         (F, Z.real, -Z.imag, np.abs(Z), DEGREES),
@@ -568,7 +569,8 @@ def test_data_are_never_changed():
     ("options", "error", "words"),
     [
         ({"structure": 3}, ftlm.ModelError, r"structure is int; give an equation"),
-        ({"structure": "D^0.5 U = 2 I"}, ftlm.ModelError, r"nothing is free"),
+        ({"structure": "R0 - p(R1, CPE1)"}, ftlm.ModelError, r"is a circuit; give its equation, such as 'D\^alpha U"),
+        ({"structure": "D^0.5 U = 2 I"}, ftlm.ModelError, r"no parameter is free"),
         ({"structure": "D^2 U = a U - fc*sign(D U) + b I"}, ftlm.ModelError, r"have friction, which a frequency resp"),
         ({"structure": "D U = a U + b sat(I, 3)"}, ftlm.ModelError, r"I saturates or has a dead zone, which a frequ"),
         ({"structure": "D U = a U + b I + c"}, ftlm.ModelError, r"have an offset, which a frequency response does not"),
@@ -607,8 +609,8 @@ def test_too_few_frequencies_and_responses_of_size_0_are_refused():
 @pytest.mark.parametrize(
     ("heads", "words"),
     [
-        (("a", "b", "c"), r"the frequency cannot be told .*known are: none.*the columns are 'a', 'b', 'c'"),
-        (("Hz", "b", "c"), r"real and imaginary part, or magnitude and phase cannot be told .*frequency 'Hz'"),
+        (("a", "b", "c"), r"the frequency cannot be recognized .*recognized: none.*the columns are 'a', 'b', 'c'"),
+        (("Hz", "b", "c"), r"real and imaginary part, or magnitude and phase cannot be recognized .*frequency 'Hz'"),
         (("Hz", "dB", "c"), r"known are: frequency 'Hz', magnitude 'dB'"),
         (
             ("f", "Hz", "dB"),

@@ -332,7 +332,7 @@ def test_results_print_and_are_json(clean_a, plants):
 def test_a_prior_that_pulls_is_named(small_run, structure):
     found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=0.01))
     (warning,) = (w for w in found.warnings if "the prior" in w)
-    assert "y: the prior (K0 = 0.01, coefficients near 0) moves a coefficient by" in warning
+    assert "y: the prior (K0 = 0.01, coefficients near 0) shifts a coefficient by" in warning
     assert "Raise prior_covariance or use method='least-squares'" in warning
     assert "p = 7 only weighs the data against it" in warning
     weak = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=1e6))
@@ -364,7 +364,7 @@ def test_the_papers_prior_on_plant_a_is_named(clean_a, plants):
     assert found.coefficients["a1"] == pytest.approx(1.25, abs=0.01)
     for output in ("theta11", "theta12"):
         assert any(w.startswith(f"{output}: the prior (K0 = 1") for w in found.warnings)
-        assert any(w.startswith(f"{output}: the free run explains little") for w in found.warnings)
+        assert any(w.startswith(f"{output}: the simulation explains little") for w in found.warnings)
 
 
 def test_a_broken_coefficient_law_is_named(clean_a, with_noise, plants):
@@ -400,7 +400,7 @@ def test_orders_on_the_edge_and_facts_about_the_run_are_repeated(small_run):
     assert any(w.startswith(f"run {resampled.name}: resampled from 0.02 s to 0.04 s") for w in found.warnings)
 
 
-def test_a_discretisation_that_is_itself_unstable_is_named():
+def test_a_discretization_that_is_itself_unstable_is_named():
     # D^2 y = -c y at pulses wider than sqrt(12/c): the scheme's Nyquist mode grows, whether or not the model does.
     n = 401
     u = np.where(np.arange(n) % 100 < 50, 1.0, -1.0)
@@ -410,10 +410,12 @@ def test_a_discretisation_that_is_itself_unstable_is_named():
     words = ftlm.equation("D^2 y = -2000 y - 60 D y + b u")
     coarse, fine = (ftlm.identify(run, words, method="least-squares", m=m) for m in (100, 400))
     assert _core.nyquist_margin([(-2000.0, 2.0), (-60.0, 1.0)], 0.08) == pytest.approx(1 - 2000 * 0.08**2 / 12)
-    (warning,) = (w for w in coarse.warnings if "discretisation" in w)
-    assert warning.startswith("y: at 100 pulses the discretisation itself is unstable (margin -0.067), whether or not")
+    (warning,) = (w for w in coarse.warnings if "discretization" in w)
+    assert warning.startswith(
+        "y: with 100 pulses the discretization itself is unstable (margin -0.067), whether or not"
+    )
     assert "raise m" in warning
-    assert not any("discretisation" in w for w in fine.warnings)
+    assert not any("discretization" in w for w in fine.warnings)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -192,7 +192,7 @@ def test_a_step_is_the_closed_form_and_so_is_its_band():
     assert found.deviation[0, 0] == pytest.approx(0.1 * np.abs(slope), abs=2e-5)
     theirs = control.step_response(control.tf([3.0], [1.0, 2.0]), t).outputs
     assert found.values[0, 0] == pytest.approx(theirs, abs=2e-5)
-    assert "at the end 1.49" in str(found)
+    assert "final value 1.49" in str(found)
     assert "<svg" in found._repr_html_()
     assert "95 % band" in found._repr_html_()
 

@@ -25,6 +25,9 @@ from test_strangers import command
         (["inputVoltage", "outputVoltage"], (["inputVoltage"], ["outputVoltage"])),
         (["Strom (A)", "Kanal 2"], (["Strom (A)"], ["Kanal 2"])),
         (["Channel A", "Temperature"], (["Channel A"], ["Temperature"])),
+        # A reference neither enters a plant nor leaves it, and a measured current stands for its command.
+        (["Im1_cmd_A", "Im1_meas_A", "Im2_cmd_A", "th1_ref", "th1"], (["Im1_meas_A", "Im2_cmd_A"], ["th1"])),
+        (["ref", "y"], (["ref"], ["y"])),
         # Nothing is guessed where names leave anything open.
         (["CH1", "CH2"], ([], [])),
         (["Voltage_0", "Voltage_1"], ([], [])),
@@ -158,7 +161,8 @@ def test_a_spectrum_is_called_one(tmp_path, names):
     path.write_text(names + "\n" + "".join(f"{k + 1},{k * k + 2},{k + 3}\n" for k in range(9)))
     opened = ftlm.open_file(path)
     assert "frequency response or an impedance spectrum" in opened.problem
-    assert "ftlm identify-frequency" in str(opened)
+    assert "ftlm.identify_frequency(ftlm.load_frequency(path)" in str(opened)
+    assert "ftlm identify-frequency" in command("open", str(path)).stdout
     # With a time it is a run whose columns have odd names.
     assert "spectrum" not in ftlm.open_file(path, step=0.1).problem
 

@@ -117,7 +117,7 @@ def test_a_certificate_names_a_free_run_that_grows():
     grows = model.stability().unstable_poles > 0
     assert grows or not proof.free_run_nr <= 0.5
     assert [f.code for f in proof.findings] == ["certified_run_grows" if grows else "certified_run_fails"]
-    assert "! the free run" in str(proof)
+    assert "! the simulation" in str(proof)
 
 
 def test_a_certificate_of_a_good_model_says_nothing_more():

@@ -80,7 +80,7 @@ def test_what_cannot_be_drawn_is_said(found, small_model):
         (lambda: ftlm.plot.fit("x"), "result is str"),
         (lambda: ftlm.plot.residuals(replace(found, residuals=None)), "too short"),
         (lambda: ftlm.plot.residuals(3), "tests is int"),
-        (lambda: ftlm.plot.landscape(replace(found, searches={})), "searched no lattice"),
+        (lambda: ftlm.plot.landscape(replace(found, searches={})), "searched no order grid"),
         (lambda: ftlm.plot.landscape(found, "z"), "there is no search 'z'; there are y"),
         (lambda: ftlm.plot.landscape(found.model), "result is Model"),
         (lambda: ftlm.plot.bode(None), "model is NoneType"),
@@ -217,7 +217,7 @@ def test_every_picture_draws_into_axes_that_are_given(joint, small_run):
         axes = figure.subplots(1, count)
         assert draw(axes) is figure
         assert all(a.has_data() for a in np.atleast_1d(axes))
-        with pytest.raises(ftlm.errors.ModelError, match=rf"this picture has {count} axes .* ax has {count + 1}"):
+        with pytest.raises(ftlm.errors.ModelError, match=rf"this figure has {count} axes .* ax has {count + 1}"):
             draw(Figure().subplots(1, count + 1))
         with pytest.raises(ftlm.errors.ModelError, match="ax holds str, which is no matplotlib axes"):
             draw("axes")

@@ -256,7 +256,7 @@ def test_terminal_json_frame_page_and_file_say_the_same(found: ftlm.Identificati
     text = found.details()
     assert f"−∞ to {own.high:.6g}" in text
     assert "but those written out: by profile likelihood" in text
-    assert [w for w in found.warnings if "do not bound c below" in w]
+    assert [w for w in found.warnings if "unbounded intervals (c below" in w]
     assert not [w for w in found.warnings if "coefficient c = " in w]
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["intervals"]["c"] == [None, own.high]
@@ -347,7 +347,7 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     structure = found.task.structure
     short = ftlm.identify(bent, structure)
     assert "c" not in short.profiles
-    (said,) = [w for w in short.warnings if "its profile there would take long" in w]
+    (said,) = [w for w in short.warnings if "its profile would take long" in w]
     assert "along c" in said
     assert "intervals='profile'" in said
     half = 1.959963984540054 * short.standard_errors["c"]
@@ -477,7 +477,7 @@ def test_delays_and_orders_are_held_where_they_are_profiled() -> None:
 
 def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification) -> None:
     structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
-    with pytest.raises(ftlm.ModelError, match="'e', nor 1 more is no free number of this fit; it has c, a, b"):
+    with pytest.raises(ftlm.ModelError, match="'e', nor 1 more is no free parameter of this fit; it has c, a, b"):
         found.profile("e", "f")
     for level in (0.0, 1.0, 95, math.nan):
         with pytest.raises(ftlm.ModelError, match="is no probability between 0 and 1"):

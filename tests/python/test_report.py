@@ -149,7 +149,7 @@ def test_page_says_what_it_must(page, identified):
     for name in ("M", "initial terms", "estimator"):
         assert name in text
     assert "standard error" in text  # that there are none
-    heads = [text.index(head) for head in ("on runs that were not fitted", "Equations", "Warnings", "Errors")]
+    heads = [text.index(head) for head in ("Validation: measured and simulated", "Equations", "Warnings", "Errors")]
     assert heads == sorted(heads)
     assert f"{identified.fit_percent['theta12']:.4g}\u00a0%" in text
 
@@ -194,7 +194,7 @@ def test_warnings_come_before_details(tmp_path, identified):
 
 def test_a_validation_that_validates_nothing_is_said(tmp_path, identified, square):
     text = report.identification_page(identified, tmp_path / "p.html", validation=[square]).read_text("utf-8")
-    assert "it validates nothing" in text
+    assert "so it is no validation" in text
 
 
 def test_a_lost_fit_is_said(tmp_path, identified, sine):
@@ -269,7 +269,7 @@ def test_a_saved_model_has_a_report_of_its_own(tmp_path, small_run, small_model,
     assert "95 % interval" in text
     assert {found.standard_errors["alpha"], found.orders["alpha"]} <= {float(v) for v in Page(page).data}
     again = report.model_page(loaded, tmp_path / "again.html", validation=with_noise(small_run, 0.02, 1))
-    assert "it has the name of a run that the model was identified from" in again.read_text("utf-8")
+    assert "it has the name of a run from which the model was identified" in again.read_text("utf-8")
     alone = report.model_page(small_model, tmp_path / "alone.html").read_text("utf-8")
     assert "No validation run was given" in alone
     assert "No standard errors are given" in alone
@@ -458,7 +458,7 @@ def paper_rows(identified):
 def test_paper_table_has_the_papers_columns(identified):
     table = paper_table(paper_rows(identified))
     assert [re.sub("<.*?>", "", c) for c in table.columns[:9]] == ["model", *"γαβμabdg"]
-    assert [text for text, _ in table.groups][3:] == ["equation error", "output error (free run)"]
+    assert [text for text, _ in table.groups][3:] == ["equation error", "output error (simulation)"]
     assert sum(width for _, width in table.groups) == len(table.columns) == 15
     deflection = table.rows[6]
     o, c, comparison = identified.orders, identified.coefficients, identified.comparison
@@ -734,10 +734,10 @@ def test_a_pole_map_has_every_pole_and_its_sector():
     assert f"{lam[0].real:.3g}".replace("-", "−")[:5] in figure.svg
     assert "2 points in the plane" in figure.svg
     assert "|arg s^0.9| < 81 degrees" in figure.caption
-    assert "none is in it" in figure.caption
+    assert "it has no pole" in figure.caption
     (grown,) = pole_charts(ftlm.Model(ftlm.equation("D^2 y = 0.6 D y - 9 y + u")))
     assert grown.title == "Poles in the plane of s"
-    assert "1 of 1 modes in it: the model is not stable" in grown.caption
+    assert "it has 1 of 1 modes, so the model is not stable" in grown.caption
     assert "2 in the shaded sector" in grown.svg
     # A relaxation of fractional order stands on the negative axis.
     (slow,) = pole_charts(ftlm.Model(ftlm.equation("D^0.5 y = -2 y + u")))
@@ -789,7 +789,7 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
         (HOSTILE, [("estimation", own), ("validation", own)]),
     ]
     figures = compared_bars(both)
-    assert [f.title for f in figures] == ["Fit of the free run of θ₁₁", "Fit of the free run of θ₁₂"]
+    assert [f.title for f in figures] == ["Fit of the simulation of θ₁₁", "Fit of the simulation of θ₁₂"]
     assert HOSTILE not in figures[0].svg
     widths = [float(w) for w in re.findall(r'<rect class="shade1"[^>]* width="([\d.]+)"', figures[1].svg)]
     assert widths[0] == widths[1] > 0

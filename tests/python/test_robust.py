@@ -392,8 +392,8 @@ def test_a_known_delay_is_honoured_and_a_free_one_says_what_it_costs() -> None:
     assert known.fit_percent["y"] > 99
     free = ftlm.identify(run, ftlm.equation(FREE, delay={"u": (0.1, 0.3)}))
     assert free.delays["u"] == pytest.approx(0.2, abs=0.02)
-    assert any("straight lines were drawn between them" in w for w in free.warnings)
-    assert not any("straight lines were drawn between them" in w for w in known.warnings)
+    assert any("outputs were interpolated linearly" in w for w in free.warnings)
+    assert not any("outputs were interpolated linearly" in w for w in known.warnings)
 
 
 def test_further_outputs_are_on_the_grid() -> None:
@@ -541,9 +541,9 @@ def test_coarse_steps_of_an_output_are_named() -> None:
     u, y = noisy(5, 0.001)
     step = 0.15 * np.std(y)
     found = ftlm.identify(run_of(u, step * np.round(y / step)), ftlm.equation(FREE))
-    assert [w for w in found.warnings if w.startswith(f"y is quantised in steps of {step:.3g}")]
+    assert [w for w in found.warnings if w.startswith(f"y is quantized in steps of {step:.3g}")]
     fine = ftlm.identify(run_of(u, 1e-4 * np.round(y / 1e-4)), ftlm.equation(FREE))
-    assert not [w for w in fine.warnings if "quantised" in w]
+    assert not [w for w in fine.warnings if "quantized" in w]
     assert quantization_step(np.array([0.0, 0.3, 0.9, 1.5])) == pytest.approx(0.3)
     assert quantization_step(np.random.default_rng(1).standard_normal(500)) == 0.0
     assert quantization_step(np.ones(4)) == 0.0

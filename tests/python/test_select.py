@@ -353,7 +353,7 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(runs, [second] * 10_001)
     with pytest.raises(ftlm.DataError, match="has 40 rows, too few to be cut into 4 blocks"):
         ftlm.select(runs[0].window(0, 0.8), second)
-    with pytest.raises(ftlm.ModelError, match="motor 1 is one of those that are fitted to, which judges nothing"):
+    with pytest.raises(ftlm.ModelError, match="motor 1 is also an estimation run, so it validates nothing"):
         ftlm.select(runs, second, validation=runs[1])
     idle = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": 1e-3 * np.sin(np.arange(300.0))})
     with pytest.raises(ftlm.DataError, match="u is 0 throughout"):
@@ -493,9 +493,10 @@ def test_none_wins_that_fails_where_another_does_not():
     assert _rank_trials([failing, steady]) == [steady, failing]
     assert failing.worst_fold == -3e7
     said = _reason(steady, steady, [steady, failing])
-    assert "steady (5 numbers, 75.00 % where unseen), which predicts best" in said
+    assert "steady (5 parameters, validation fit 75.00 %), which predicts best" in said
     assert said.endswith(
-        "failing leaves 25 % less on the mean and is not chosen: it fails on y of run 3, with < -1000 % where the "
+        "failing has 25 % smaller residuals on the mean and is not chosen: it fails on y of run 3, with < -1000 "
+        "% where the "
         "chosen one has 60.00."
     )
     # It is none of the best with more numbers either.
@@ -539,8 +540,8 @@ def test_the_first_rows_of_a_run_in_motion_are_judged_with_its_own_initial_terms
 
 def test_the_page_and_the_figures(chosen, tmp_path):
     page = chosen.report(tmp_path / "choice.html").read_text("utf-8")
-    assert "What each number is worth" in page
-    assert "not told from 0" in page
+    assert "Fit by number of parameters" in page
+    assert "insignificant" in page
     # What is chosen is a dot on the line, not a line of one point that nobody sees.
     assert "are not finite" not in page
     with pytest.raises(ftlm.DataError, match="exists"):

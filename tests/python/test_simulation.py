@@ -220,7 +220,7 @@ def test_an_unstable_model_says_when_it_leaves_the_range_of_numbers():
         model("D^1 y = 5 y + u").simulate(run)
     # e^(5 t) overflows after 142 s.
     found = re.fullmatch(
-        r"the free run of y leaves the range of numbers ([\d.]+) s into run 'run'; the model is unstable: .*",
+        r"the simulation of y overflows ([\d.]+) s into run 'run'; the model is unstable: .*",
         str(refused.value),
     )
     assert float(found[1]) == pytest.approx(142, abs=2)

@@ -616,7 +616,7 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
     wave = sum(last - first for _, first, last, _ in work.build_evaluator(keeps_course=True).pending_spans())
     for number, (first, last, kind, message) in enumerate(
         [
-            (0, wave + 1, 0, "are cut up otherwise"),
+            (0, wave + 1, 0, "are divided into other blocks"),
             (0, wave, 9, "are no verdicts"),
             (10**9, 10**9 + 1, 0, "it holds"),
         ]

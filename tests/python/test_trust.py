@@ -72,7 +72,11 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
         covariance = joint.covariance.copy()
         covariance[0, 0] = value
         words = texts(identifiability_findings(replace(joint, covariance=covariance), problem))
-        said = "these runs do not tell alpha apart" if value == np.inf else "order alpha cannot be told from these runs"
+        said = (
+            "not separately identifiable from these runs: alpha"
+            if value == np.inf
+            else "order alpha is not identifiable from these runs"
+        )
         assert any(w.startswith(said) for w in words), value
 
 
@@ -96,14 +100,16 @@ def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
     assert said_of(np.full(n, 0.01)) == []
     assert said_of([0.2, *np.full(n - 1, 0.01)]) == []
     listed = f"{', '.join(joint.names[:-1])} and {joint.names[-1]}"
-    assert said_of(np.full(n, 0.2)) == [f"{listed} cannot be told apart in these runs (correlations up to 0.9990)"]
+    assert said_of(np.full(n, 0.2)) == [
+        f"hardly separately identifiable from these runs: {listed} (correlations up to 0.9990)"
+    ]
     assert said_of([0.2, 0.2, *np.full(n - 2, 0.01)]) == [
-        f"{joint.names[0]} and {joint.names[1]} cannot be told apart in these runs (correlation 0.9990)"
+        f"hardly separately identifiable from these runs: {joint.names[0]} and {joint.names[1]} (correlation 0.9990)"
     ]
     lost = [np.inf, np.inf, *np.full(n - 2, 0.01)]
     with np.errstate(invalid="ignore"):
         assert said_of(lost) == [
-            f"{joint.names[0]} and {joint.names[1]} cannot be told apart in these runs "
+            f"hardly separately identifiable from these runs: {joint.names[0]} and {joint.names[1]} "
             "(their standard errors are not finite)"
         ]
 
@@ -116,7 +122,7 @@ def test_one_sine_for_many_numbers_says_so(small_model):
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": clean["u"]}, outputs={"y": y})
     structure = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
     found = ftlm.identify(run, structure)
-    assert said(found, "the equation of y has 5 free numbers, but u fixes 2")
+    assert said(found, "the equation of y has 5 free parameters, but u determines 2")
 
 
 def test_what_is_printed_is_what_compare_says(noisy, tmp_path):

@@ -130,7 +130,7 @@ def test_two_terms_that_are_one_are_told_apart_by_nothing(twice: ftlm.Identifica
     assert twice.intervals["b"] == (-math.inf, math.inf)
     for name, true in (("a", -4.0), ("c", -0.4)):
         assert abs(twice.coefficients[name] - true) < 3 * errors[name] < 0.1 * abs(true)
-    said = [w for w in twice.warnings if "do not tell b, e apart" in w]
+    said = [w for w in twice.warnings if "not separately identifiable from these runs: b, e" in w]
     assert len(said) == 1
     assert "infinite" in said[0]
     assert not [w for w in twice.warnings if "b = " in w or "not defined" in w]

@@ -68,7 +68,7 @@ def test_figures_of_what_cannot_be_compared_are_refused(measured, predicted, mes
 def test_the_true_model_fits_its_own_run(small_model, small_run):
     found = small_model.compare(small_run)
     assert found.m == 256  # that of the identification
-    # What is left is discretisation: 40 ms pulses, and 20 ms ones.
+    # What is left is discretization: 40 ms pulses, and 20 ms ones.
     assert found.fit_percent["y"] > 99.8
     assert found.equation_error["y"].fit > 99.7
     assert found.warnings == ()
@@ -167,9 +167,9 @@ def test_comparison_prints_and_is_json(small_model, small_run, with_noise):
     lines = str(found).splitlines()
     assert lines[0].split() == ["output", "error", "RMSE", "NR", "fit", "%"]
     assert [line.split()[:3] for line in lines[1:3]] == [["y", "equation", "error"], ["y", "output", "error"]]
-    assert lines[3] == "output error over 1026 samples, equation error over 64 block pulses a run"
+    assert lines[3] == "output error over 1026 samples, equation error over 64 block pulses per run"
     means = str(compare_means(small_model, small_run, m=64)).splitlines()
-    assert means[3] == "over 64 block pulses a run"
+    assert means[3] == "over 64 block pulses per run"
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["m"] == 64
     assert document["output_error"]["y"]["fit"] == found.fit_percent["y"]
@@ -233,10 +233,10 @@ def figures(nr):
         ((1.4,), 0.01, 0.04, None),
         ((1.4,), 0.01, 0.06, "order 1.4 is close to alpha = 1.5, so the equation nearly says that y equals itself"),
         ((1.4, 1.3), 0.001, np.inf, "orders 1.4, 1.3 are close to alpha = 1.5"),
-        ((1.4, 1.3), 0.001, np.nan, "its free run has NR nan against 0.001"),
+        ((1.4, 1.3), 0.001, np.nan, "its simulation has NR nan against 0.001"),
         ((1.0,), 0.01, 0.4, None),
-        ((1.0,), 0.01, 0.6, "the free run (NR 0.6) is far worse than the equation error (0.01)"),
-        ((1.0,), 0.4, 0.6, "the free run explains little of the output (NR 0.6)"),
+        ((1.0,), 0.01, 0.6, "the simulation (NR 0.6) is far worse than the equation error (0.01)"),
+        ((1.0,), 0.4, 0.6, "the simulation explains little of the output (NR 0.6)"),
         ((1.0,), np.nan, np.nan, "is far worse than the equation error"),
     ],
 )

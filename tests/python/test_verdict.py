@@ -64,7 +64,7 @@ def checked(found, other):
 def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
     judged = verdict(found, checked)
     assert (judged.level, judged.reasons, judged.trusted) == ("trust", (), True)
-    assert judged.reason.startswith("it predicts runs it was not fitted to (y 99")
+    assert judged.reason.startswith("it predicts validation runs (y 99")
     assert checked.verdict == judged == found.verdict(checked)
     assert found.verdict() == found.verdict
     assert str(checked).startswith("TRUST: ")
@@ -109,9 +109,9 @@ def test_what_no_number_says_speaks_against_a_model(found, checked, doubt):
 
 def test_without_a_validation_nothing_is_trusted(found, run):
     assert found.verdict.level == "with care"
-    assert found.verdict.reasons == ("no run that it was not fitted to has been tried",)
+    assert found.verdict.reasons == ("the model was not validated on another run",)
     # Its own run validates nothing.
-    assert found.validate(run).verdict.reason == "no run that it was not fitted to has been tried"
+    assert found.validate(run).verdict.reason == "the model was not validated on another run"
 
 
 def test_a_missing_mode_is_with_care(other):
@@ -120,7 +120,7 @@ def test_a_missing_mode_is_with_care(other):
     judged = poor.validate(record(CHIRP, words, seed=3)).verdict
     assert judged.level == "with care"
     assert judged.reason.startswith("residuals of y")
-    assert "leaves something out" in judged.reason
+    assert "is incomplete" in judged.reason
     assert "a delay" in judged.remedy
 
 
@@ -134,7 +134,7 @@ def test_a_closed_loop_is_named():
     poor = ftlm.identify(loop("closed, coloured, biased", 0), ftlm.equation("D^alpha y = a y + b u"))
     judged = poor.verdict
     assert judged.level == "with care"
-    assert judged.reason == "u answers y, a closed loop, and what comes back biases the numbers"
+    assert judged.reason == "u depends on past values of y: a closed loop, which biases the estimates"
     assert "reference=" in judged.remedy
 
 
@@ -147,7 +147,7 @@ def test_a_free_run_that_grows_is_not_to_be_used():
     grown = ftlm.Run.from_arrays(step=0.02, inputs={"u": volts}, outputs={"y": y})
     judged = ftlm.identify(grown, ftlm.equation("D y = a y + b u")).verdict
     assert judged.level == "do not use"
-    assert judged.reason == "the free run grows without bound (1 pole with a positive real part)"
+    assert judged.reason == "the simulation grows without bound (1 pole with a positive real part)"
 
 
 def test_numbers_that_no_run_tells_apart_are_not_to_be_used(run, monkeypatch):
@@ -157,7 +157,7 @@ def test_numbers_that_no_run_tells_apart_are_not_to_be_used(run, monkeypatch):
     twice = ftlm.Run.from_arrays(step=0.02, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]})
     judged = ftlm.identify(twice, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u + b1 v")).verdict
     assert judged.level == "do not use"
-    assert judged.reason == "the runs do not tell b0 and b1 apart"
+    assert judged.reason == "not separately identifiable from the runs: b0 and b1"
     assert "richer input" in judged.remedy
 
 
@@ -165,7 +165,7 @@ def test_a_method_without_errors_says_nothing_of_its_numbers(run, other):
     plain = ftlm.identify(run, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u"), method="multi-innovation")
     assert not plain.standard_errors
     reasons = plain.validate(other).verdict.reasons
-    assert "multi-innovation gives no standard errors, so nothing says how sure its numbers are" in reasons
+    assert "multi-innovation gives no standard errors, so the uncertainty of the parameters is unknown" in reasons
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -187,13 +187,13 @@ def test_each_rule_finds_its_own_fault(found, checked):
     gone = verdict(found, fit(checked, 40.0))
     assert (gone.level, gone.reason) == (
         "do not use",
-        "the free run explains little of the validation run of y (fit 40 %)",
+        "the simulation explains little of the validation run of y (fit 40 %)",
     )
     far = replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=math.inf)})
     never = verdict(worse(found, comparison=far), checked)
-    assert (never.level, never.reason) == ("do not use", "the free run leaves the range of numbers")
+    assert (never.level, never.reason) == ("do not use", "the simulation overflows")
     stuck = verdict(worse(found, fit=replace(found.fit, converged=False)), checked)
-    assert (stuck.level, stuck.reason) == ("with care", "the fit ended before it stood still")
+    assert (stuck.level, stuck.reason) == ("with care", "the fit has not converged")
     short = verdict(worse(found, residuals=None), checked)
     assert short.reason == "the runs are too short for residual tests"
 
@@ -206,18 +206,18 @@ def test_a_number_is_vague_by_its_own_size(found, checked):
         spread[a1, a1] = (share * found.coefficients["a1"]) ** 2
         judged = verdict(worse(found, fit=replace(found.fit, covariance=spread, profiles={})), checked)
         assert judged.trusted != vague
-        assert not vague or judged.reason.startswith("the runs hardly tell a1 = -0.6")
+        assert not vague or judged.reason.startswith("poorly identifiable from the runs: a1 = -0.6")
     spread[a1, a1], spread[alpha, alpha] = 0.0, 0.3**2
     judged = verdict(worse(found, fit=replace(found.fit, covariance=spread, profiles={})), checked)
-    assert judged.reason == f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± 0.3"
+    assert judged.reason == f"poorly identifiable from the runs: alpha = {found.orders['alpha']:.3g} ± 0.3"
 
 
 def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, checked):
     late = replace(found.model, structure=found.model.structure.with_delays({"u": 0.1}))
     for name, low, high, reason in (
         ("delay_u", -math.inf, 0.3, ""),  # it may well be 0
-        ("delay_u", 0.05, math.inf, "the runs do not bound delay_u"),
-        ("alpha", 1.5, math.inf, f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± "),
+        ("delay_u", 0.05, math.inf, "unbounded intervals: delay_u"),
+        ("alpha", 1.5, math.inf, f"poorly identifiable from the runs: alpha = {found.orders['alpha']:.3g} ± "),
     ):
         open_ended = replace(found.fit, profiles={name: ProfileInterval(low, high, 0.95)})
         judged = verdict(worse(found, fit=open_ended, model=late), checked)
@@ -229,8 +229,8 @@ def test_rough_intervals_are_a_fact(found, checked):
     doubted = worse(found, findings=(ROUGH,))
     assert verdict(doubted, checked).trusted
     assert doubted.warnings == (
-        "the cost is no parabola along a0, and its profile there would take long: these intervals are rough; "
-        "intervals='profile' finds them",
+        "the cost is not quadratic along a0, and its profile would take long: these intervals are approximate; "
+        "intervals='profile' computes them",
     )
 
 
@@ -243,7 +243,7 @@ BOUND = make_finding("on_bound", parameter="alpha", what="order alpha", value="2
 @pytest.mark.parametrize("words", ["D y = 2 u", "D^2 y = 2 u", "D^2 y = -0.3 D y + u", "D^1.5 y = -D^0.5 y + u"])
 def test_an_integrator_is_no_fault(words):
     assert saved_verdict(ftlm.Model(ftlm.equation(words)), []).reasons == (
-        "its file says nothing of how it was identified",
+        "the model file does not say how it was identified",
     )
 
 
@@ -251,7 +251,7 @@ def test_a_swing_that_nothing_damps_is_with_care(found, checked):
     for words in ("D^2 y = -4 y + u", "D^2.5 y = -4 D^0.5 y + u"):
         judged = saved_verdict(ftlm.Model(ftlm.equation(words)), [])
         assert judged.level == "with care"
-        assert judged.reason == "a swing of 2 rad/s may never die away (damping 0)"
+        assert judged.reason == "an oscillation at 2 rad/s may not decay (damping 0)"
     # The damping of the clean result is 0.27; it is not told apart from 0 where its own error is half of it.
     order = found.fit.names.index("alpha")
     for spread, told in ((1e-3, True), (0.3, False)):
@@ -261,7 +261,7 @@ def test_a_swing_that_nothing_damps_is_with_care(found, checked):
         known = replace_estimate(found.model, covariance=tuple(map(tuple, covariance.tolist())))
         judged = verdict(worse(found, model=known), checked)
         assert judged.trusted == told
-        assert told or "may never die away (damping 0.27 ± " in judged.reason
+        assert told or "may not decay (damping 0.27 ± " in judged.reason
 
 
 #: Faults by name: words of the plant, of the structure, what else identify is given, what it finds.
@@ -329,7 +329,7 @@ def test_findings_survive_a_file(found, tmp_path):
     kept = replace_estimate(found.model, findings=(infinite.to_file(), BOUND.to_file()))
     read = ftlm.load_model(kept.save(tmp_path / "m.json")).estimate.findings
     assert [f.text for f in read] == [infinite.text, BOUND.text]
-    assert read[0].text == "y: the free run explains little of the output (NR inf)"
+    assert read[0].text == "y: the simulation explains little of the output (NR inf)"
     assert read[0].to_dict()["level"] == "do not use"
 
 
@@ -345,7 +345,7 @@ def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checke
     assert verdict(worse(found, residuals=part), checked).trusted
     part = replace(found.residuals, outputs={"y": replace(tests, inputs=follows)})
     assert verdict(worse(found, residuals=part), checked).reason == (
-        "residuals of y still follow u: it leaves something out"
+        "residuals are correlated with inputs (y with u): the model is incomplete"
     )
 
 
@@ -354,13 +354,13 @@ def test_a_hidden_offset_is_named(found, checked):
     hidden = worse(found, comparison=replace(found.comparison, offsets=({"y": {}},), initial=past))
     judged = verdict(hidden, checked)
     assert judged.level == "with care"
-    assert judged.reason == "the offset of y is not told apart from what a run did before its start"
-    assert "offset in the equation of y in square: not told apart" in str(hidden)
+    assert judged.reason == "the offset of y is not separately identifiable from the initial conditions"
+    assert "offset in the equation of y in square: not separately identifiable" in str(hidden)
 
 
 def test_a_run_in_motion_says_so(found):
     moving = worse(found, comparison=replace(found.comparison, initial=[{"y": {0.0: 1.0, 1.0: 2.0}}]))
-    assert "in motion at its start, initial terms estimated with it: square (2)" in str(moving)
+    assert "nonzero initial conditions, initial terms estimated (their number): square (2)" in str(moving)
     assert "in motion" not in str(found)
 
 
@@ -414,12 +414,12 @@ def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_
     for code, kind in FINDING_CATALOGUE.items():
         reason = f"{code} a closed loop" if kind.reason else ""
         monkeypatch.setitem(
-            FINDING_CATALOGUE, code, replace(kind, template="grows without bound| is quantised", reason=reason)
+            FINDING_CATALOGUE, code, replace(kind, template="grows without bound| is quantized", reason=reason)
         )
     after = verdict(poor, checked), saved_verdict(model, [])
     assert [v.level for v in after] == [v.level for v in before]
     assert [len(v.reasons) for v in after] == [len(v.reasons) for v in before]
-    assert poor.warnings == ("grows without bound is quantised",) * 3
+    assert poor.warnings == ("grows without bound is quantized",) * 3
     again = replace(found.model, estimate=model.estimate).save(tmp_path / "m.json")
     assert saved_verdict(ftlm.load_model(again), []).level == before[1].level
 
@@ -453,8 +453,8 @@ def test_every_entry_of_the_catalogue_renders():
 
 def test_remedies_know_the_method():
     for method, remedy in (
-        ("least-squares", "add what drives it, a delay or a term; or use method='output-error'"),
-        ("output-error", "add what drives it, a delay or a term"),
+        ("least-squares", "add a missing input, a delay or a term; or use method='output-error'"),
+        ("output-error", "add a missing input, a delay or a term"),
     ):
         assert Finding("explains_little", method=method).remedy == remedy
 
@@ -489,7 +489,7 @@ def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
     poor = worse(found, findings=many)
     text = str(poor)
     assert sum(line.startswith("! ") for line in text.splitlines()) == MAX_SUMMARY_FINDINGS == 3
-    assert "! y: u answers what y did before" in text
+    assert "! y: u depends on past values of y" in text
     assert "(4 more warnings: print(result.details()))" in text
     assert all(f"warning: {w}" in poor.details() for w in poor.warnings)
     assert poor.findings == many
@@ -545,7 +545,7 @@ def test_json_and_page_say_the_same(found, checked, other, tmp_path):
     document = json.loads(json.dumps(verdict(found, checked).to_dict()))
     assert document["level"] == "trust"
     html = found._repr_html_()
-    assert "<strong>With care</strong>: no run that it was not fitted to has been tried" in html
+    assert "<strong>With care</strong>: the model was not validated on another run" in html
     assert html.index("With care") < html.index("<math>")
     assert "<strong>Trust</strong>" in checked._repr_html_()
     page = found.report(tmp_path / "r.html", validation=other).read_text("utf-8")
@@ -556,17 +556,17 @@ def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_p
     saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
     assert saved_verdict(saved, [saved.compare(other)]).level == "trust"
     for seen in ([], [saved.compare(run)]):
-        assert saved_verdict(saved, seen).reason == "no run that it was not fitted to has been tried"
+        assert saved_verdict(saved, seen).reason == "the model was not validated on another run"
     page = model_page(saved, tmp_path / "m.html", validation=other).read_text("utf-8")
     assert page.index("Trust") < page.index("<math>")
     bare = replace(saved, estimate=None)
-    assert saved_verdict(bare, []).reason == "its file says nothing of how it was identified"
+    assert saved_verdict(bare, []).reason == "the model file does not say how it was identified"
     estimate = replace_estimate(saved, standard_errors={**saved.estimate.standard_errors, "b0": None})
     judged = saved_verdict(estimate, [])
-    assert (judged.level, judged.reason) == ("do not use", "the runs do not tell b0 apart")
+    assert (judged.level, judged.reason) == ("do not use", "not separately identifiable from the runs: b0")
     warned = replace_estimate(saved, against=(BOUND,))
     assert saved_verdict(warned, [saved.compare(other)]).reason == (
-        "an order or a number is on its bound: order alpha = 2 is on its bound"
+        "an order or another parameter is on its bound: order alpha = 2 is on its bound"
     )
     # Sentences of earlier versions are shown and not judged.
     old = replace_estimate(saved, warnings=("order alpha = 2 is on its bound; widen it",))
@@ -588,10 +588,10 @@ def test_the_command_line_has_verdict_validation_and_more(run, other, tmp_path):
     words = ["identify", str(tmp_path / "run.csv"), "--structure", "D^1.8 y = a1 D^0.8 y + a0 y + b0 u"]
     alone = CliRunner().invoke(cli.app, words)
     assert alone.exit_code == 0, alone.output
-    assert alone.output.startswith("WITH CARE: no run that it was not fitted to has been tried")
+    assert alone.output.startswith("WITH CARE: the model was not validated on another run")
     assert len(alone.output.splitlines()) < 24
     both = CliRunner().invoke(cli.app, [*words, "--validation", str(tmp_path / "other.csv"), "-v"])
-    assert both.output.startswith("TRUST: it predicts runs it was not fitted to (y ")
+    assert both.output.startswith("TRUST: it predicts validation runs (y ")
     assert "equation error" in both.output
     assert "validation on chirp" in both.output
     document = json.loads(CliRunner().invoke(cli.app, [*words, "--json"]).output)

@@ -272,7 +272,7 @@ def test_differential_evolution_finds_what_is_there_and_the_same_again():
     assert told[-1][0] == told[-1][1] == found.evaluations[3]
     assert differential_evolution_search(records, single, settings, threads=2) == found
     moving = prepare([run.window(1.0, 9.0)], replace(single, initial="caputo"), None, power_of_two=True)
-    with pytest.raises(ftlm.ModelError, match="slice the runs to start at rest"):
+    with pytest.raises(ftlm.ModelError, match="cut the runs so that they start at rest"):
         differential_evolution_search(moving, single, settings)
 
 

@@ -1,6 +1,6 @@
 """Analysis of a model: frequency response, poles, modes, steady state, step response, and forms for other tools."""
 
-from ftlm.analysis.conversion import control_text, export_text, json_text, matlab_text, to_tf
+from ftlm.analysis.conversion import control_text, export_text, json_text, matlab_text, to_ss, to_tf
 from ftlm.analysis.frequency_response import (
     TransferFunctions,
     frequency_response,
@@ -31,6 +31,7 @@ __all__ = [
     "steady_states",
     "step_response",
     "to_control",
+    "to_ss",
     "to_tf",
     "transfer_functions",
     "zeros",

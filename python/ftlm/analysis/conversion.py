@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from ftlm._core import __version__
-from ftlm.analysis.frequency_response import POWER_TOLERANCE, check_no_input_nonlinearity, transfer_functions
-from ftlm.analysis.rational_approximation import approximate, identifier
+from ftlm.analysis.frequency_response import (
+    POWER_TOLERANCE,
+    check_no_input_nonlinearity,
+    response_inputs,
+    transfer_functions,
+)
+from ftlm.analysis.rational_approximation import approximate, identifier, state_space_matrices
+from ftlm.data.sampling import check_step
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
+from ftlm.simulation.discretization import check_linear
 from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
@@ -182,6 +190,8 @@ def export_text(
     return control_text(model, band=band, order=order)
 
 
+#: Rest of a delay in sampling intervals below which the delay is a whole number of them.
+WHOLE_DELAY_TOLERANCE = 1e-9
 #: Size of a Markov parameter, relative to its factors, below which it is rounding error.
 MARKOV_TOLERANCE = 1e-12
 _LABEL_PATTERN = re.compile(r"([A-Za-z]+)\[(\d+)\]")
@@ -221,15 +231,7 @@ def to_tf(model: Model) -> Any:
         raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
     check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
-    sensor = model.structure.sensor_filter
-    filtered = () if sensor is None else sensor.signals
-    behind = next((name for name in transfer.inputs if name in filtered), None)
-    if behind is not None:
-        raise ModelError(
-            f"the input {behind} passes a sensor filter, and its inverse is no transfer function; leave it out"
-        )
-    top = np.ones(1) if sensor is None else _coefficients(sensor.numerator)
-    bottom = np.ones(1) if sensor is None else _coefficients(sensor.denominator)
+    filtered, top, bottom = _output_filter(model, transfer.inputs)
     tops, bottoms = [], []
     for output in transfer.outputs:
         through, under = (top, bottom) if output in filtered else (np.ones(1), np.ones(1))
@@ -238,15 +240,143 @@ def to_tf(model: Model) -> Any:
         bottoms.append([denominator] * len(transfer.inputs))
     names = {"inputs": list(transfer.inputs), "outputs": list(transfer.outputs)}
     system = control.TransferFunction(tops, bottoms, name=identifier(model.structure.name), **names)
-    system.delay = {name: delay for name, delay in transfer.delay.items() if delay}
-    for name, delay in system.delay.items():
+    return _with_delay(system, transfer.delay)
+
+
+@check_arguments
+def to_ss(model: Model, *, step: float | None = None) -> Any:
+    """Return a model of integer orders as a python-control StateSpace, without approximation.
+
+    Its matrices ``A``, ``B``, ``C`` and ``D`` are those that ``scipy.signal.StateSpace`` takes.
+
+    Parameters
+    ----------
+    model
+        A linear model of integer orders; equations are coupled.
+    step
+        Sampling interval [s] of a system in discrete time, exact for inputs that are constant between samples. It
+        contains the delays of inputs, of any length, as states. None for continuous time.
+
+    Returns
+    -------
+    control.StateSpace
+        With named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders is
+        included). In continuous time its attribute ``delay`` has the delay [s] of each input.
+
+    Warns
+    -----
+    UserWarning
+        Where an input has a delay, in continuous time.
+
+    Raises
+    ------
+    ModelError
+        As :func:`to_tf`; a step that is not positive; an input that acts before its sample, in discrete time.
+    """
+    try:
+        control = importlib.import_module("control")
+    except ImportError:
+        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+    check_linear(model.equations, "a linear system in state space")
+    check_no_input_nonlinearity(model, "a linear system in state space")
+    orders = {o.constant for item in model.equations for o in (item.order, *(term.order for term in item.terms))}
+    _coefficients([(1.0, order) for order in sorted(orders)])
+    inputs = response_inputs(model, coupled=True)
+    filtered, top, bottom = _output_filter(model, inputs)
+    a, b, c, d = state_space_matrices(model, {}, (1.0, 1.0), 1)
+    for i, name in enumerate(model.outputs):
+        if name in filtered:
+            a, b, c, d = _filter_output(a, b, c, d, i, np.pad(top, (bottom.size - top.size, 0)), bottom)
+    delay = {name: model.structure.delay.get(name, 0.0) for name in inputs}
+    if step is not None:
+        interval = check_step(step, "step")
+        early = next((name for name, seconds in delay.items() if seconds < 0.0), None)
+        if early is not None:
+            raise ModelError(f"{early} acts {-delay[early]:g} s before its sample; shift its rows, and identify again")
+        a, b, c, d = _sampled(a, b, c, d, [delay[name] for name in inputs], interval)
+    names = {"inputs": list(inputs), "outputs": list(model.outputs), "name": identifier(model.structure.name)}
+    if step is not None:
+        return control.ss(a, b, c, d, interval, **names)
+    return _with_delay(control.ss(a, b, c, d, **names), delay)
+
+
+def _with_delay(system: Any, delay: Mapping[str, float]) -> Any:
+    """Return a system with the attribute `delay`, and warn about each."""
+    system.delay = {name: seconds for name, seconds in delay.items() if seconds}
+    for name, seconds in system.delay.items():
         warnings.warn(
-            f"the delay of {name}, {delay:g} s, is not in the transfer function; it is in its attribute delay, and "
-            f"to_control with {parameter('band')} approximates it",
+            f"the delay of {name}, {seconds:g} s, is not in the system; it is in its attribute delay, to_ss with "
+            f"{parameter('step')} includes it, and to_control with {parameter('band')} approximates it",
             UserWarning,
-            stacklevel=2,
+            stacklevel=4,
         )
     return system
+
+
+def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...], Floats, Floats]:
+    """Return the filtered signals, numerator and denominator of the sensor filter; raise for a filtered input."""
+    sensor = model.structure.sensor_filter
+    if sensor is None:
+        return (), np.ones(1), np.ones(1)
+    behind = next((name for name in inputs if name in sensor.signals), None)
+    if behind is not None:
+        raise ModelError(
+            f"the input {behind} passes a sensor filter, and its inverse is no transfer function; leave it out"
+        )
+    return tuple(sensor.signals), _coefficients(sensor.numerator), _coefficients(sensor.denominator)
+
+
+def _filter_output(
+    a: Floats, b: Floats, c: Floats, d: Floats, output: int, top: Floats, bottom: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return a state space whose output passes top / bottom, in observer form; both have the same length."""
+    count, own = bottom.size - 1, a.shape[0]
+    top, bottom = top / bottom[0], bottom / bottom[0]
+    shift = np.eye(count, k=1)
+    shift[:, :1] -= bottom[1:, None]
+    fed = (top[1:] - bottom[1:] * top[0])[:, None]
+    a = np.block([[a, np.zeros((own, count))], [fed @ c[output : output + 1], shift]])
+    b = np.vstack([b, fed @ d[output : output + 1]])
+    c = np.hstack([c, np.zeros((c.shape[0], count))])
+    c[output], d[output] = top[0] * c[output], top[0] * d[output]
+    c[output, own : own + 1] += 1.0
+    return a, b, c, d
+
+
+def _sampled(
+    a: Floats, b: Floats, c: Floats, d: Floats, delays: Sequence[float], step: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the state space at multiples of the step, for held inputs; late inputs are further states.
+
+    An input that acts in the middle of an interval has the effect of its two last values there (Åström and Wittenmark,
+    Computer-Controlled Systems, section 2.3).
+    """
+    expm = importlib.import_module("scipy.linalg").expm
+
+    def hold(column: Floats, seconds: float) -> tuple[Floats, Floats]:
+        """Return the transition over some seconds, and the effect of a constant input."""
+        whole = expm(np.block([[a, column], [np.zeros((1, a.shape[0] + 1))]]) * seconds)
+        return whole[:-1, :-1], whole[:-1, -1:]
+
+    count, inputs = a.shape[0], b.shape[1]
+    whole = [math.floor(delay / step + WHOLE_DELAY_TOLERANCE) for delay in delays]
+    parts = [max(delay - k * step, 0.0) for delay, k in zip(delays, whole, strict=True)]
+    lengths = [k + (part > WHOLE_DELAY_TOLERANCE * step) for k, part in zip(whole, parts, strict=True)]
+    size = count + sum(lengths)
+    # Columns: states, past values of each input, then the inputs of this sample.
+    motion, read = np.zeros((size, size + inputs)), np.zeros((c.shape[0], size + inputs))
+    motion[:count, :count], read[:, :count] = hold(np.zeros((count, 1)), step)[0], c
+    first = count
+    for j, length in enumerate(lengths):
+        column, late = b[:, j : j + 1], length > whole[j]
+        places = [size + j, *range(first, first + length)]
+        motion[:count, [places[whole[j]]]] += hold(column, step - parts[j] if late else step)[1]
+        read[:, places[-1]] += d[:, j]
+        if late:
+            motion[:count, [places[-1]]] += hold(column, step - parts[j])[0] @ hold(column, parts[j])[1]
+        motion[places[1:], places[:-1]] = 1.0
+        first += length
+    return motion[:, :size], motion[:, size:], read[:, :size], read[:, size:]
 
 
 def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
@@ -254,7 +384,7 @@ def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
     broken = next((p for _, p in pairs if abs(p - round(p)) > POWER_TOLERANCE or p < -POWER_TOLERANCE), None)
     if broken is not None:
         raise ModelError(
-            f"order {broken:g} is no whole number from 0, so there is no exact transfer function of python-control; "
+            f"order {broken:g} is no whole number from 0, so no system of python-control is exact; "
             f"to_control with {parameter('band')} approximates one"
         )
     values = np.zeros(1 + max((round(p) for _, p in pairs), default=0))

@@ -38,7 +38,7 @@ def check_no_input_nonlinearity(model: Model, what: str) -> None:
     for limit in model.structure.limits:
         raise ModelError(
             f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.law]} before it acts, which {what} does not know; "
-            "use free runs "
+            "use simulations "
             "(simulate, compare), or a model of the equation without it"
         )
 
@@ -366,7 +366,7 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
     ModelError
         An input that saturates or has a dead zone.
     ConvergenceError
-        A model so unstable that the response leaves the range of numbers.
+        A model so unstable that the response overflows.
     """
     check_no_input_nonlinearity(model, "a step response")
     t = as_floats("time", time)

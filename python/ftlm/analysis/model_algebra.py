@@ -134,14 +134,14 @@ def _ratio(model: Model, what: str) -> tuple[_Ratio, str, str]:
 
 
 def series(first: Model, second: Model) -> Model:
-    """Return the model whose output is that of `second` driven by the output of `first`; delays add up."""
+    """Return the series connection: the output of `first` is the input of `second`. Delays add up."""
     (a, _, signal), (b, output, _) = _ratio(first, "a series"), _ratio(second, "a series")
     top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
     return _Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
 
 
 def parallel(first: Model, second: Model) -> Model:
-    """Return the model whose output is the sum of both outputs from one input; both must have the same delay."""
+    """Return the parallel connection: the sum of both outputs from one input. Both delays must be equal."""
     (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
     if a.delay != b.delay:
         raise ModelError(

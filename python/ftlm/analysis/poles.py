@@ -92,7 +92,7 @@ class Stability:
 
 
 def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
-    """Characteristic sums of c s^p, one for each set of equations that act together."""
+    """Return the characteristic function, a sum of c s^p, of each group of coupled equations."""
     return [
         determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names])
         for names in coupled_outputs(model, coupled=coupled)
@@ -100,7 +100,7 @@ def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
 
 
 def common_base(powers: Sequence[float]) -> float | None:
-    """Largest q of which all powers are multiples, or None where it is below 0.01."""
+    """Return the largest q of which all powers are multiples; None if it is below 0.01."""
     powers = [p for p in powers if abs(p) > POWER_TOLERANCE]
     fractions = [Fraction(p).limit_denominator(1000) for p in powers]
     if any(abs(float(f) - p) > 1e-8 for f, p in zip(fractions, powers, strict=True)):
@@ -113,9 +113,9 @@ def common_base(powers: Sequence[float]) -> float | None:
 
 
 def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
-    """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power.
+    """Return the base q and the nonzero roots in s^q of a commensurate polynomial.
 
-    None without a common base, or if frequencies or coefficients are out of the range of numbers.
+    None without a common base, or if frequencies or coefficients overflow.
     """
     lowest, highest = min(polynomial), max(polynomial)
     base = common_base([p - lowest for p in polynomial])
@@ -191,7 +191,7 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
     Raises
     ------
     ModelError
-        A name that is not known, several signals and none named, or zeros out of the range of numbers.
+        A name that is not known, several signals and none named, or zeros that overflow.
     """
     transfer = transfer_functions(model)
     chosen = []
@@ -218,7 +218,7 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
     if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
         decades = int(MAX_LOG_FREQUENCY / math.log(10))
         raise ModelError(
-            f"the {what} are out of the range of numbers, 1e-{decades} to 1e{decades} rad/s: change the unit of time"
+            f"the {what} overflow, outside of 1e-{decades} to 1e{decades} rad/s: change the unit of time"
             " or the coefficients"
         )
     found = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
@@ -450,7 +450,7 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     coupled = is_coupled(coupling)
     found: list[Mode] = []
     for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
-        # Beyond the range of numbers a pole is one at the origin, or of nothing that ever shows.
+        # A pole that underflows is one at the origin; one that overflows has no visible effect.
         sheet = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
         spreads = _standard_deviations(model, at, np.array(sheet), coupled=coupled)
         found += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
@@ -479,7 +479,7 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
 
 
 def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
-    """Return zeros beyond the negative axis up to two turns, or up to the first one."""
+    """Return zeros, also those beyond the principal sheet: up to two turns, or to the first zero if it is farther."""
     powers = np.array(list(polynomial))
     gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
     zeros = zeros_of(polynomial, max(MAX_SHEET_ANGLE_RAD, math.pi / gap) + REAL_AXIS_ANGLE_RAD)
@@ -721,9 +721,9 @@ def dcgain(model: Model) -> Floats:
 
 
 def settling_time(model: Model) -> float:
-    """Seconds in which a model shows what it does: some time constants of its slowest mode.
+    """Return the duration of a response chart [s]: some time constants of the slowest mode.
 
-    No more than fifty periods of the fastest swing, so that a picture of it shows a swing.
+    At most fifty periods of the fastest oscillation, so that a chart resolves it.
     """
     found = modes(model)
     if not found:

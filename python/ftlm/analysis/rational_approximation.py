@@ -236,8 +236,6 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
         raise ModelError(f"{setting('order')} {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
-    inputs, outputs = response_inputs(model, coupled=True), model.outputs
-    builder = _Builder(len(inputs), len(outputs))
     delays = model.structure.delay
     early = next((name for name, delay in delays.items() if delay < 0.0), None)
     if early is not None:
@@ -245,10 +243,32 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
             f"{early} acts {-delays[early]:g} s before it is logged, and no linear system answers before its input; "
             "shift the rows of that input, and identify again"
         )
+    reach = (low / BAND_EXTENSION_FACTOR, high * BAND_EXTENSION_FACTOR)
+    matrices = state_space_matrices(model, delays, reach, count)
+    inputs, outputs = response_inputs(model, coupled=True), model.outputs
+    unjudged = Approximation(*matrices, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
+    return _with_errors(model, unjudged)
+
+
+def state_space_matrices(
+    model: Model, delays: Mapping[str, float], reach: tuple[float, float], count: int
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return A, B, C and D of a model with coupled equations; inputs in the order of the response.
+
+    Parameters
+    ----------
+    model
+        A linear model. A model of integer orders is represented exactly.
+    delays
+        Delays of inputs [s] to approximate.
+    reach, count
+        Frequencies [rad/s] and order of the filters of fractional orders.
+    """
+    inputs, outputs = response_inputs(model, coupled=True), model.outputs
+    builder = _Builder(len(inputs), len(outputs))
     sources: dict[str, _Signal] = {o: ({}, {}, {i: 1.0}) for i, o in enumerate(outputs)}
     for i, name in enumerate(inputs):
         sources[name] = _delay_input(builder, i, delays[name]) if delays.get(name) else ({}, {i: 1.0}, {})
-    reach = (low / BAND_EXTENSION_FACTOR, high * BAND_EXTENSION_FACTOR)
     # D^alpha y = sum of c D^nu s becomes y = sum of c s^-ceil(eta) (filter for the rest) s. The integrators of an
     # equation form one chain that adds up what every term feeds in (observer form): none runs away by itself, and what
     # a model does at rest and far below the band stays exact.
@@ -281,13 +301,11 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     solved = np.eye(len(outputs)) - loop
     if abs(float(np.linalg.det(solved))) < 1e-12:
         raise ModelError(
-            f"the equations of {', '.join(outputs)} cannot be solved for them: they are no more than a loop"
+            f"the equations of {', '.join(outputs)} cannot be solved for them: they form an algebraic loop"
         )
     c: Floats = np.asarray(np.linalg.solve(solved, reads), dtype=np.float64)
     d: Floats = np.asarray(np.linalg.solve(solved, direct), dtype=np.float64)
-    a, b = a + feedback @ c, b + feedback @ d
-    unjudged = Approximation(a, b, c, d, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
-    return _with_errors(model, unjudged)
+    return a + feedback @ c, b + feedback @ d, c, d
 
 
 def _with_errors(model: Model, system: Approximation) -> Approximation:

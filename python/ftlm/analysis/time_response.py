@@ -68,7 +68,7 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     ModelError
         An input that saturates or has a dead zone.
     ConvergenceError
-        A model so unstable that the response leaves the range of numbers.
+        A model so unstable that the response overflows.
     """
     check_model(model)
     if time is None:

@@ -238,7 +238,7 @@ def flexible_link(
         way (its deflection goes with the current where a real one goes against it). It is the paper's, for its tables.
     input_order
         Of the published form: order of the current in the deflection's equation, see :func:`order_law`. ``"derived"``
-        is the Lagrange form with the hub's acceleration eliminated and nothing dropped: the same free runs, but what
+        is the Lagrange form with the hub's acceleration eliminated and nothing dropped: the same simulations, but what
         bends the link is then the small difference of large terms. Naming it chooses the published form.
     coupling
         ``"measured"``: each equation is driven by the other angle as it was measured, the default of the Lagrange form.
@@ -267,7 +267,7 @@ def flexible_link(
     cross_damping
         Adds the rate of the other link's deflection, w_2 D theta_22 in the equation of theta_12, with
         ``cross_stage="inertial"`` and measured coupling. No dissipation of the arm: it damps what a link does against
-        the other one, as the gain of an observer would, so that a free run is not thrown off by what little is
+        the other one, as the gain of an observer would, so that a simulation is not thrown off by what little is
         wrong with what drives it (docs/arm.md has what that is worth).
     hub
         False leaves the hub's equation out: a deflection driven by the measured hub, whose friction nobody knows. No
@@ -290,8 +290,8 @@ def flexible_link(
         ``"stock"`` for the 2 Hz low-pass that the arm's stock real-time model puts on both deflections, whether they
         are modelled or drive a model, or a filter.
     offset
-        ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one a run, such as the current
-        that it takes to hold the arm still; see :func:`ftlm.equation`.
+        ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one per run, such as the
+        current that holds the arm still; see :func:`ftlm.equation`.
 
     Returns
     -------

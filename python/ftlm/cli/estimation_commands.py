@@ -97,7 +97,7 @@ def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure
         parsed = [shape.structure(text) for text in texts]
         return parsed[0]
     if len(texts) > 1:
-        raise ModelError("--structure auto is searched by itself; leave the others out, or give them without it")
+        raise ModelError("--structure auto takes no other structure beside it; leave auto or the others out")
     given = replace(shape, delay=None, only=None).given_options()
     if given:
         raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")

@@ -680,9 +680,9 @@ class Run:
         DataError
             A name that is no signal of the run.
         """
-        from ftlm.plot.comparison_charts import picture
+        from ftlm.plot.comparison_charts import run_charts
 
-        return picture(self, *signals)
+        return run_charts(self, *signals)
 
     @check_arguments
     def advice(self, structure: Structure | None = None) -> Advice:
@@ -707,7 +707,7 @@ class Run:
         return advise(self, structure)
 
     def inspect(self) -> Inspection:
-        """Return range, noise, quantization and rest of every signal.
+        """Return range, noise, quantization and initial rest of every signal.
 
         Returns
         -------
@@ -720,7 +720,7 @@ class Run:
 
     @check_arguments
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write this run to a csv file that `ftlm.load` reads back bit for bit, without being told the columns.
+        """Write this run to a csv file that `ftlm.load` reads back bit for bit, without `inputs` and `outputs`.
 
         The first line is a comment, ``# ftlm-run 1`` and a JSON object with name, step, start, inputs, outputs, units,
         intersample and warnings, and ``about`` for a run of a rig. A header ``t_s,…`` and the samples follow, with

@@ -136,7 +136,7 @@ def as_seconds(given: object, thing: str) -> tuple[Floats, str] | None:
     lapses = array - array[0] if array.dtype.kind == "M" else array
     nanoseconds = lapses.astype("timedelta64[ns]")
     if (nanoseconds.astype(lapses.dtype) != lapses).any():
-        raise DataError(f"{thing}: from {array.min()} to {array.max()} there are more nanoseconds than can be counted")
+        raise DataError(f"{thing}: from {array.min()} to {array.max()} is more than 292 years; split the record")
     words = f"time counted from {array[0]} on" if array.dtype.kind == "M" else ""
     return nanoseconds.astype(np.int64) / 1e9, words
 
@@ -348,7 +348,7 @@ def check_rows(since: Floats, step: float) -> int:
 
 
 def rows_coincide(since: Floats, step: float) -> bool:
-    """Whether sample times are regular and every row of the new step is one of them, so that no value is made up."""
+    """Whether every row at the new step is a sample of a regular grid, so that nothing is interpolated."""
     own = float(since[-1]) / (since.size - 1)
     regular = np.abs(since - uniform_times(since.size, own)).max() <= _MAX_JITTER_SHARE * own
     return bool(regular) and abs(step / own - round(step / own)) * since.size <= _MAX_JITTER_SHARE and step > 0.5 * own
@@ -390,8 +390,8 @@ def check_missing_policy(given: object) -> MissingPolicy:
         if given == known:
             return known
     raise DataError(
-        f"{parameter('missing', given)} is unknown; use 'refuse', 'weight' (outputs that were not read weigh "
-        "nothing) or 'hold' (inputs hold their last value besides)"
+        f"{parameter('missing', given)} is unknown; use 'refuse', 'weight' (missing outputs get no weight) "
+        "or 'hold' (as 'weight', and missing inputs keep their last value)"
     )
 
 

@@ -38,13 +38,13 @@ MIN_CHANGING_SHARE = 0.5
 _BETWEEN_SAMPLES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 
 
-def start_not_told_findings(fit: Fit) -> list[Finding]:
-    """Return a finding if another start explains the runs as well as the one that was taken, with another gain."""
+def undetermined_start_findings(fit: Fit) -> list[Finding]:
+    """Return a finding if other initial conditions explain the runs as well and give another gain."""
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or structure.has_friction or structure.limits or structure.offset not in ("none", "level"):
         return []
     if all(rest_evidence(run, structure) is not None for run in runs):
-        # What shows rest, or that it is assumed, is said.
+        # Another finding states the evidence of rest, or that rest is assumed.
         return []
     taken = joint.initial if joint.initial == "rest" else "caputo", structure.offset
     own = _gains(joint, structure)
@@ -115,7 +115,7 @@ def _changes_often(runs: Sequence[Run], name: str) -> bool:
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:
-    """Name a start."""
+    """Describe initial conditions."""
     return ("at rest" if initial == "rest" else "in motion") + (" at a level of its own" if offset == "level" else "")
 
 

@@ -63,7 +63,8 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     inputs = [s for s in structure.signals if s in runs[0].inputs]
     if not inputs:
         raise DataError(
-            f"{parameter('reference', reference)}: the model reads no input of run {runs[0].name!r} that it could drive"
+            f"{parameter('reference', reference)}: the model has no input of run {runs[0].name!r} that could "
+            f"depend on it"
         )
     moves = [run[reference] for run in runs]
     if is_constant(moves):

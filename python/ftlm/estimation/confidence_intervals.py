@@ -69,7 +69,7 @@ def with_intervals(
                 joint, problem, runs, names, DEFAULT_INTERVAL_LEVEL, threads=threads, progress=progress, budget=budget
             )
         except FtlmError:
-            # No finite free run where the weights of the last descent are taken anew: what is known stays.
+            # No finite simulation where the weights of the last descent are taken anew: what is known stays.
             return joint, findings
         spent += found.evaluations * pulses
         if found.lower_optimum is None or turn == MAX_RESTARTS:
@@ -209,7 +209,7 @@ def result_profiles(
     unknown = [n for n in names if n not in problem.names]
     if unknown:
         others = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
-        raise ModelError(f"{unknown[0]!r}{others} is no free number of this fit; it has {', '.join(problem.names)}")
+        raise ModelError(f"{unknown[0]!r}{others} is no free parameter of this fit; it has {', '.join(problem.names)}")
     probability = real_number("level", level)
     if not 0.0 < probability < 1.0:
         raise ModelError(f"level = {level} is no probability between 0 and 1, such as 0.95")

@@ -346,8 +346,8 @@ def consistency(
             raise type(error)(f"{name}: {error}") from error
         if not results[0].standard_errors:
             raise ModelError(
-                f"method {results[0].method!r} gives no standard errors of {structure}, and without them nothing tells "
-                f"whether numbers differ; use {parameter('method', 'output-error')}, and leave something to estimate"
+                f"method {results[0].method!r} gives no standard errors of {structure}, which this test needs; "
+                f"use {parameter('method', 'output-error')}, and leave at least one parameter free"
             )
         if progress is not None:
             progress(len(results), len(pieces))
@@ -360,7 +360,7 @@ def consistency(
 
 
 def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequence[Identification]) -> list[Finding]:
-    """Return findings on runs whose inputs, shifted by some rows, make another run's model fit as well as their own."""
+    """Return findings on runs to which another run's model fits as well as their own once the inputs are shifted."""
     findings = []
     for (k, piece), (j, result) in itertools.product(enumerate(pieces), enumerate(results)):
         inputs = [n for n in result.model.structure.signals if n in piece.inputs]

@@ -1,4 +1,4 @@
-"""Joint output-error fit with external instruments, for data from a closed loop."""
+"""Estimators of whole structures: joint output error, external instruments, order search with linear methods."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ STEP_TOLERANCE_ERRORS = 1e-3
 INSTRUMENT_RANK_TOLERANCE = 1e-12
 #: Score of the best candidate under a prior, relative to that of a zero output, that is not reported.
 MAX_PRIOR_SCORE_RATIO = 0.5
-#: Fewest pulses a sample interval. The estimates are those of one grid.
+#: Fewest pulses per sampling interval. The estimates are those of one grid.
 MIN_PULSES_PER_SAMPLE = 2
 
 
@@ -86,7 +86,7 @@ def fit_with_instruments(
             try:
                 there = _evaluate_moments(measured, clean, tried)
             except FtlmError:
-                # No finite free run that far.
+                # No finite simulation that far.
                 continue
             if _moment_norm(there) < level:
                 values, here = tried, there
@@ -155,7 +155,7 @@ def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
     return _core.long_run_covariance(influence, series)
 
 
-#: Largest number of block pulses a run for the final instrumental-variable fit if m is not given.
+#: Largest number of block pulses per run for the final instrumental-variable fit if m is not given.
 MAX_IV_PULSES = 1 << 14
 
 
@@ -320,7 +320,7 @@ def fit_at_best_orders(
 def prior_findings(
     task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
 ) -> list[Finding]:
-    """Return a finding on each search by simulation under a prior whose best candidate hardly moves."""
+    """Return a finding on each search whose prior covariance makes the best simulation nearly zero."""
     if settings.coefficients != "multi-innovation" or settings.prior_covariance is None:
         return []
     if settings.criterion != "output-error":

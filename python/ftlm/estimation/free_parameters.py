@@ -202,7 +202,7 @@ def warm_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[s
     bounds = dict(zip(problem.names, problem.all_bounds, strict=True))
     check_known("start value", known, problem.names)
     if not known:
-        raise ModelError(f"{parameter('start')} has none of the numbers that are free: {', '.join(problem.names)}")
+        raise ModelError(f"{parameter('start')} names none of the free parameters: {', '.join(problem.names)}")
     for name, value in known.items():
         low, high = bounds[name]
         if not low <= real_number(f"start value of {name}", value) <= high:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
@@ -41,6 +42,8 @@ from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
 
 
+#: Circuit in the notation of impedance tools, such as ``R0-p(R1,CPE1)``.
+_CIRCUIT_PATTERN = re.compile(r"\s*(?:R|C|L|CPE|W|Wo|Ws|G|Q|p\s*\()[0-9_]*\s*(?:-|\(|[RCLWQ]|$)")
 #: Largest exponent of a constant-phase element: that of a capacitor.
 MAX_EXPONENT = 1.0
 
@@ -600,7 +603,8 @@ def identify_frequency(
     count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
     if count <= numbers:
         raise DataError(
-            f"{count // 2} frequencies give {count} numbers, and {numbers} are free ({', '.join(problem.names)}); "
+            f"{count // 2} frequencies give {count} values, and {numbers} parameters are free "
+            f"({', '.join(problem.names)}); "
             "measure more frequencies, or fix numbers"
         )
     if isinstance(progress, Progress):
@@ -626,7 +630,7 @@ def identify_frequency(
     fits = [f for f in fits if math.isfinite(f.cost)]
     if not fits:
         raise ConvergenceError(
-            "no start has a finite response: the lattice of orders is empty or singular; widen "
+            "no initial guess has a finite response: the order grid is empty or singular; widen "
             f"{parameter('orders')}, or give {parameter('start')}"
         )
     first = min(fits, key=lambda f: f.cost)
@@ -665,7 +669,12 @@ def _structure(
     fixed: Mapping[str, float] | None,
     delay: Mapping[str, float | tuple[float, float]] | None,
 ) -> Structure:
-    """Return the structure to identify; raise for what a frequency response cannot represent."""
+    """Return the structure to identify; raise for nonlinear terms, offsets, sensor filters and laws."""
+    if isinstance(structure, str) and _CIRCUIT_PATTERN.match(structure):
+        raise ModelError(
+            f"structure {structure!r} is a circuit; give its equation, such as 'D^alpha U = a U + r D^alpha I + b I' "
+            "for R0 - p(R1, CPE1) and 'D U = a U + r D I + b I' for R0 - p(R1, C1)"
+        )
     wanted = equation(structure) if isinstance(structure, str) else structure
     if not isinstance(wanted, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; give an equation: 'D^alpha y = a0 y + b0 u'")
@@ -686,7 +695,9 @@ def _structure(
             f"the structure has a law of its coefficients, which this fit does not keep; leave {parameter('laws')} out"
         )
     if not (wanted.order_names or wanted.coefficient_names or wanted.free_inputs):
-        raise ModelError("nothing is free: every order, coefficient and delay is a number; name what is unknown")
+        raise ModelError(
+            "no parameter is free: every order, coefficient and delay is a number; give the unknown ones names"
+        )
     return replace(wanted, coupling="simulated", initial="auto")
 
 
@@ -695,7 +706,7 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
     outputs = structure.outputs
     inputs = tuple(s for s in structure.signals if s not in outputs)
     if not inputs:
-        raise ModelError(f"the equations of {', '.join(outputs)} have no input; add what drives them, as in '+ b0 u'")
+        raise ModelError(f"the equations of {', '.join(outputs)} have no input; add an input term, as in '+ b0 u'")
     found = []
     for record in records:
         own = {"output": record.output, "input": record.input}
@@ -823,7 +834,7 @@ def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
 
 
 def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
-    """Fit from the end of a fit of another problem with the same parameters."""
+    """Fit a problem from the optimum of another problem with the same parameters."""
     return _fit(problem, problem.in_problem_units(other.in_seconds(end.values)))
 
 
@@ -835,7 +846,7 @@ def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) 
 
 
 def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
-    """Return ends of the multistart that are nearly as likely as the best, one for each response."""
+    """Return distinct optima of the multistart that are nearly as likely as the best."""
     ranked = sorted(fits, key=lambda f: f.cost)
     kept, seen = [], [problem.residuals(ranked[0].values, slopes=False)[0]]
     for fit in ranked[1:]:

@@ -117,6 +117,12 @@ def nyquist_figure(model: Model, record: FrequencyData) -> Figure:
     )
 
 
+def response_figures(model: Model, record: FrequencyData) -> list[Figure]:
+    """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
+    bode, nyquist = bode_figures(model, record), nyquist_figure(model, record)
+    return [nyquist, *bode] if record.unit.endswith("Ω") else [*bode, nyquist]
+
+
 def relative_residual_figure(model: Model, record: FrequencyData) -> Figure:
     """Return the chart of the residuals relative to the measured response, by frequency."""
     order = np.argsort(record.frequency, kind="stable")
@@ -323,7 +329,7 @@ class FrequencyIdentification:
         if against is not None:
             return against
         shown = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
-        return Verdict(TRUST_LEVEL, f"it predicts what it was not fitted to (error {shown}), residuals are noise")
+        return Verdict(TRUST_LEVEL, f"it predicts validation responses (error {shown}), residuals are noise")
 
     def _unstable_poles(self) -> list[Finding]:
         """Return a finding on poles with a positive real part, if there are any."""
@@ -350,7 +356,7 @@ class FrequencyIdentification:
         same, tried = self.start_counts
         lines.append(
             f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {tried} "
-            "starts ended here"
+            "initial guesses ended here"
         )
         return "\n".join(
             [
@@ -376,11 +382,7 @@ class FrequencyIdentification:
     def figures(self) -> list[Figure]:
         """Return Bode and Nyquist charts with the measured points, and residual charts."""
         model = self.model
-        return [
-            f
-            for r in self.data
-            for f in (*bode_figures(model, r), nyquist_figure(model, r), relative_residual_figure(model, r))
-        ]
+        return [f for r in self.data for f in (*response_figures(model, r), relative_residual_figure(model, r))]
 
     @check_arguments
     def report(
@@ -407,7 +409,13 @@ class FrequencyIdentification:
 
         shown, more = first_findings(self.findings)
         equations = [equation_html(e, self.model.structure.delay) for e in self.model.equations]
-        first = Section(
+        new = () if validation is None else validation.data
+        charts = Section(
+            f"{'Validation' if new else 'Estimation'}: measured and modeled response",
+            figures=[f for record in new or self.data for f in response_figures(self.model, record)],
+            small=True,
+        )
+        about = Section(
             "Model",
             [Markup("<p>{}</p>").format(e) for e in equations],
             warnings=shown,
@@ -420,20 +428,18 @@ class FrequencyIdentification:
         rows += [] if validation is None else [_error_row("validation", e) for e in validation.errors]
         heads = ("data", "record", "response", "error, % rms", "largest, %", "at [rad/s]")
         notes = [w for r in self.data for w in r.warnings]
-        figures = self.figures()
-        for record in () if validation is None else validation.data:
-            figures += [*bode_figures(self.model, record), nyquist_figure(self.model, record)]
-        response = Section(
-            "Measured and modelled response",
+        figures = [relative_residual_figure(self.model, record) for record in self.data]
+        residuals = Section(
+            "Residuals" if not new else "Residuals, and the fit to the estimation data",
             [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
             tables=[Table("Error over the size of the measured response", heads, rows)],
-            figures=figures,
+            figures=self.figures() if new else figures,
             small=True,
         )
         return write_page(
             path,
             title=title_of(self.model),
-            sections=[first, response],
+            sections=[charts, about, residuals],
             force=force,
             verdict=verdict_box(self.verdict if validation is None else validation.verdict),
         )

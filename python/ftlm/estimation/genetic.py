@@ -120,7 +120,7 @@ class GeneticProblem:
         self.bounds |= {n: default_bounds(n, records, structure, values) for n in self.coefficient_names}
         for name, pair in settings.bounds.items():
             if name not in self.names:
-                raise ModelError(f"bounds of {name!r}: there is no such number; free are {', '.join(self.names)}")
+                raise ModelError(f"bounds of {name!r}: not a free parameter; free are {', '.join(self.names)}")
             self.bounds[name] = (float(pair[0]), float(pair[1]))
         self.rows = [self._rows(e, records, settings.norm) for e in structure.equations]
         self.threads = threads
@@ -254,12 +254,12 @@ def genetic_search(
     pygad = load_pygad()
     if records[0].offset != "none":
         raise ModelError(
-            f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
+            f"the genetic baseline does not estimate an offset, and offset = {records[0].offset!r}; "
             f"use {parameter('method', 'output-error')}, or {parameter('offset', 'none')}"
         )
     if records[0].start != (False, []):
         raise ModelError(
-            "the genetic baseline knows no initial terms and needs runs that start at rest; "
+            "the genetic baseline does not estimate initial terms and needs runs that start at rest; "
             f"slice the runs, or give the structure {parameter('initial', 'rest')}"
         )
     problem = GeneticProblem(records, structure, settings, check_threads(threads))
@@ -421,7 +421,9 @@ def differential_evolution_search(
     """
     differential_evolution = load_differential_evolution()
     if records[0].start != (False, []) or records[0].offset != "none":
-        raise ModelError("differential evolution knows no initial terms and no offset; slice the runs to start at rest")
+        raise ModelError(
+            "differential evolution estimates no initial terms and no offset; cut the runs so that they start at rest"
+        )
     problem = GeneticProblem(records, structure, settings, check_threads(threads))
     wanted = settings.evaluations or problem.size
     bounds = [problem.bounds[n] for n in problem.names]
@@ -465,7 +467,7 @@ def differential_evolution_search(
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class GeneticAlgorithm:
-    """Genetic algorithm on the free run, the paper's baseline; for comparison only.
+    """Genetic algorithm on the simulation, the paper's baseline; for comparison only.
 
     Orders and coefficients are searched together. It needs PyGAD (``pip install 'ftlm[genetic]'``).
 
@@ -476,9 +478,9 @@ class GeneticAlgorithm:
     norm
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     seeds
-        One run of the algorithm a seed; the best of all is the result, and the errors of all are kept.
+        The algorithm runs once per seed; the result is the best run, with the errors of all.
     evaluations
-        Evaluations a seed, rounded up to a whole generation; by default as many as the order grid has candidates.
+        Evaluations per seed, rounded up to a whole generation; by default as many as the order grid has candidates.
     population
         Candidates of one generation, at least 8.
     bounds
@@ -488,8 +490,8 @@ class GeneticAlgorithm:
     Raises
     ------
     ModelError
-        Seeds that are none or too many, a population outside [8, 100000], evaluations of less than two generations,
-        bounds that are no interval, an order grid or a norm that is none.
+        No seeds or too many, a population outside [8, 100000], evaluations of less than two generations, bounds that
+        are no interval, an invalid order grid or norm.
     """
 
     name: ClassVar[str] = "genetic"
@@ -543,7 +545,7 @@ class GeneticAlgorithm:
         names = [n for own in free.values() for n in own]
         strange = [n for n in self.bounds if n not in names]
         if strange:
-            raise ModelError(f"bounds of {strange[0]!r}: there is no such number; free are {', '.join(names)}")
+            raise ModelError(f"bounds of {strange[0]!r}: not a free parameter; free are {', '.join(names)}")
         record = prepare(task.runs, structure, m, power_of_two=True)[0]
         ends = {}
         for name, part in parts.items():

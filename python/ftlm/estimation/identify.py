@@ -16,7 +16,7 @@ from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.alternative_assumptions import intersample_findings, start_not_told_findings
+from ftlm.estimation.alternative_assumptions import intersample_findings, undetermined_start_findings
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
@@ -86,7 +86,7 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         fit = _fit_with_level_decision(structure, estimate)
         if structure.initial != "auto" or structure.offset != "none":
             return fit
-        return replace(fit, findings=[*fit.findings, *start_not_told_findings(fit)])
+        return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit)])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
@@ -94,7 +94,7 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
         return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
     twin = constant_input(runs, structure)
     if twin is not None:
-        words = f"none: {twin} is constant on every run, which an offset cannot be told from"
+        words = f"none: {twin} is constant on every run, from which an offset is not separately identifiable"
         return _with_offset_decision(estimate(replace(structure, offset="none")), words)
     fit = estimate(asked)
     if fit.task.structure.offset == "level":
@@ -102,7 +102,7 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
     test = fit_offset_test(fit)
     if test is not None and test.exceeds():
         return _with_offset_decision(fit, test.decision)
-    decision = "none: its test has no finite free run" if test is None else test.decision
+    decision = "none: its test has no finite simulation" if test is None else test.decision
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
 
 
@@ -150,7 +150,7 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
 
 
 def _shows_level(fit: Fit) -> bool:
-    """Whether a fit took runs for motion whose outputs lie far from zero, compared with how they move."""
+    """Whether a fit chose nonzero initial conditions for outputs whose mean is large against their deviation."""
     if fit.joint is None or fit.joint.initial == "rest" or fit.task.structure.initial != "auto":
         return False
     values = [drop_missing(run[o]) for run in fit.task.runs for o in fit.model.outputs]
@@ -235,34 +235,33 @@ def identify(
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
         friction that the model lacks; ``"level"``: a constant that is added to each output; ``"ramp"``: a constant and
-        a drift in proportion to time. One each run, in ``.comparison.offsets``, estimated anew on any run that the
-        model is judged on; beside a history (a run that starts in motion) it is estimated, but cannot be told from it.
-        A run that rests at its own level before an input moves has a level by default. ``"auto"``: a constant where the
-        runs ask for one at 99 %, none where they do not, with the statistic in ``.settings["offset_test"]``; it fits
-        once with the constant and, where none is asked for, once without. Default what the structure says. Where it
-        says none and a constant would explain much, a warning does.
+        a linear drift. Each run has its own, in ``.comparison.offsets``, also in validation. It is not separately
+        identifiable from a history of nonzero initial conditions. A run that rests at its own level before an input
+        changes has a level by default. ``"auto"``: a constant if it is significant at 99 %, with the statistic in
+        ``.settings["offset_test"]``; it fits once with the constant and, if it is not significant, once without.
+        Default that of the structure. A finding reports a missing constant that would explain much.
     m
-        Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows). Instrumental variables
-        search on these and, without m, end on all samples (at most 16 384 pulses).
+        Block pulses per run; default 2 048, or what the runs carry (a power of two for Haar rows). Without `m`,
+        instrumental variables search on these and estimate on all samples (at most 16 384 pulses).
     threads, progress
-        Threads, by default all cores, and what is called with (work done, work in all).
+        Threads, by default all cores; and a function that is called with (work done, total work).
 
     Returns
     -------
     Identification
-        Prints well; ``.model`` simulates, compares and saves.
+        Prints its summary; ``.model`` simulates, compares and saves, ``.validate`` and ``.report`` follow.
 
     Raises
     ------
     DataError
-        Runs that do not fit the structure, or a constant output; a reference that is not there or does not move; a
-        store of other searches, in use, damaged, or that cannot be written.
+        Runs that do not fit the structure, or a constant output; a missing or constant reference; a checkpoint file of
+        other searches, in use, damaged, or not writable.
     ModelError
-        A method that is not known, an order grid without or with too many candidates, settings out of range, options of
-        an order search without a free order, a store with ``offset="auto"``, a start that has none of the free
-        parameters, others, or values out of their bounds.
+        An unknown method, an order grid without or with too many candidates, settings out of range, options of an
+        order search without a free order, a store with ``offset="auto"``, an initial guess without free parameters,
+        with unknown ones, or out of bounds.
     ConvergenceError
-        Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
+        Linearly dependent regressors at the given orders, or an executor that has lost its workers.
     """
     several = as_runs(runs)
     chosen = resolve_method(method)
@@ -332,7 +331,7 @@ def assess_fit(fit: Fit) -> Identification:
     if plant:
         findings = [*plant, *(f for f in findings if f.code not in WHOLE_RUN_CODES)]
     if any(f.code == "plant_unstable_in_pieces" for f in plant):
-        # The residuals of free runs that grow say nothing of the model.
+        # The residuals of simulations that grow say nothing of the model.
         tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is not None:
@@ -363,7 +362,7 @@ def assess_fit(fit: Fit) -> Identification:
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
-    """Return residuals that are not white as colored noise, and a poor fit as noise, where they follow no input.
+    """Replace findings of colored residuals and of a poor fit by findings of noise if no input explains them.
 
     Residual tests leave the first and the last row out: a fit that is poor by these alone has an outlier there.
     """
@@ -377,14 +376,14 @@ def _noise_finding(item: Finding, tests: Residuals) -> Finding:
 
 
 def _coupling_finding(item: Finding, structure: Structure) -> Finding:
-    """Return residuals that follow an input that no equation reads as a coupling that the structure lacks."""
+    """Replace a finding of residuals correlated with an unused input by a finding of a missing coupling."""
     if item.code != "residuals_follow_input" or item.input in structure.signals:
         return item
     return msgspec.structs.replace(item, code="coupling_missing")
 
 
 def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Finding]:
-    """Return a finding on what a flexible link leaves out of an arm, if residuals show that something is missing."""
+    """Return a finding on the effects that a flexible link omits, if residual tests fail."""
     if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in LEFT_OUT_CODES for f in findings):
         return []
     parts = [] if structure.has_friction else ["dry friction of the hubs"]
@@ -395,7 +394,7 @@ def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Find
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
-    """Return the tests with the bias that found feedback can make of a joint fit."""
+    """Return the residual tests with the bias of a joint fit that detected feedback can cause."""
     fed = {
         signal: test.response
         for o in tests.outputs.values()

@@ -167,7 +167,7 @@ class MultiInnovationTrace:
     coefficients
         By name, after each of these steps.
     error
-        Error (45) of the free run of the model after each of these steps, at rest; infinite where it diverged.
+        Error (45) of the simulation of the model after each of these steps, at rest; infinite where it diverged.
     innovation_length
         p.
     """
@@ -284,7 +284,7 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
         [(name, trace.error) for name, trace in traces],
         title=title,
         x_label="step of the recursion",
-        y_label="error (45) of the free run",
+        y_label="error (45) of the simulation",
         log_x=log_x,
         log_y=True,
     )
@@ -293,7 +293,7 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
 class Streaming:
     """Online estimator of the coefficients of a structure for a run that starts at rest.
 
-    Each sample costs the same, whatever the length of the run: the past is held by about a hundred numbers a signal.
+    The cost of a sample does not depend on the length of the run: about a hundred states per signal represent the past.
     After the last sample the coefficients are those of ``identify(method=MultiInnovation(row_basis="time"))`` at
     the same orders on the run's own grid, to rounding.
 

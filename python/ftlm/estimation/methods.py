@@ -56,22 +56,21 @@ class OutputError:
     Parameters
     ----------
     loss
-        ``"squares"``, or ``"huber"``, which counts residuals beyond 1.345 of the usual ones by their size, so that
-        outliers decide nothing; without any it has 95 % of the precision. Figures stay those of all samples.
+        ``"squares"``, or ``"huber"``, which limits the influence of residuals beyond 1.345 standard deviations.
+        Without outliers it has 95 % of the precision. Fits and errors are still those of all samples.
     intervals
-        ``"quadratic"``: estimate ± 1.96 standard errors, true where the cost is a parabola. ``"profile"``: by profile
-        likelihood for every parameter, some ten to a hundred free runs each. ``"auto"``: by profile likelihood for the
-        parameters for which two free runs each say that the quadratic picture is off by over a tenth. See
+        ``"quadratic"``: estimate ± 1.96 standard errors, exact for a quadratic cost. ``"profile"``: by profile
+        likelihood for every parameter, some ten to a hundred simulations each. ``"auto"``: by profile likelihood for
+        the parameters whose Wald interval is off by over a tenth, from two simulations each. See
         :meth:`ftlm.Identification.profile`.
     start
-        Initial guess besides the automatic ones, so that the fit never ends with a larger cost than one gets from
-        there: an identification or a model of the same outputs, simpler or not, or values of free parameters by name.
-        What it lacks starts at the coefficient 0; an order that is free now and was a number there starts at that
-        number.
+        Initial guess besides the automatic ones; the fit never ends with a larger cost than a fit from it. An
+        identification or a model of the same outputs, simpler or not, or values of free parameters by name. Missing
+        coefficients start at 0; an order that is free now and was fixed there starts at that value.
     reference
-        Name of a signal of the runs that drives a closed loop from outside, such as its set point. It is the
-        instrument: residuals are made orthogonal to the response to the part of every input that follows the
-        reference, which is uncorrelated with the noise that the loop feeds back.
+        Name of the reference signal of a closed loop in the runs, such as its set point. It is the instrument:
+        residuals are made orthogonal to the response to the part of every input that follows the reference, which is
+        uncorrelated with the noise in the feedback.
     noise
         ``"white"``, or ``"ar"`` for y = G u + e / A(q): model and autoregression are estimated together by the
         prediction-error method. It is consistent in a closed loop if A(q) can describe the noise and the loop has a
@@ -252,7 +251,7 @@ class MultiInnovation(OrderSearchMethod):
     order_grid, criterion, norm, top, store, executor
         Options of the order search; see :func:`ftlm.search_orders`. Without a free order they must be the defaults.
     innovation_length
-        p of paper (43)-(44): a weight of the data against the prior, nothing else.
+        p of paper (43)-(44): only a weight of the data against the prior.
     prior_covariance
         Diagonal of K0 of paper (43)-(44): one number for all coefficients. By default the prior is weak and does not
         depend on units: 1e10 over the sum of squares of each coefficient's regressor. The paper's is 1.

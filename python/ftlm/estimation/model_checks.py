@@ -32,7 +32,7 @@ from ftlm.validation.data_advice import check_excitation, find_dead_channel
 
 #: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
-#: Least number of samples a period of a mode whose numbers do not rest on the inputs between samples, and damping
+#: Least number of samples per period of a mode whose numbers do not rest on the inputs between samples, and damping
 #: ratio from which on a mode is no swing.
 MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
@@ -168,7 +168,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
 
 
 def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
-    """Return the optima from some starts that are models of their own and almost as likely as that from the best one.
+    """Return other optima that are almost as likely as the best one and simulate other outputs.
 
     Each comes with the fall of the log likelihood.
     """
@@ -247,7 +247,7 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
 
 
 def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on runs that were taken to rest before their first row, and on what tells that they did."""
+    """Return findings on runs that are assumed to rest before their first row, with the evidence."""
     resolved = resolve_start(runs, structure)
     findings = []
     for run in runs if resolved.initial == "rest" or resolved.offset == "level" else ():
@@ -340,14 +340,14 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
 
 
 def _simulated_speeds(measured: Floats, residuals: Floats) -> Floats:
-    """Change of a simulated output around each inner sample, which outliers of the measured one do not move."""
+    """Absolute change of the simulated output around each inner sample; measured outliers do not affect it."""
     simulated = interpolate_gaps(measured[1 : 1 + residuals.size] - residuals)
     steps = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
     return np.maximum(steps[:-1], steps[1:])
 
 
 def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
-    """Deviation of the residuals of each row, robustly: of all rows, or if it is larger, of those of its speed.
+    """Robust standard deviation of the residuals by row: of all rows, or that of rows of similar speed if larger.
 
     Noise that grows with speed (an error of timing, a rate, a gain) is no outlier. Nor is all that moves, where a
     machine stands still for a part of the run.
@@ -385,7 +385,7 @@ def quantization_step(values: Floats) -> float:
 
 
 def correlation_findings(joint: JointFit) -> list[Finding]:
-    """Return findings on groups of parameters that are not separately identifiable, one a group."""
+    """Return findings on groups of parameters that are not separately identifiable, one per group."""
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
     sizes = {n: abs(v) for n, v in joint.values_by_name.items()}
     # Negated so that a standard error that is not a number counts as too large.
@@ -423,7 +423,7 @@ def excitation_findings(runs: Sequence[Run], structure: Structure) -> list[Findi
 
 
 def dead_channel_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on measured channels that are dead, which a fit would take for motion."""
+    """Return findings on measured outputs that stay constant for a time although they vary otherwise."""
     channels = [(r.with_interpolated_gaps(), n) for r in runs for n in r.outputs if n in structure.signals]
     return [item for run, name in channels for item in find_dead_channel(run, name)]
 
@@ -525,7 +525,7 @@ def stability_findings(model: Model) -> list[Finding]:
 
 
 def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
-    """Return a finding on the fastest oscillation that has too few samples a period."""
+    """Return a finding on the fastest oscillation that has too few samples per period."""
     if model.structure.has_friction:
         return []
     try:

@@ -31,7 +31,7 @@ LAG_RANK_TOLERANCE = 1e-10
 
 
 def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
-    """Raise ModelError for runs and structures whose signals a filter does not whiten alike."""
+    """Raise ModelError for runs and structures to which a noise model does not apply."""
     asked = parameter("noise", "ar")
     if len(structure.outputs) > 1:
         raise ModelError(f"{asked} is of one output, not of {', '.join(structure.outputs)}; fit each one")

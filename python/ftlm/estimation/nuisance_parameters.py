@@ -40,7 +40,7 @@ from ftlm.utils.statistics import (
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
 
-#: Block pulses a sample interval if the fit does not state its refinement.
+#: Block pulses per sampling interval if the fit does not state its refinement.
 DEFAULT_PULSES_PER_SAMPLE = 2
 #: Relative size of the offset sensitivity below which it is collinear with the other parameters.
 OFFSET_COLLINEARITY_TOLERANCE = 1e-6
@@ -87,7 +87,7 @@ class OffsetTest:
     def decision(self) -> str:
         """Decision of ``offset="auto"`` as text."""
         if not self.degrees:
-            return "none: these runs do not tell one from the other unknowns"
+            return "none: it is not separately identifiable from the other parameters"
         if self.exceeds():
             return f"constant, since the runs ask for one ({self.statistic_text})"
         return f"none, since the runs ask for none ({self.statistic_text})"
@@ -140,7 +140,7 @@ def offset_test(
         whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
         grid, here = evaluate_at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
     except FtlmError:
-        # No finite free run on this grid: the result says so elsewhere.
+        # No finite simulation on this grid: the result says so elsewhere.
         return None
     first = len(grid.problem.orders) + grid.problem.coefficients.index(names[0])
     rows = np.asarray(here.outcome["jacobian"])
@@ -292,7 +292,7 @@ def fit_with_initial_conditions(
             fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
             fine = replace(fine, starts=many.starts, origin=many.origin)
             return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
-        # Where a free run may grow, the starts of the race are asked on every grid.
+        # Where a simulation may grow, the starts of the race are asked on every grid.
         return _simplify_initial_terms(fit_initial_terms(start, raced=raced), runs, structure, loss, refine=True)
     joint = fit_initial_terms(start)
     if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
@@ -321,7 +321,7 @@ def _simplify_initial_terms(
     try:
         few = refit_from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
     except FtlmError:
-        # From here it has no finite free run, so it is not enough.
+        # From here it has no finite simulation, so it is not enough.
         return joint
     return joint if _fit_needs_history(few, joint, runs, structure) else few
 

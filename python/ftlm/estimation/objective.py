@@ -30,7 +30,7 @@ def sample_run(
     decimation: int = 1,
     shares: Floats | None = None,
 ) -> _core.Experiment:
-    """Convert a run for the core, with `every` pulses a sample interval and each `decimation`-th sample.
+    """Convert a run for the core, with `every` pulses per sampling interval and each `decimation`-th sample.
 
     `shares` are the robust weights of the compared samples, one row an output. Missing samples have weight 0.
     """
@@ -96,7 +96,7 @@ def minimize_cost(
 
 @dataclass(frozen=True)
 class Objective:
-    """Output-error objective on sampled runs: problem, output weights, pulses a sample, decimation.
+    """Output-error objective on sampled runs: problem, output weights, pulses per sample, decimation.
 
     `robust_weights` holds the weights of a robust loss by run, one row an output. With `prefer_stable`, no step leads
     from a stable model to an unstable one.

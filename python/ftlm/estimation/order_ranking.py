@@ -64,7 +64,7 @@ def search_orders(
     order_grid
         Intervals and increment; see :func:`ftlm.order_grid`.
     criterion
-        ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
+        ``"output-error"``: the simulation, each equation driven by the measured other outputs. ``"equation-error"``:
         measured signals on the right-hand side; it prefers near-identities.
     coefficients
         ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``:
@@ -78,7 +78,7 @@ def search_orders(
         (``"time"``). Without K0 the prior is weak in any units; see :class:`ftlm.MultiInnovation`. Of
         ``"multi-innovation"`` alone; with other coefficients a change of them is refused.
     m
-        Block pulses a run; default 2 048, or what the runs carry.
+        Block pulses per run; default 2 048, or what the runs carry.
     top
         Rows of the table.
     threads

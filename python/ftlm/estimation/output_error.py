@@ -1,4 +1,4 @@
-"""Comparison of an unstable optimum with the best stable one."""
+"""Joint output-error fit: multistart, optimum with its statistics, and the free parameters in model files."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class ProfileInterval:
     ----------
     low, high
         Its ends, in the unit of the number; infinite where the cost does not rise to the threshold within the bounds,
-        as far as there is a finite free run.
+        as far as there is a finite simulation.
     level
         Probability with which intervals of repeated runs hold the truth.
     points
@@ -138,8 +138,8 @@ class JointFit:
     samples
         Number of residuals, without missing samples.
     refinement
-        Block pulses a sample interval on the finest grid. The estimates are extrapolated from it and the next coarser
-        one.
+        Block pulses per sampling interval on the finest grid. The estimates are extrapolated from it and the
+        next coarser one.
     step_converged
         Whether halving the step moved every estimate by less than a tenth of its standard error.
     converged
@@ -271,7 +271,8 @@ def _check_sample_count(runs: Sequence[Run], structure: Structure) -> FreeProble
     samples = sum(max(drop_missing(known).size - 2, 0) for known in values)
     if samples <= len(problem.names):
         raise DataError(
-            f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
+            f"{samples} samples between the first and the last do not determine {len(problem.names)} free "
+            f"parameters; use "
             "longer runs, or fix orders or coefficients"
         )
     return problem
@@ -329,7 +330,7 @@ def fit_output_error(
     )
     if found is None:
         why = describe_collinear_inputs(runs, structure) or "check the signs of the data and the bounds"
-        raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
+        raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {why}")
     orders, coefficients, inputs = problem.split(found["estimate"])
     residuals = [dict(zip(outputs, part, strict=True)) for part in found["left"]]
     return JointFit(
@@ -407,8 +408,8 @@ def parameter_set_of(model: Model) -> FitParameters:
     if known is None or isinstance(known, UnsetType):
         how = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
         raise ModelError(
-            f"this model {how}, or of a file that does not say what was free in its fit: without intervals and noise "
-            f"no experiment can be laid out; identify it with {parameter('method', 'output-error')}"
+            f"this model {how}, or its file does not list the free parameters, whose covariance an input design needs; "
+            f"identify it with {parameter('method', 'output-error')}"
         )
     return known
 
@@ -429,7 +430,7 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
         what = (
             f"no value of {lacking[0]}" if lacking else f"{len(known.orders)} orders where its equations have {count}"
         )
-        raise ModelError(f"what the model says of its fit has {what}; identify it again")
+        raise ModelError(f"the record of the fit in the model has {what}; identify it again")
     laws = iter(known.orders)
     equations = []
     for item in model.equations:
@@ -455,5 +456,5 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     problem = FreeProblem.of(structure)
     if set(problem.names) != set(known.names):
         odd = sorted(set(problem.names) ^ set(known.names))
-        raise ModelError(f"what the model says of its fit does not fit its equations: {odd[0]}; identify it again")
+        raise ModelError(f"the record of the fit in the model contradicts its equations: {odd[0]}; identify it again")
     return problem, [values[n] for n in problem.names]

@@ -57,7 +57,7 @@ class PhysicalParameter:
 
 @check_arguments
 def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str, PhysicalParameter]:
-    """Compute the physical parameters of a link from its coefficients, given one parameter a stage.
+    """Compute the physical parameters of a link from its coefficients, given one parameter per stage.
 
     a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (paper (16)-(21)), or j = J_1/J_2, fix
     five ratios of six parameters. Standard errors follow from the joint covariance to first order; the known value is
@@ -68,7 +68,7 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
     joint
         Joint output-error fit of a :func:`flexible_link` with its coefficient law.
     known
-        One parameter a stage by name: K_s1, J_11, J_12, B_11, B_12 or K_tau1 (2 for the second stage).
+        One parameter per stage by name: K_s1, J_11, J_12, B_11, B_12 or K_tau1 (2 for the second stage).
 
     Returns
     -------
@@ -83,7 +83,7 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
     out: dict[str, PhysicalParameter] = {}
     names = {name.format(j=j): (j, unit) for j in (1, 2) for name, unit in PHYSICAL_UNITS.items()}
     if not known:
-        raise ModelError(f"no physical parameter is given; one a stage must be known: {', '.join(names)}")
+        raise ModelError(f"no physical parameter is given; one per stage must be known: {', '.join(names)}")
     stages = []
     for name, value in known.items():
         if name not in names:

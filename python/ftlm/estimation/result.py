@@ -202,7 +202,7 @@ class Identification:
         Parameters
         ----------
         **known
-            One parameter a stage by name, such as ``J_12=0.1704``.
+            One parameter per stage by name, such as ``J_12=0.1704``.
 
         Returns
         -------
@@ -235,9 +235,9 @@ class Identification:
         noise variance, widened for colored residuals; a robust loss keeps the weights of the fit. Each bound is
         followed continuously from the optimum, so another optimum beyond a ridge is not found.
 
-        It takes two to four refits an end where the picture is nearly quadratic, up to forty in a valley without end:
-        some ten to two hundred free runs a number, each as long as one evaluation on the fit's finest grid. Ends are
-        found by several threads, with the same figures for any number of them; Ctrl-C ends it within a refit.
+        A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley: ten to two
+        hundred simulations per parameter, each as long as one evaluation on the fit's finest grid. The result does not
+        depend on the number of threads. Ctrl-C ends the search within a refit.
 
         Parameters
         ----------
@@ -285,8 +285,8 @@ class Identification:
         Returns
         -------
         Validation
-            A :class:`ftlm.Comparison` whose ``.verdict`` says whether to trust the model. Its warnings name a fit that
-            is lost, and runs that the model was identified from.
+            A :class:`ftlm.Comparison` with a ``.verdict``. Its findings name a fit that falls, and runs from which the
+            model was identified.
 
         Raises
         ------
@@ -309,7 +309,7 @@ class Identification:
         path
             File to write.
         validation
-            Runs that the model was not identified from; without any, the page says that it was not validated.
+            Validation runs; without them the page says that the model was not validated.
         force
             Overwrite an existing file.
 
@@ -391,7 +391,7 @@ class Identification:
         Parameters
         ----------
         validation
-            What :meth:`validate` said of runs that the model was not identified from.
+            Result of :meth:`validate`; None for the summary without a validation.
 
         Raises
         ------

@@ -112,7 +112,7 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
 
 
 def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], comparison: Comparison) -> list[Finding]:
-    """Return a finding if the plant is unstable: as the model says, or unlike a joint fit that explains little."""
+    """Return a finding if pieces of the runs show an unstable plant, by the model or by a linear fit at its orders."""
     if model.structure.has_friction:
         return []
     explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())

@@ -145,7 +145,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
     return Verdict(
-        TRUST_LEVEL, f"it predicts runs it was not fitted to ({fits}), residuals are noise, every number is known"
+        TRUST_LEVEL, f"it predicts validation runs ({fits}), residuals are noise, all parameters are well determined"
     )
 
 
@@ -186,7 +186,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     if judged is not None:
         return judged
     fits = ", ".join(f"{o} {f.fit:.3g} %" for c in validation for o, f in c.output_error.items())
-    return Verdict(TRUST_LEVEL, f"it predicts runs it was not fitted to ({fits}), and nothing spoke against its fit")
+    return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), and no finding speaks against its fit")
 
 
 def saved_findings(known: Estimate) -> list[Finding]:
@@ -280,7 +280,7 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
 
 
 def is_degenerate(result: Identification) -> bool:
-    """Whether a fit must not be used by itself, so that no comparison with it says anything."""
+    """Whether the verdict on a fit without validation is "do not use", so that comparisons with it are meaningless."""
     return result.verdict.level == LEVEL_DO_NOT_USE
 
 
@@ -315,9 +315,9 @@ def improves_prediction(
 
 
 def is_buried(residuals: OutputResiduals) -> bool:
-    """Whether the residuals of an output are white or colored noise in which nothing of the inputs is left.
+    """Whether the residuals of an output are noise that is uncorrelated with the inputs.
 
-    A model that says nothing passes too where nothing of the input is in the output: it must explain something.
+    The model must also explain a part of the output: a zero model of an output without response passes the tests.
     """
     moving = [t for t in residuals.informative_tests.values() if t.conclusive]
     explained = residuals.nr < MAX_BURIED_RESIDUAL
@@ -381,7 +381,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     }
     following = {o: signals for o, signals in following.items() if signals}
     if following:
-        shown = ", ".join(f"{o} still follow {join_names(signals)}" for o, signals in following.items())
+        shown = ", ".join(f"{o} with {join_names(signals)}" for o, signals in following.items())
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
         yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
     yield from coupled

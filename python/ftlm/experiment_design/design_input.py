@@ -284,8 +284,9 @@ def _design_candidates(
     found = [d for d in begun if d.score > -math.inf]
     if not found:
         raise ModelError(
-            f"no input tells {', '.join(laid.names[i] for i in goal.indices)} from the other numbers: they move the "
-            "outputs in ways that no experiment of this length tells apart; name fewer numbers, or make the run longer"
+            f"no input of this length makes {', '.join(laid.names[i] for i in goal.indices)} separately "
+            f"identifiable from "
+            "the other parameters; name fewer parameters, or make the run longer"
         )
     # Of each kind the best one: what they lead to differs more than what they are.
     kinds: dict[str, Design] = {}
@@ -331,9 +332,7 @@ def _check_arguments(
     if reference_run is None and isinstance(model, Identification) and model.task is not None:
         reference_run = model.task.runs[0]
     if reference_run is not None and not isinstance(reference_run, Run):
-        raise ModelError(
-            f"reference_run is {type(reference_run).__name__}, not a Run; give a run that the machine bore"
-        )
+        raise ModelError(f"reference_run is {type(reference_run).__name__}, not a Run; give a run of the machine")
     free = parameter_set_of(solved)
     outputs = solved.outputs
     laid = ModelFit.of(solved, per_signal_values("noise", noise, outputs, free.noise))
@@ -368,7 +367,7 @@ def _check_arguments(
     )
     for name, value in bounds.peaks.items():
         if math.isinf(value):
-            raise ModelError(f"peak of {name} is infinite: the louder the better; give what the machine bears")
+            raise ModelError(f"peak of {name} is infinite; give the largest value that the machine allows")
     ramp = bounds.ramp_samples(time)
     if ramp > rows // 4:
         slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
@@ -461,12 +460,13 @@ def _parameter_indices(laid: ModelFit, names: Sequence[str] | None) -> tuple[int
         if not isinstance(name, str) or name not in laid.names:
             near = nearest(name, laid.names) if isinstance(name, str) else ""
             raise ModelError(
-                f"names[{k}] = {short_repr(name)} is no free number of the model{near}; it has {', '.join(laid.names)}"
+                f"names[{k}] = {short_repr(name)} is no free parameter of the model{near}; it has "
+                f"{', '.join(laid.names)}"
             )
         if name in given[:k]:
             raise ModelError(f"names has {name!r} twice; give each once")
     if not given:
-        raise ModelError("names is empty; give the numbers to be told, or leave it out for all orders")
+        raise ModelError("names is empty; give the parameters of interest, or leave it out for all orders")
     return tuple(laid.names.index(n) for n in given)
 
 
@@ -475,13 +475,14 @@ def _check_stable(laid: ModelFit, bounds: Bounds) -> None:
     found = stability(laid.model)
     if found.unstable_poles != 0 or found.on_axis:
         raise ModelError(
-            f"the model is {found}: whatever an experiment begins with grows, and none can be laid out on it; identify "
-            "the machine in a loop that holds it, or check the model"
+            f"the model is {found}, and inputs are designed for stable models; identify the machine with a stabilizing "
+            "controller, or check the model"
         )
     drifting = [o for o, limit in bounds.output_limits.items() if math.isinf(limit)]
     if found.origin_order > 0 and drifting:
         raise ModelError(
-            f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; "
+            f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift "
+            f"without limit; "
             f"say how far it may go by {parameter('limits')}, or give {parameter('reference_run')} a run"
         )
 
@@ -527,7 +528,7 @@ def _raise_too_uncertain(laid: ModelFit, why: str, times: tuple[float, float] | 
     band = f"{low:.2g}:{max(high, 2 * low):.2g}"
     raise ModelError(
         f"the intervals are too wide to design on ({why}): what is best for this model may be bad for the machine. "
-        f"First record a run that shakes all of its band, such as a multisine of {band} Hz (ftlm record --input "
+        f"First record a run that excites the whole band, such as a multisine of {band} Hz (ftlm record --input "
         f"multisine --band {band}), and identify again from both runs"
     )
 

@@ -147,7 +147,7 @@ def per_signal_values(
     Raises
     ------
     ModelError
-        A name that is none of them, a value that is no positive number, or one that is not said without a default.
+        An unknown name, a value that is not positive, or a missing value without a default.
     """
     if isinstance(given, Mapping):
         for name in given:

@@ -5,7 +5,7 @@ KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIONS a JSON object w
 the reader writes one line of JSON to standard output, followed by the numbers:
 
 ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays as
-little-endian float64, column after column; or ``{"error": why, "way_out": what to do}`` and nothing else. An array may
+little-endian float64, column after column; or only ``{"error": reason, "way_out": remedy}``. An array may
 have a ``"unit"``. An array of timestamps has ``"since"``, the reference time in integer nanoseconds since 1970 for its
 values in nanoseconds. Columns that do not come from matrices have ``"text": true``; a run written by ftlm has
 ``"ftlm-run"``, its header. A sheet has ``"sheet"``, its name, ``"others"``, the names of empty sheets, and ``"bytes"``,

@@ -97,6 +97,11 @@ _OUTPUT_WORDS = frozenset(
 )
 #: Voltage is an input of motors and an output of cells.
 _AMBIGUOUS_WORDS = frozenset(["voltage", "volt", "volts", "spannung", "v"])
+#: Words of reference signals, which neither enter a plant nor leave it.
+_REFERENCE_WORDS = frozenset(("ref", "reference", "setpoint", "target", "desired", "soll", "sollwert", "referenz"))
+#: Words by which a commanded input and its measurement differ.
+_COMMAND_WORDS = frozenset(("cmd", "command", "commanded"))
+_MEASUREMENT_WORDS = frozenset(("meas", "measured", "actual", "ist"))
 #: Words of temperature columns, whose degrees are no angles.
 _TEMPERATURE_WORDS = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
 
@@ -108,7 +113,28 @@ def words_of(column: str) -> set[str]:
 
 
 def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Guess inputs and outputs from column names; both are empty if the names are ambiguous."""
+    """Guess inputs and outputs from column names; both are empty if the names are ambiguous.
+
+    References are left out, and a command beside its own measurement, if the other columns have both roles.
+    """
+    measured = {_tokens(c) - _MEASUREMENT_WORDS for c in columns if _tokens(c) & _MEASUREMENT_WORDS}
+    plant = [
+        c
+        for c in columns
+        if not words_of(c) & _REFERENCE_WORDS
+        and not (_tokens(c) & _COMMAND_WORDS and _tokens(c) - _COMMAND_WORDS in measured)
+    ]
+    found = _roles_by_words(plant)
+    return found if found[0] else _roles_by_words(columns)
+
+
+def _tokens(column: str) -> frozenset[str]:
+    """Return the case-folded words of a column name with their digits, such as ``im1``."""
+    return frozenset(re.split(r"[\W_]+", column.casefold()))
+
+
+def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the columns whose names have words of inputs, and those with words of outputs."""
     told = {column: words_of(column) for column in columns}
     drives = [c for c, words in told.items() if words & _INPUT_WORDS and not words & _OUTPUT_WORDS]
     follows = [c for c, words in told.items() if words & _OUTPUT_WORDS and not words & _INPUT_WORDS]

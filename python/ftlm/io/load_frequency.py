@@ -19,125 +19,99 @@ from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import PART_COLUMNS, parameter
 from ftlm.utils.validation import Complex, Floats, join_names, nearest
 
+#: Words of each part of a response, alone or beside the name z, h or g, as in ``zreal`` and ``im(z)``.
+_PART_WORDS = {
+    "real": ("re", "real"),
+    "imag": ("im", "imag", "img", "imaginary"),
+    "magnitude": ("abs", "mag", "mod"),
+    "phase": ("phase", "arg"),
+}
 #: Column names of each part, case-folded, without spaces and underscores; a leading minus inverts the sign.
 _PART_SYNONYMS = {
-    "frequency": (
-        "f",
-        "freq",
-        "frequency",
-        "frequenz",
-        "fréquence",
-        "frecuencia",
-        "frequenza",
-        "hz",
-        "w",
-        "omega",
-        "ω",
-        "angularfrequency",
-        "kreisfrequenz",
-        "rad/s",
-    ),
-    "real": (
-        "re",
-        "real",
-        "realpart",
-        "realteil",
-        "z'",
-        "z′",
-        "z’",
-        "zreal",
-        "zre",
-        "rez",
-        "re(z)",
-        "zr",
-        "z'(a)",
-        "reh",
-        "re(h)",
-        "reg",
-        "re(g)",
-        "hreal",
-        "greal",
-        "real(z)",
-        "real(h)",
-        "real(g)",
-    ),
-    "imag": (
-        "im",
-        "imag",
-        "imaginary",
-        "imagpart",
-        "imaginarypart",
-        "imaginärteil",
-        "imaginaerteil",
-        "z''",
-        "z″",
-        "z′′",
-        "zimag",
-        "zim",
-        "imz",
-        "im(z)",
-        "zi",
-        "z''(b)",
-        "z’’",
-        "imh",
-        "im(h)",
-        "img",
-        "im(g)",
-        "himag",
-        "gimag",
-        "imag(z)",
-        "imag(h)",
-        "imag(g)",
-    ),
-    "magnitude": (
-        "mag",
-        "magnitude",
-        "gain",
-        "abs",
-        "amplitude",
-        "betrag",
-        "verstärkung",
-        "verstaerkung",
-        "modulus",
-        "|z|",
-        "|h|",
-        "|g|",
-        "zmod",
-        "zmag",
-        "amp",
-        "abs(z)",
-        "abs(h)",
-        "abs(g)",
-        "z",
-        "db",
-        "impedance",
-        "amplitudengang",
-    ),
-    "phase": (
-        "phase",
-        "phi",
-        "φ",
-        "ϕ",
-        "arg",
-        "angle",
-        "winkel",
-        "zphz",
-        "phase(z)",
-        "zphase",
-        "phz",
-        "theta",
-        "θ",
-        "deg",
-        "°",
-        "phasenwinkel",
-        "phasengang",
-        "arg(z)",
-        "arg(h)",
-        "arg(g)",
-        "phase(h)",
-        "phase(g)",
-    ),
-    "deviation": ("std", "sigma", "σ", "deviation", "stddev", "sd", "stdev", "standarddeviation", "standardabweichung"),
+    part: (
+        *names,
+        *_PART_WORDS.get(part, ()),
+        *(
+            form.format(q, w)
+            for w in _PART_WORDS.get(part, ())
+            for q in "zhg"
+            for form in ("{0}{1}", "{1}{0}", "{1}({0})")
+        ),
+    )
+    for part, names in {
+        "frequency": (
+            "f",
+            "freq",
+            "frequency",
+            "frequenz",
+            "fréquence",
+            "frecuencia",
+            "frequenza",
+            "hz",
+            "w",
+            "omega",
+            "ω",
+            "angularfrequency",
+            "kreisfrequenz",
+            "rad/s",
+        ),
+        "real": ("realpart", "realteil", "z'", "z′", "z’", "zr", "z'(a)"),
+        "imag": (
+            "imagpart",
+            "imaginarypart",
+            "imaginärteil",
+            "imaginaerteil",
+            "z''",
+            "z″",
+            "z′′",
+            "zi",
+            "z''(b)",
+            "z’’",
+        ),
+        "magnitude": (
+            "magnitude",
+            "gain",
+            "amplitude",
+            "betrag",
+            "verstärkung",
+            "verstaerkung",
+            "modulus",
+            "|z|",
+            "|h|",
+            "|g|",
+            "amp",
+            "z",
+            "db",
+            "impedance",
+            "amplitudengang",
+        ),
+        "phase": (
+            "phi",
+            "φ",
+            "ϕ",
+            "angle",
+            "winkel",
+            "zphz",
+            "phz",
+            "theta",
+            "θ",
+            "deg",
+            "°",
+            "phasenwinkel",
+            "phasengang",
+        ),
+        "deviation": (
+            "std",
+            "sigma",
+            "σ",
+            "deviation",
+            "stddev",
+            "sd",
+            "stdev",
+            "standarddeviation",
+            "standardabweichung",
+        ),
+    }.items()
 }
 _ANGULAR_FREQUENCY_NAMES = frozenset(("w", "omega", "ω", "angularfrequency", "kreisfrequenz", "rad/s"))
 _MINUS_PREFIX_PATTERN = re.compile(r"^(?:-|−|–|neg|minus)")
@@ -301,7 +275,7 @@ def _check_parts(found: Mapping[str, _ResponseColumn], pool: Pool) -> None:
     known = ", ".join(f"{i.part} {i.column.name!r}" for i in found.values()) or "none"
     missing = "the frequency" if "frequency" not in found else "real and imaginary part, or magnitude and phase"
     raise DataError(
-        f"{missing} cannot be told from the names of the columns (known are: {known}); name them with "
+        f"{missing} cannot be recognized by column names (recognized: {known}); name the columns with "
         f"{parameter('columns', PART_COLUMNS)}, parts frequency, real and imag, or frequency, magnitude and phase; "
         f"{pool.describe()}"
     )
@@ -441,8 +415,8 @@ def _polar(
     )
     if decibels == "dB" and "deviation" in found:
         raise DataError(
-            f"column {found['deviation'].column.name!r} is taken for the standard deviation of the real and of the "
-            "imaginary part, and sizes in dB have another; give real and imaginary part, or name the others with "
+            f"column {found['deviation'].column.name!r} is read as the standard deviation of real and imaginary "
+            "part, which does not apply to magnitudes in dB; give real and imaginary part, or name the columns with "
             f"{parameter('columns', PART_COLUMNS)}"
         )
     written = _PHASE_UNIT_FACTORS.get(angle.unit.casefold())

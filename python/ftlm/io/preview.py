@@ -33,10 +33,12 @@ from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import write_atomically
-from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, flag_of, parameter
+from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, choose_text, flag_of, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
 _MAX_LISTED_COLUMNS = 40
+#: Equation of a resistor in series with a resistor beside a constant-phase element.
+_ZARC = "D^alpha U = a U + r D^alpha I + b I"
 #: Names of time columns that imply seconds.
 _SECONDS_COLUMN_NAMES = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
 #: Part of a column's error message about its first bad cell.
@@ -302,13 +304,14 @@ class _FilePreview:
             clock, assumed = self.pool.time(wanted.time, matrices if len(matrices) == 1 else [], self._named_signals())
         except DataError as error:
             if is_response(self.pool):
+                command = f"ftlm identify-frequency {shlex.quote(os.fspath(self.table.path))} --structure {_ZARC!r}"
+                how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ZARC!r})", command)
                 return (
                     None,
                     (),
-                    (
-                        "these are columns of a frequency response or an impedance spectrum, and none is a time; "
-                        "ftlm.load_frequency and ftlm identify-frequency read it as such"
-                    ),
+                    f"the columns are those of a frequency response or an impedance spectrum, and none is a "
+                    f"time; {how} "
+                    "fits a first model, of an impedance a resistor before a depressed arc",
                 )
             return None, (), str(error)
         if assumed is not None:

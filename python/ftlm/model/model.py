@@ -23,7 +23,7 @@ from ftlm.utils.validation import Complex, Floats, check_pulses
 
 if TYPE_CHECKING:
     from ftlm.analysis.poles import Mode, Stability
-    from ftlm.plot.model_charts import Answer, Bode
+    from ftlm.plot.model_charts import Bode, TimeResponse
     from ftlm.validation.comparison import Comparison
     from ftlm.validation.residual_tests import Residuals
 
@@ -257,7 +257,7 @@ class Model:
         return dcgain(self)
 
     @check_arguments
-    def step(self, time: ArrayLike | None = None) -> Answer:
+    def step(self, time: ArrayLike | None = None) -> TimeResponse:
         """Response to unit steps from rest with its standard deviation, plotted in notebooks.
 
         Parameters
@@ -267,7 +267,7 @@ class Model:
 
         Returns
         -------
-        Answer
+        TimeResponse
             ``.time``, ``.values`` of shape (outputs, inputs, N), ``.deviation`` from the covariance or None.
 
         Raises
@@ -279,16 +279,16 @@ class Model:
         ConvergenceError
             An unstable model whose response overflows.
         """
-        from ftlm.plot.model_charts import answer
+        from ftlm.plot.model_charts import time_response
 
-        return answer(self, time, "step")
+        return time_response(self, time, "step")
 
     @check_arguments
-    def impulse(self, time: ArrayLike | None = None) -> Answer:
+    def impulse(self, time: ArrayLike | None = None) -> TimeResponse:
         """Response to unit impulses, averaged over each sampling interval; otherwise as :meth:`step`."""
-        from ftlm.plot.model_charts import answer
+        from ftlm.plot.model_charts import time_response
 
-        return answer(self, time, "impulse")
+        return time_response(self, time, "impulse")
 
     @check_arguments
     def bode(self, w: ArrayLike | None = None) -> Bode:
@@ -413,6 +413,13 @@ class Model:
         from ftlm.analysis.conversion import to_tf
 
         return to_tf(self)
+
+    @check_arguments
+    def to_ss(self, *, step: float | None = None) -> Any:
+        """Convert a model of integer orders to a state space of python-control; see :func:`ftlm.analysis.to_ss`."""
+        from ftlm.analysis.conversion import to_ss
+
+        return to_ss(self, step=step)
 
     @check_arguments
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:

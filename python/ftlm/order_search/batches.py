@@ -522,7 +522,7 @@ def _join_verdicts(wave: list[Verdicts], first: int, end: int) -> Outcomes:
         values.append(verdicts.values)
         kinds.append(verdicts.kinds)
     if at != end:
-        raise ModelError(f"candidates {first} to {end} are cut up otherwise")
+        raise ModelError(f"candidates {first} to {end} are divided into other blocks")
     return b"".join(values), b"".join(kinds)
 
 

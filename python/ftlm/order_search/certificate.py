@@ -52,7 +52,7 @@ def certify_orders(
     Branch and bound halves boxes of orders until each has a lower bound of the RMS equation error, with the best
     coefficients of each of its orders, of at least the best one found times ``1 - tolerance``. The certificate covers
     squared equation errors, equations at rest, and free coefficients only. No such certificate is known for
-    simulations: a finding says where the free run of the best orders grows or explains little of the output.
+    simulations: a finding says where the simulation of the best orders grows or explains little of the output.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def certify_orders(
     tolerance
         Tolerance: how much smaller than the best error found that of other orders may be, as a fraction below 1.
     start
-        Tuples of orders by name, such as those of another optimizer. The certificate has the error of each, and tells
+        Tuples of orders by name, such as those of another optimizer. The certificate has the error of each, and shows
         which of them other orders may still beat.
     min_separation
         Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.
@@ -222,7 +222,7 @@ def certify_job(
 
 
 def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
-    """Return NR of the free run of some orders, infinite if there is none, and the number of unstable poles."""
+    """Return NR of the simulation of some orders, infinite if there is none, and the number of unstable poles."""
     settings = SearchSettings(**{**CERTIFIED_SETTINGS, "criterion": "output-error", "pruning": False})
     values = {name: (orders[name],) for name in job.values}
     try:

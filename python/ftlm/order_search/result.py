@@ -1,4 +1,4 @@
-"""Certificate of an order search."""
+"""Results of an order search: ranked table, certificate, and progress of a checkpoint file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ftlm.utils.parameters import choose_text, parameter
 if TYPE_CHECKING:
     from ftlm.estimation.verdict import Verdict
 
-#: NR of a free run above which it explains little of the output.
+#: NR of a simulation above which it explains little of the output.
 MAX_FREE_RUN_NR = 0.5
 #: Relative difference below which scores and coefficients of two rows are those of one model.
 SAME_MODEL_TOLERANCE = 1e-6
@@ -52,8 +52,8 @@ class OrderCertificate:
     m
         Block pulses per run.
     free_run_nr
-        RMS of the output minus the free run of the best orders, relative to the standard deviation of the output, with
-        the coefficients of least equation error; infinite if the free run leaves the range of numbers. The certificate
+        RMS of the output minus the simulation of the best orders, relative to the standard deviation of the output,
+        with the coefficients of least equation error; infinite if the simulation overflows. The certificate
         bounds the equation error alone.
     unstable_poles
         Number of poles of that model with a positive real part; NaN if it is not known.
@@ -82,7 +82,7 @@ class OrderCertificate:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the free run of the best orders, which no certificate of the equation error bounds."""
+        """Findings on the simulation of the best orders, which no certificate of the equation error bounds."""
         if self.unstable_poles > 0:
             return (make_finding("certified_run_grows", poles=int(self.unstable_poles), nr=self.free_run_nr),)
         if self.free_run_nr > MAX_FREE_RUN_NR:
@@ -137,7 +137,8 @@ class OrderCertificate:
         # Rounded up: a share that is said must be true.
         share = math.ceil(1000 * self.proved_tolerance - 1e-4) / 10
         text = (
-            f"certificate: no orders with {intervals} ({apart}), on a lattice or between, leave an RMS equation error "
+            f"certificate: no orders with {intervals} ({apart}), on the order grid or between, have an RMS "
+            f"equation error "
             f"below {self.lower_bound:.5g} with coefficients whose terms are together at most "
             f"{self.max_term_ratio:g} times the "
             f"output; {found} leave {self.best:.5g}, so nothing is better by more than {share:g} % ({cells})"
@@ -416,7 +417,7 @@ def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What b
         ("search", "ranked by", "candidates", "kept", *reasons),
         rows,
         groups=(("", 4), ("left out", len(reasons))) if reasons else (),
-        note="Every candidate of the lattice is kept or counted under a reason. “beaten” and “stopped early” were "
+        note="Every candidate of the order grid is kept or counted under a reason. “beaten” and “stopped early” were "
         "worse than the last row kept."
         + "".join(
             f" Of the {number(s.exclusion_counts['bound'])} under “bound” of {_search_name(name)}, "

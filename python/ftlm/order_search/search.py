@@ -304,7 +304,7 @@ def resume_search(
     executor: Executor | None = None,
     recover: bool = False,
 ) -> dict[str, SearchResult]:
-    """Go on with the searches of a store; it holds all that they are computed from.
+    """Resume the searches of a checkpoint file, which contains their data and settings.
 
     Parameters
     ----------
@@ -313,14 +313,14 @@ def resume_search(
     threads, progress, executor
         As for :func:`search_orders`.
     recover
-        Whether to go on with a damaged store: what stands before the damage is kept, the rest is computed again, and
-        the damaged file stays beside it as ``….damaged``.
+        Whether to continue a damaged file: the part before the damage is kept, the rest is computed again, and the
+        damaged file is renamed to ``….damaged``.
 
     Returns
     -------
     dict of SearchResult
-        By output, or under ``"stage"`` for a search under an order law; those of the uninterrupted searches to the last
-        bit. A store that is complete is only read.
+        By output, or under ``"stage"`` for a search under an order law. The results equal those of uninterrupted
+        searches bit for bit. A complete file is only read.
 
     Raises
     ------
@@ -348,7 +348,7 @@ def resume_job(
     progress: Callable[[int, int], None] | None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Go on with one search of a store."""
+    """Resume one search of a checkpoint file."""
     check_executor(executor)
     job = replace(job_of(store, number, threads_per_task(threads, executor)), progress=_core_callback(progress))
     with _usable(store.path, store.contents.requests[number]):
@@ -442,7 +442,7 @@ def landscape(
     search
         What was found.
     orders
-        Names of the two; by default the first two free orders that the lattice gives several values.
+        Names of the two; by default the first two free orders with several values in the order grid.
     threads
         See :func:`ftlm.search_orders`.
 
@@ -460,7 +460,7 @@ def landscape(
     names = orders or tuple(list(axes)[:2])
     if len(names) != 2 or names[0] == names[1] or any(n not in axes for n in names):
         free = ", ".join(axes) or "none"
-        raise ModelError(f"a landscape needs two different orders with several values each; this lattice has {free}")
+        raise ModelError(f"a landscape needs two different orders with several values each; this order grid has {free}")
     x, y = (np.array(axes[n]) for n in names)
     fixed = structure.with_orders({n: v for n, v in best.items() if n not in names})
     table = rank_orders(

@@ -69,7 +69,7 @@ def comparison_charts(
             points=points,
             slider=True,
             bands=_behind_measured(known[name]) if name in known else (),
-            caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
+            caption=f"Simulation: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
             + (" Shade: 95 % confidence band of the simulation." if name in known else ""),
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)
@@ -150,7 +150,7 @@ def residual_series(
 
 @check_arguments
 def compared_bars(
-    compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the free run"
+    compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the simulation"
 ) -> list[Figure]:
     """Chart the fits of several models side by side, for every output.
 
@@ -235,7 +235,7 @@ def error_chart(
     return line_chart(
         pulse_times(compared[0][1], run),
         errors,
-        title=title or f"{symbol(output)}: absolute error of the free run",
+        title=title or f"{symbol(output)}: absolute error of the simulation",
         x_label="time [s]",
         y_label=with_unit("|error|", units, output),
         points=points,
@@ -305,8 +305,8 @@ def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
     return f"{bars} The residual {word} white noise: {judged} (99 %)."
 
 
-def picture(run: Run, *signals: str) -> Figures:
-    """Charts of a run; see :meth:`ftlm.Run.plot`."""
+def run_charts(run: Run, *signals: str) -> Figures:
+    """Return charts of a run; see :meth:`ftlm.Run.plot`."""
     unknown = [name for name in signals if name not in run]
     if unknown:
         raise DataError(f"signal {unknown[0]!r} is not in run {run.name!r}; its signals are {', '.join(run.signals)}")

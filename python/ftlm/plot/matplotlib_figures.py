@@ -28,7 +28,7 @@ from ftlm.experiment_design.result import DesignedInput
 from ftlm.model.model import Model
 from ftlm.order_search.search import landscape as scores_of
 from ftlm.plot.comparison_charts import pulse_times, with_unit
-from ftlm.plot.model_charts import Answer, bode_curves, pole_points, response_frequencies
+from ftlm.plot.model_charts import TimeResponse, bode_curves, pole_points, response_frequencies
 from ftlm.svg.heat_map import Landscape
 from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.arguments import check_arguments
@@ -74,7 +74,7 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
         raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")
     if given.size != rows * columns:
         raise ModelError(
-            f"this picture has {rows * columns} axes ({rows} by {columns}), and ax has {given.size}; give as many, "
+            f"this figure has {rows * columns} axes ({rows} by {columns}), and ax has {given.size}; give as many, "
             f"such as subplots({rows}, {columns})[1], or leave ax out"
         )
     return given[0].figure, given.reshape(rows, columns)
@@ -308,7 +308,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
             raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
     elif isinstance(result, Identification):
         if not result.searches or result.task is None:
-            raise ModelError("this identification searched no lattice, so it has no landscape")
+            raise ModelError("this identification searched no order grid, so it has no landscape")
         name = next(iter(result.searches)) if output is None else output
         if name not in result.searches:
             raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")
@@ -320,7 +320,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     axis = axes[0, 0]
     scores = np.where(np.isfinite(found.scores) & (found.scores > 0), found.scores, np.nan)
     if np.all(np.isnan(scores)):
-        raise ModelError("no candidate of this lattice has a finite score; widen it")
+        raise ModelError("no candidate of this order grid has a finite score; widen it")
     norm = importlib.import_module("matplotlib.colors").LogNorm()
     drawn = axis.pcolormesh(found.x, found.y, scores, norm=norm, cmap="viridis", shading="nearest")
     axis.set_facecolor("0.8")
@@ -461,7 +461,7 @@ def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax:
     return _response_figure(_model_of(model).impulse(time), ax)
 
 
-def _response_figure(found: Answer, ax: Any) -> Any:
+def _response_figure(found: TimeResponse, ax: Any) -> Any:
     figure, axes = axes_for(ax, len(found.outputs), max(len(found.inputs), 1))
     for i, output in enumerate(found.outputs):
         for j, signal in enumerate(found.inputs):
@@ -605,7 +605,7 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
         axis.bar_label(bars, [f"{v:.4g}" for v in fits], fontsize="small", padding=3)
     axis.set_yticks(range(len(compared)), [escape_math(n) for n in compared])
     axis.invert_yaxis()
-    axis.set(xlabel="fit of the free run [%]", xlim=(0, 112))
+    axis.set(xlabel="fit of the simulation [%]", xlim=(0, 112))
     if len(outputs) > 1:
         axis.legend(loc="lower right", fontsize="small")
     return figure

@@ -112,8 +112,8 @@ def pole_charts(model: Model) -> list[Figure]:
     found = modes(model)
     plane = "s" if q == 1 else f"s^{q:.4g}"
     inside = sum(m.unstable for m in found)
-    words = "none is in it" if not inside else f"{inside} of {len(found)} modes in it: the model is not stable"
-    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, where poles make a free run grow; {words}."
+    words = "it has no pole" if not inside else f"it has {inside} of {len(found)} modes, so the model is not stable"
+    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, the unstable sector; {words}."
     if q != 1:
         caption += f" A relaxation is drawn at −T^−{q:.4g}."
     unit = "rad/s" if q == 1 else f"(rad/s)^{q:.4g}"
@@ -189,7 +189,7 @@ class Bode:
     curves: tuple[BodeCurve, ...]
 
     def figures(self) -> list[Figure]:
-        """Its charts, as in a report."""
+        """Charts as in a report."""
         return bode_figures(self.frequency, self.curves)
 
     def __str__(self) -> str:
@@ -248,7 +248,7 @@ def response_charts(found: Response, *, units: Mapping[str, str] | None = None) 
 
 
 @dataclass(frozen=True)
-class Answer(Response):
+class TimeResponse(Response):
     """Step or impulse response with charts, the result of :meth:`ftlm.Model.step`.
 
     Parameters
@@ -263,18 +263,18 @@ class Answer(Response):
     units: Mapping[str, str] = field(default_factory=dict)
 
     def figures(self) -> list[Figure]:
-        """Its charts, as in a report."""
+        """Charts as in a report."""
         return response_charts(self, units=self.units)
 
     def __str__(self) -> str:
-        lines = [f"{self.kind} response, {self.time.size} instants to {self.time[-1]:.4g} s"]
+        lines = [f"{self.kind} response, {self.time.size} samples to {self.time[-1]:.4g} s"]
         for i, output in enumerate(self.outputs):
             for j, signal in enumerate(self.inputs):
                 values, last = self.values[i, j], self.values[i, j, -1]
                 at = int(np.argmax(np.abs(values)))
                 sure = "" if self.deviation is None else f" ± {self.deviation[i, j, -1]:.2g}"
                 lines.append(
-                    f"  {output} from {signal}: at the end {last:.5g}{sure}, farthest {values[at]:.5g} at "
+                    f"  {output} from {signal}: final value {last:.5g}{sure}, peak {values[at]:.5g} at "
                     f"{self.time[at]:.4g} s"
                 )
         return "\n".join(lines)
@@ -283,7 +283,7 @@ class Answer(Response):
         return "".join(f._repr_html_() for f in self.figures())
 
 
-def answer(model: Model, time: ArrayLike | None, kind: str) -> Answer:
+def time_response(model: Model, time: ArrayLike | None, kind: str) -> TimeResponse:
     """Return a step or impulse response of a model with charts; see :meth:`ftlm.Model.step`."""
     found = response(model, time, kind=kind)
-    return Answer(**vars(found), units=dict(model.units))
+    return TimeResponse(**vars(found), units=dict(model.units))

@@ -156,7 +156,8 @@ def behavior_tables(model: Model) -> list[Table]:
             for k, m in enumerate(found)
         ]
         note = (
-            "A swing has the time constant 1/|Re s|, a relaxation 1/|s|; standard errors are to first order from the "
+            "The time constant is 1/|Re s| of an oscillation and 1/|s| of a relaxation; standard errors are to "
+            "first order from the "
             "covariance of the fit."
         )
         columns = ("mode", "pole s [rad/s]", "frequency [rad/s]", "±", "damping", "±", "time constant [s]", "±")
@@ -187,7 +188,7 @@ SERIES_POINTS = 600
 #: Points of a convergence curve.
 TRACE_POINTS = 64
 #: Text for models with friction, in place of their stability.
-FRICTION_STABILITY_NOTE = "The body rests while friction holds it, so that no poles say how it comes to rest."
+FRICTION_STABILITY_NOTE = "A model with friction is not linear, so it has no poles."
 
 
 def identification_page(
@@ -244,7 +245,7 @@ def identification_page(
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
     details.append(frequency_section(model, steps))
     details += _search_sections(result)
-    titled = ((f"Initial terms of the free runs, {label}", c) for label, c in compared)
+    titled = ((f"Initial terms of the simulations, {label}", c) for label, c in compared)
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.fit)] if result.fit is not None and result.fit.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
@@ -269,12 +270,12 @@ def first_sections(
     """
     units = model.units
     words = [
-        "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
-        "edge of their interval, pull of the prior, coefficient law, residuals, stability of the discretisation, the "
+        "No check raised a warning. Checked: simulation against equation error, orders close to one another or on the "
+        "edge of their interval, influence of the prior, coefficient law, residuals, stability of the scheme, the "
         "data."
     ]
     if not validated:
-        words.append("No validation run was given: how well the model predicts other data is not known.")
+        words.append("No validation run was given, so the prediction of other data is unknown.")
     warned = unique(findings)
     shown, left = first_findings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
@@ -294,7 +295,7 @@ def first_sections(
     sections = []
     if first:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table of errors has every run."
-        heading = "Measured and simulated, on runs that were not fitted" if new else "Measured and simulated"
+        heading = "Validation: measured and simulated" if new else "Measured and simulated"
         sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
     sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint)]),
@@ -307,9 +308,7 @@ def first_sections(
         sections.append(Section("Errors", tables=[errors_table(compared, units=units)], collapsed=True))
     if new and known:
         figures = known[: max(PAGE_CHARTS - len(new), 0)]
-        sections.append(
-            Section("Measured and simulated, on the runs that were fitted", figures=figures, collapsed=True)
-        )
+        sections.append(Section("Estimation: measured and simulated", figures=figures, collapsed=True))
     return sections
 
 
@@ -395,7 +394,7 @@ def _search_sections(result: Identification) -> list[Section]:
     traces = _traces(result)
     if traces:
         words = (
-            "Error (45) of the free run after every step of the recursion, at the orders found. p weighs the data "
+            "Error (45) of the simulation after every step of the recursion, at the orders found. p weighs the data "
             "against the prior; all lines end where the closed form is."
         )
         sections.append(Section("Convergence of the recursion", words, figures=traces))
@@ -463,7 +462,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     for label, comparison in compared:
         fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit_percent.items())
         runs = ", ".join(name for name, _, _ in comparison.per_run)
-        sentences.append(f"Fit of the free run, {label} ({runs}): {fits}.")
+        sentences.append(f"Fit on {label} data ({runs}): {fits}.")
     return " ".join(sentences)
 
 
@@ -509,7 +508,7 @@ def settings_table(result: Identification, *, title: str = "What the result depe
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
         ["structure", structure.name],
-        ["coupling in free runs", structure.coupling],
+        ["coupling in simulations", structure.coupling],
         ["estimator", result.method],
         *settings_rows(result.settings, searched=bool(result.searches)),
     ]
@@ -601,7 +600,10 @@ def model_page(
     if tests := tests_on(model, others):
         details.append(residual_section(tests, None, compared, model.units))
     details.append(frequency_section(model, [(r.step, r.duration) for r in others]))
-    about: list[list[Cell]] = [["structure", model.structure.name], ["coupling in free runs", model.structure.coupling]]
+    about: list[list[Cell]] = [
+        ["structure", model.structure.name],
+        ["coupling in simulations", model.structure.coupling],
+    ]
     if known is not None:
         about += [["estimator", known.method], ["identified from", ", ".join(known.runs)]]
         about += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in known.fit.items()]

@@ -14,7 +14,7 @@ from ftlm.analysis.poles import Mode, SteadyState, modes, steady_states
 from ftlm.errors import FtlmError
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import verdict
-from ftlm.findings import MAX_SUMMARY_FINDINGS, Finding, group_findings, hidden_findings_text
+from ftlm.findings import LEVEL_NOTE, MAX_SUMMARY_FINDINGS, Finding, group_findings, hidden_findings_text
 from ftlm.model.model import Model
 from ftlm.report.typesetting import ORDER_DECIMALS
 from ftlm.structure.equation import Equation, format_equation
@@ -92,7 +92,7 @@ def parameter_lines(result: Identification) -> list[str]:
 def behavior_lines(model: Model) -> list[str]:
     """Return lines on steady-state gains and modes, if the model has them."""
     if model.structure.has_friction:
-        return ["  no poles, no gain: a body that may stick answers out of proportion"]
+        return ["  no poles and no gain: a model with friction is not linear"]
     lines: list[str] = []
     # Equations that cannot be solved for their outputs together have neither; everything else can be told.
     with contextlib.suppress(FtlmError):
@@ -124,7 +124,7 @@ def describe_gain(state: SteadyState, model: Model) -> str:
         course = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
         return f"{pair}: none, it integrates: {rate}{unit} {course}{sure}"
     if state.order < 0:
-        return f"{pair}: 0, a step dies away{sure}"
+        return f"{pair}: 0, the response to a step decays{sure}"
     return f"{pair}: {rate}{unit}{sure}"
 
 
@@ -142,7 +142,7 @@ def describe_order(state: SteadyState) -> str:
 def fit_lines(result: Identification, validation: Comparison | None) -> list[str]:
     """Return lines on the simulation fit on estimation and validation data, and on the equation error."""
     width = max(len(o) for o in result.output_error) + 2
-    lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
+    lines = [f"{'simulation fit, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
     for output, own in result.output_error.items():
         unit = result.model.units.get(output, "")
         other = "not tried" if validation is None else f"{validation.output_error[output].fit:.4g}"
@@ -172,7 +172,7 @@ def _starts(result: Identification) -> list[str]:
         if sum(map(len, terms.values())) and not comparison.offsets
     ]
     if moving:
-        lines += wrap_text(f"in motion at its start, initial terms estimated with it: {', '.join(moving)}")
+        lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {', '.join(moving)}")
     return lines
 
 
@@ -181,7 +181,9 @@ def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[s
     found = group_findings(findings)
     lines = []
     for group in found[:MAX_SUMMARY_FINDINGS]:
-        lines += wrap_text(f"{group.first_finding}{group.count}", "! ")
+        lines += wrap_text(
+            f"{group.first_finding}{group.count}", "  " if group.first_finding.level == LEVEL_NOTE else "! "
+        )
         if group.remedy:
             lines += wrap_text(group.remedy, "  -> ")
     more = hidden_findings_text(found)
@@ -201,7 +203,7 @@ def settings_text(settings: Mapping[str, Any]) -> str:
     """Return the settings on one line."""
     words = f"M = {settings['m']}"
     if "refinement" in settings:
-        words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} starts"
+        words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} initial guesses"
     if "seeds" in settings:
         seeds = ", ".join(map(str, settings["seeds"]))
         words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
@@ -212,11 +214,11 @@ def settings_text(settings: Mapping[str, Any]) -> str:
     if "loss" in settings:
         words += f", loss: {settings['loss']} ({robust_loss_text(settings)})"
     words += f", initial terms: {settings['initial']}"
-    words += f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
+    words += f", offset: {settings['offset']}, one per run" if "offset" in settings else ""
     words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
     words += f", noise: autoregression of order {len(settings['noise_model'])}" if "noise_model" in settings else ""
     return words + (
-        f", instrument: what of the inputs follows {settings['reference']}" if "reference" in settings else ""
+        f", instrument: the part of the inputs that {settings['reference']} explains" if "reference" in settings else ""
     )
 
 
@@ -230,7 +232,7 @@ def robust_loss_text(settings: Mapping[str, Any]) -> str:
 
 def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
     """Return the settings as table rows; the ranking criterion only if orders were searched."""
-    rows: list[list[Cell]] = [["block pulses a run, M", int(settings["m"])]]
+    rows: list[list[Cell]] = [["block pulses per run, M", int(settings["m"])]]
     if "innovation_length" in settings:
         rows += [
             ["innovation length, p", int(settings["innovation_length"])],
@@ -242,8 +244,8 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         ]
     if "refinement" in settings:
         rows += [
-            ["pulses a sample interval", int(settings["refinement"])],
-            ["automatic starts", int(settings["starts"])],
+            ["pulses per sampling interval", int(settings["refinement"])],
+            ["automatic initial guesses", int(settings["starts"])],
         ]
         rows += [[f"noise found on {symbol(name)}", float(level)] for name, level in settings["noise"].items()]
     if "loss" in settings:
@@ -256,7 +258,7 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
     if "noise_model" in settings:
         rows.append(["noise", f"autoregression of order {len(settings['noise_model'])}, estimated with the model"])
     if "reference" in settings:
-        rows.append(["reference", f"{settings['reference']}; instrument: what of the inputs follows it"])
+        rows.append(["reference", f"{settings['reference']}; instrument: the part of the inputs that it explains"])
     if searched:
         rows.append(
             ["orders ranked by", f"{settings['criterion']}, {NORM_TEXTS.get(settings['norm'], settings['norm'])}"]

@@ -231,7 +231,7 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
     rows += [row(n, v, None, place) for n, (place, v) in inputs.items()]
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
     if known:
-        note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
+        note = "Intervals assume a right model. A coefficient without one is fixed or given by the law."
         if profiles:
             note += f" Those of {', '.join(map(symbol, profiles))} are by profile likelihood, the others symmetric."
     else:

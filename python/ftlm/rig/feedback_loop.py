@@ -124,7 +124,7 @@ def control(
     if duration is None:
         if given.ndim == 1:
             raise ModelError(
-                f"a reference that is held needs {parameter('duration')} [s]; or give it as rows, one a sample"
+                f"a reference that is held needs {parameter('duration')} [s]; or give it as rows, one per sample"
             )
         duration = (len(given) - 1) / rate
     duration, limit, rate = check_times(duration, limit, rate)

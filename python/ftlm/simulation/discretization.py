@@ -146,7 +146,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
 
 
 def without_level(run: Run, structure: Structure) -> tuple[Run, Structure]:
-    """Return a run as deviations from the level of a structure, which its equations have no term for."""
+    """Return a run minus the output level of a structure, and the structure without it."""
     if structure.offset != "level":
         return run, structure
     return deviations(run, structure)[0], replace(structure, offset="none")
@@ -374,7 +374,7 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
         if item.friction is not None:
             raise ModelError(
                 f"the equation of {item.output} has friction, which {what} does not know; use "
-                f"{parameter('method', 'output-error')} and free runs (simulate, compare), or leave the friction out"
+                f"{parameter('method', 'output-error')} and simulations (simulate, compare), or leave the friction out"
             )
 
 
@@ -407,7 +407,7 @@ def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
 def equation_tuple(
     item: Equation, signals: Sequence[str]
 ) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
-    """Return an identified equation: its structure and its coefficients."""
+    """Return an equation with its coefficients as arguments of the core."""
     for term in item.terms:
         _check_excess_order(term.signal, term.order.constant, item.output, item.order.constant)
     return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
@@ -456,7 +456,8 @@ def prepare(
             if structure.offset in ("constant", "ramp") and _is_offset(term, item, prepared):
                 raise DataError(
                     f"{term.signal} is constant on every run, so {term} and the offset in the equation of "
-                    f"{item.output} cannot be told apart; add a run in which it changes, fix its coefficient, "
+                    f"{item.output} are not separately identifiable; add a run in which it changes, fix its "
+                    f"coefficient, "
                     f"or use {parameter('offset', 'none')}"
                 )
     return prepared

@@ -106,8 +106,8 @@ class RestEvidence:
     Parameters
     ----------
     rows
-        Number of rows in which inputs and outputs stand still before an input moves; 1 if only the outputs do, at zero,
-        and 0 if the inputs are constant from the first or second row on, so that rest is an assumption.
+        Number of rows in which inputs and outputs are constant before an input changes; 1 if only the outputs are, at
+        zero; 0 if the inputs are constant from the first or second row on, so that rest is an assumption.
     levels
         Level of each output before the run.
     inputs
@@ -157,7 +157,7 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
         for name in outputs:
             noise = noise_at_start(run[name])
             rows = _without_outliers(drop_missing(run[name][:quiet]), noise)
-            if rows.size < START_SETTINGS.quiet_rows or not _stands_still(rows, noise):
+            if rows.size < START_SETTINGS.quiet_rows or not _is_at_rest(rows, noise):
                 return None
             if held and noise * run.length / _slope_weight(rows.size) > START_SETTINGS.drift_share * float(
                 np.nanstd(run[name])
@@ -175,7 +175,7 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
 
 
 def _slow_start_evidence(run: Run, structure: Structure) -> RestEvidence | None:
-    """Return the evidence of outputs that are zero and hardly move at first, though an input may act from row 0 on."""
+    """Return the evidence of outputs that start at zero and move slowly at first; an input may act from row 0 on."""
     inputs = [n for n in structure.signals if n in run.inputs]
     outputs = [n for n in structure.signals if n in run.outputs]
     if not inputs or not outputs or any(n not in run for n in structure.signals) or run.sample_times is not None:
@@ -211,7 +211,7 @@ def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
     return np.flatnonzero(np.abs(samples - samples[0]) > START_SETTINGS.rounding * float(np.max(np.abs(samples))))
 
 
-def _stands_still(rows: Floats, noise: float) -> bool:
+def _is_at_rest(rows: Floats, noise: float) -> bool:
     """Whether slope and scatter of rows are those of noise."""
     t = np.arange(rows.size) - 0.5 * (rows.size - 1)
     slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
@@ -363,10 +363,10 @@ def output_residuals(measured: Floats, simulated: Floats) -> Floats:
 
 
 def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Floats]) -> float:
-    """Return the Bayesian information criterion of a start with so many terms, from the residuals of each output.
+    """Return the Bayesian information criterion of a fit with this number of initial terms, from its residuals.
 
     The residuals count as white ones by the color of `reference`: all starts are allowed the same smooth misfit, so
-    that none wins by what the structure lacks.
+    that the choice does not depend on missing terms.
     """
     score, total = 0.0, 0
     for own, other in zip(residuals, reference, strict=True):

@@ -129,9 +129,10 @@ def fit_history(
 
 
 def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
-    """Return the amounts of some shapes in a signal, each with a normal prior whose size has the largest likelihood.
+    """Return posterior means of the coefficients of some shapes in a signal, under a normal prior.
 
-    What the shapes do not explain is noise; smooth noise counts as so much more white noise.
+    The standard deviation of the prior has the largest likelihood. The rest of the signal is
+    noise, with the variance of its sums.
     """
     left, spread, right = thin_svd(shapes)
     along = projections(left, target)

@@ -107,7 +107,7 @@ def simulate(
         An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); the level of an
         output is the exponent infinity, and inputs then count from their values in quiet rows; default none. Initial
         values y(0), y'(0) by Caputo's definition bring further powers of t where a term of the output has a fractional
-        order; a call that leaves these out is refused, and says them.
+        order; a call without these powers raises an error that lists them.
     max_m
         Maximum number of pulses; a larger remaining change raises ConvergenceError.
 
@@ -163,7 +163,7 @@ def simulate(
         if not np.all(np.isfinite(samples)):
             at = int(np.argmax(~np.isfinite(samples))) * run.step
             raise ConvergenceError(
-                f"the free run of {name} leaves the range of numbers {at:.4g} s into run {run.name!r}; "
+                f"the simulation of {name} overflows {at:.4g} s into run {run.name!r}; "
                 "the model is unstable: check its orders and coefficients"
             )
     if not np.all(free.change <= tolerance):
@@ -182,7 +182,7 @@ def simulate(
 
 
 def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
-    """Raise ModelError for initial values without the powers that Caputo derivatives of own terms bring along.
+    """Raise ModelError for initial values that lack the fractional powers of t that own terms imply.
 
     D^nu y of y = y_i t^i / i! + ... is integrated by alpha to I^(alpha - nu) (y - y_i t^i / i! ...).
     """

@@ -225,7 +225,10 @@ class Structure:
                 f"own with {parameter('coupling', 'simulated')}, or leave it out of the filter"
             )
         if self.free_delays:
-            raise ModelError(f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in seconds")
+            raise ModelError(
+                f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in "
+                f"seconds, such as a fit without friction estimates it"
+            )
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
         held = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
         if held:

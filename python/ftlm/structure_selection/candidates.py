@@ -356,7 +356,7 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
         else [(describe_structure(s) if isinstance(s, Structure) else "", s) for s in structures]
     )
     if not items:
-        raise ModelError("there are no candidates; give structures, or one structure whose inside is searched")
+        raise ModelError("there are no candidates; give structures, or one structure whose terms are selected")
     for place, (_, structure) in enumerate(items):
         if not isinstance(structure, Structure):
             raise ModelError(

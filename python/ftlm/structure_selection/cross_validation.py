@@ -136,7 +136,7 @@ class Folds:
             for run in others:
                 if any(_same(run, fitted) for fitted in every):
                     raise ModelError(
-                        f"validation run {run.name} is one of those that are fitted to, which judges nothing; leave it "
+                        f"validation run {run.name} is also an estimation run, so it validates nothing; leave it "
                         f"out of one of the two, or use {parameter('validation', 'runs')}"
                     )
             names = ", ".join(r.name for r in others)

@@ -136,20 +136,20 @@ class Selection(ReportMixin):
         """Return the candidates as a table of a page."""
         columns = (
             "structure",
-            "numbers",
-            "fit where fitted %",
-            "fit where unseen %",
-            "least %",
+            "parameters",
+            "estimation fit %",
+            "validation fit %",
+            "worst fold %",
             "BIC",
-            "not told from 0",
+            "insignificant",
         )
         return Table(
             "Candidates, best prediction first",
             columns,
             self._rows(),
             wrap=True,
-            note="Fits are means over runs and outputs, the least is that of the worst run or block left out. BIC "
-            "counts as many samples as the colour of the best residuals lets count.",
+            note="Fits are means over runs and outputs; the worst fold is the worst run or block left out. BIC "
+            "counts effective samples, from the autocorrelation of the best residuals.",
         )
 
     def figure(self) -> Figure:
@@ -166,19 +166,19 @@ class Selection(ReportMixin):
         chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, unseen, strict=True)]
         return line_chart(
             [float(n) for n in along],
-            [("where fitted", seen), ("where unseen", unseen), ("chosen", chosen)],
-            title="What each number is worth",
-            x_label="numbers estimated",
+            [("estimation", seen), ("validation", unseen), ("chosen", chosen)],
+            title="Fit by number of parameters",
+            x_label="estimated parameters",
             y_label="fit in %",
             dots=("chosen",),
-            caption=f"The best candidate with each number of estimates; chosen is one with {self.winner.parameters}.",
+            caption=f"The best candidate with each number of parameters; the chosen one has {self.winner.parameters}.",
         )
 
     def _page(self) -> Page:
         sections = [
             Section(
                 "The choice",
-                paragraphs=[self.reason, f"Judged on: {self.validation}. {self.fitted} candidates fitted."],
+                paragraphs=[self.reason, f"Validation data: {self.validation}. {self.fitted} candidates fitted."],
                 warnings=list(self.warnings),
                 figures=[self.figure()],
             ),
@@ -242,8 +242,8 @@ class Selection(ReportMixin):
 
     def ranking_text(self) -> str:
         """Table of the candidates and the reason of the choice, as text."""
-        lines = [f"{len(self.trials)} of {self.fitted} fitted candidates judged: {self.validation}"]
-        lines.append(f"{'':2}{'unseen %':>9}{'least %':>9}{'fitted %':>10}{'numbers':>9}  structure")
+        lines = [f"{len(self.trials)} of {self.fitted} fitted candidates validated: {self.validation}"]
+        lines.append(f"{'':2}{'valid. %':>9}{'worst %':>9}{'estim. %':>10}{'param.':>9}  structure")
         for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
             mark = "> " if place == self.chosen else "  "
             lines.append(mark + _row(trial))

@@ -111,7 +111,7 @@ def select(
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
         ``"auto"``: one output, every input, integer orders 1 to 4 with zeros, delays, direct feedthrough, an
-        integrator and an output level, then fractional orders. These are chosen where they predict better, or alike
+        integrator and an output level, then fractional orders. These are chosen if they predict better, or as well
         with a Schwarz criterion lower by 10.
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
@@ -135,7 +135,7 @@ def select(
     Raises
     ------
     DataError
-        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing; a store
+        Runs that do not fit together or the structure, that are too short to be cut, or without excitation; a store
         of another selection, in use, damaged, or that cannot be written.
     ModelError
         No candidates, two that differ in parameter names only, more than 10 000, no validation run, an unknown option,
@@ -163,9 +163,8 @@ def select(
         )
     if not isinstance(candidates, (str, Structure)) and len(candidates) > MAX_CANDIDATES:
         raise ModelError(
-            f"{len(candidates)} candidates are more than {MAX_CANDIDATES}; give one structure instead, whose inside "
-            "is grown "
-            "step by step"
+            f"{len(candidates)} candidates are more than {MAX_CANDIDATES}; give one structure instead, from which "
+            "terms are selected stepwise"
         )
     every = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
     if isinstance(candidates, str) and candidates != "auto":
@@ -355,8 +354,8 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
 def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
     """Indices of trials that may be chosen beside integer orders, and a sentence on the fractional ones.
 
-    Fractional orders predict better only if they leave 1 % less than the best integer orders, beyond the scatter over
-    the folds. They are eligible as well if they predict alike and their criterion is lower by very strong evidence.
+    Fractional orders predict better only if their residuals are 1 % smaller than those of the best integer orders, and
+    significantly over the folds. They are also eligible if they predict as well and their criterion is much lower.
     """
     whole = [k for k in _peer_indices(ranked) if not is_fractional(ranked[k].structure)]
     other = [k for k in near if is_fractional(ranked[k].structure)]
@@ -375,7 +374,7 @@ def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[lis
 
 
 def _predicts_better(trial: Trial, other: Trial) -> bool:
-    """Whether a trial leaves 1 % less than another one, beyond the scatter over the folds."""
+    """Whether the residuals of a trial are smaller than another's by 1 %, and significantly over folds."""
     apart = np.array(trial.scores) - np.array(other.scores)
     if apart.size < MIN_SCATTER_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
         return False
@@ -414,16 +413,19 @@ def _with_validated_initial_conditions(trial: Trial, folds: Folds) -> Structure:
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
     """Describe why the winner was chosen."""
-    lead = f"Chosen: {winner.name} ({winner.parameters} numbers, {format_fit(winner.validation_fit)} % where unseen)"
+    lead = (
+        f"Chosen: {winner.name} ({winner.parameters} parameters, validation fit {format_fit(winner.validation_fit)} %)"
+    )
     peers = [ranked[k] for k in _peer_indices(ranked)]
     if winner is best:
         lead += ", which predicts best"
     else:
         more = best.parameters - winner.parameters
         lead += (
-            f", which leaves {100 * (math.exp(winner.score - best.score) - 1):.2g} % more than the best prediction"
-            + (f" with {more} number{'s' * (more > 1)} fewer" if more > 0 else "")
-            + " and has the least Schwarz criterion of those that predict alike"
+            f", whose residuals are {100 * (math.exp(winner.score - best.score) - 1):.2g} % larger than those "
+            f"of the best prediction"
+            + (f" with {more} parameter{'s' * (more > 1)} fewer" if more > 0 else "")
+            + " and which has the lowest Schwarz criterion of those that predict equally well"
         )
     for word, others in (
         ("fewer", [t for t in peers if t.parameters < winner.parameters]),
@@ -432,8 +434,8 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
         if others:
             near = min(others, key=lambda t: t.score)
             share = 100 * (math.exp(near.score - winner.score) - 1)
-            side = "more" if share >= 0 else "less"
-            lead += f"; the best with {word} ({near.parameters}) leaves {abs(share):.3g} % {side}"
+            side = "larger" if share >= 0 else "smaller"
+            lead += f"; the best with {word} ({near.parameters}) has {abs(share):.3g} % {side} ones"
     return lead + "." + _failure_text(winner, ranked)
 
 
@@ -446,7 +448,8 @@ def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
         other = min(ahead, key=lambda t: t.score)
         name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
         told += (
-            f" {other.name} leaves {share:.2g} % less on the mean and is not chosen: it fails on {name}, with "
+            f" {other.name} has {share:.2g} % smaller residuals on the mean and is not chosen: it fails on "
+            f"{name}, with "
             f"{format_fit(other.parts[name])} % where the chosen one has {format_fit(winner.parts[name])}."
         )
     for name in failures[id(winner)]:

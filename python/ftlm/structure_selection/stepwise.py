@@ -1,4 +1,4 @@
-"""Prescreening of candidates on subsampled records; only survivors are fitted on all samples."""
+"""Stepwise selection of a structure: forward, then backward, with prescreening on subsampled records."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _prescreen_cost(
                 found, grid.minimize(start_from_values(problem, point), PRESCREEN_EVALUATIONS).cost_per_residual
             )
         except FtlmError:
-            # A start whose free run is not finite is no start.
+            # A start whose simulation is not finite is no start.
             continue
     return found
 
@@ -191,7 +191,7 @@ class CandidateEvaluator:
             return trial
         joint = self.fit_candidate(trial.structure, [trial.values])
         try:
-            # On a finer grid it may have no finite free run: it stays what it was judged as.
+            # On a finer grid it may have no finite simulation: it stays what it was judged as.
             return trial if isinstance(joint, FtlmError) else update_trial(trial, self.folds, joint)
         except FtlmError:
             return trial

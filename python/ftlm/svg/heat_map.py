@@ -68,7 +68,7 @@ def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
     finite = np.isfinite(landscape.scores)
     good = landscape.scores[finite & (landscape.scores > 0)]
     if good.size == 0:
-        raise DataError("no candidate of this lattice has a finite score; widen it")
+        raise DataError("no candidate of this order grid has a finite score; widen it")
     low, high = float(good.min()), float(good.max())
     row, column = divmod(int(np.argmin(np.where(finite, landscape.scores, np.inf))), landscape.scores.shape[1])
     at = f"{symbol(across)} = {landscape.x[column]:g}, {symbol(upward)} = {landscape.y[row]:g}"
@@ -78,7 +78,7 @@ def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
     if landscape.score != "score":
         caption += f" Score: {landscape.score}."
     if left_out:
-        caption += f" Grey: {left_out} pairs that are no candidate or whose free run diverges."
+        caption += f" Grey: {left_out} pairs that are no candidate or whose simulation diverges."
     wide, small = (
         _heat_drawing(landscape, (low, high), (row, column), heading, described, narrow=n) for n in (False, True)
     )

@@ -338,7 +338,7 @@ def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]
     neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
     if not neutral:
         return low, high, []
-    # A free run that runs away would flatten what it is to be compared with.
+    # A simulation that runs away would flatten what it is to be compared with.
     bottom, top = limits(neutral, 0.0)
     reach = MAX_STRAY_HEIGHTS * (top - bottom)
     floor, ceiling = bottom - reach, top + reach

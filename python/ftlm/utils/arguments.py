@@ -1,4 +1,4 @@
-"""Errors of wrong arguments in words: what an argument is, and what its annotation says that it should be."""
+"""Error messages for arguments of a wrong type: the type found, and the type that the annotation asks for."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def check_arguments(decorated: Decorated) -> Decorated:
             cause = error.__cause__ if isinstance(error, FtlmError) else error
             foreign = cause is error or isinstance(cause, _FROM_ARGUMENTS)
             if foreign and cause is not None and not _is_raised_by_caller(cause):
-                _raise_in_words(decorated, given, named, error)
+                _raise_type_error(decorated, given, named, error)
             raise
 
     return cast("Decorated", call_function)
@@ -97,8 +97,8 @@ def _is_raised_by_caller(error: BaseException) -> bool:
     return False
 
 
-def _raise_in_words(function: Callable[..., Any], given: Any, named: Any, error: Exception) -> None:
-    """Raise for the first argument that is not what its annotation says."""
+def _raise_type_error(function: Callable[..., Any], given: Any, named: Any, error: Exception) -> None:
+    """Raise ModelError for the first argument whose type is not the annotated one."""
     signature = inspect.signature(function)
     try:
         bound = signature.bind(*given, **named)
@@ -108,7 +108,7 @@ def _raise_in_words(function: Callable[..., Any], given: Any, named: Any, error:
     for name, value in bound.arguments.items():
         annotation = _annotation(signature.parameters[name].annotation, names)
         if not _fits(value, annotation):
-            words = " or ".join(dict.fromkeys(_words(kind) for kind in _alternatives(annotation)))
+            words = " or ".join(dict.fromkeys(_describe_type(kind) for kind in _alternatives(annotation)))
             raise ModelError(
                 f"{setting(name)} {short_repr(value)} is a {type(value).__name__}; give {words}"
             ) from error
@@ -141,8 +141,8 @@ def _alternatives(annotation: Any) -> tuple[Any, ...]:
     return (annotation,)
 
 
-def _words(kind: Any) -> str:
-    """Say what a value of a type without alternatives is."""
+def _describe_type(kind: Any) -> str:
+    """Describe a type that is no union."""
     if get_origin(kind) is Literal:
         return ", ".join(map(repr, get_args(kind)))
     kind = get_origin(kind) or kind
@@ -150,7 +150,7 @@ def _words(kind: Any) -> str:
 
 
 def _fits(value: object, annotation: Any) -> bool:
-    """Whether a value is what an annotation says; True for annotations that cannot be checked."""
+    """Whether a value has the annotated type; True for annotations that cannot be checked."""
     return any(_fits_one(value, kind) for kind in _alternatives(annotation))
 
 

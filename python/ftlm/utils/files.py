@@ -1,4 +1,4 @@
-"""Logger ``ftlm``, silent unless the program configures a handler."""
+"""Files: paths in messages, atomic writing, versioned JSON documents, and the logger ``ftlm``."""
 
 from __future__ import annotations
 

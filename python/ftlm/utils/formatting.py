@@ -122,12 +122,12 @@ _CONTROL_PATTERN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u061c\\u200e\
 
 
 def escape_controls(text: str) -> str:
-    """Return a text with escapes, which JSON reads as well, in place of the characters that a terminal obeys."""
+    """Return a text with control characters replaced by escapes of JSON."""
     return _CONTROL_PATTERN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 class EscapedStream:
-    """Text stream to a terminal, on which names from files and messages of libraries cannot act.
+    """Text stream to a terminal that escapes the control characters of all that is written.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ class EscapedStream:
 
 
 def escape_standard_streams() -> None:
-    """Escape all that is printed from now on; streams that are escaped already stay."""
+    """Replace standard output and standard error by escaped streams; those that are escaped already stay."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if not isinstance(stream, EscapedStream):

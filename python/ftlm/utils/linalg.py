@@ -33,7 +33,7 @@ def vector_norm(row: Floats) -> float:
 
 
 def column_norms(columns: Floats) -> Floats:
-    """Euclidean norm of each column, of any scale."""
+    """Euclidean norm of each column, without overflow or underflow."""
     # Squares of large columns overflow.
     peaks = np.max(np.abs(columns), axis=0, initial=0.0)
     return np.asarray(peaks * np.linalg.norm(columns / np.where(peaks > 0, peaks, 1.0), axis=0))

@@ -93,7 +93,7 @@ def setting(name: str) -> str:
 
 
 def choose_text(python: str, command_line: str) -> str:
-    """Return the text for the interface in use, where the two say it by different means."""
+    """Return the first text in Python and the second on the command line."""
     return python if _Current.interface == "python" else command_line
 
 

@@ -208,7 +208,7 @@ def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
 
 @cache
 def _end_with_parent(_process: int) -> None:
-    """End this process with its parent: a worker of a killed pool would wait for tasks for good."""
+    """End this process when its parent ends; a worker of a killed pool would wait for tasks forever."""
     from multiprocessing import parent_process  # noqa: PLC0415 — pools alone import it
 
     parent = parent_process()

@@ -55,9 +55,9 @@ NOISE_SAMPLES = 4096
 
 
 def white_noise(samples: Floats) -> float:
-    """Standard deviation of white noise on a signal that may swing: the least of differences of several orders.
+    """Standard deviation of white noise on a signal that may oscillate: the least of several difference estimates.
 
-    White noise is in the differences of every order. A swing of few samples a period, which second differences take
+    White noise is in the differences of every order. A swing of few samples per period, which second differences take
     for noise, is in the low orders alone (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521).
     """
     least = estimate_noise(samples)

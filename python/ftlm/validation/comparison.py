@@ -162,7 +162,7 @@ class Comparison:
     offsets
         Unknown constants of the equations, one mapping per run: output -> ``"constant"`` [unit of D^alpha y] (and
         ``"ramp"`` [that unit/s]) -> value. Estimated on each run separately; empty for a model without an offset, and
-        for an output whose initial history makes the offset unidentifiable or whose free run diverges.
+        for an output whose initial history makes the offset unidentifiable or whose simulation diverges.
     without_equation_error
         Outputs without an equation error, with the reason: friction acts on them, or samples are missing.
     """
@@ -232,13 +232,13 @@ class Comparison:
         if self.output_samples:
             count = max(sum(drop_missing(y).size for y in parts) for parts in self.measured.values())
             known = (
-                f", equation error over {self.m} block pulses a run"
+                f", equation error over {self.m} block pulses per run"
                 if set(self.measured) - set(self.without_equation_error)
                 else ""
             )
             lines.append(f"output error over {count} samples{known}")
         else:
-            lines.append(f"over {self.m} block pulses a run")
+            lines.append(f"over {self.m} block pulses per run")
         lines += describe_missing_equation_errors(self.without_equation_error)
         lines += describe_offsets(self)
         lines += [f"warning: {w}" for w in self.warnings]
@@ -250,9 +250,9 @@ class Comparison:
 
 #: Reasons for a missing equation error.
 FRICTION_REASON = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
-MISSING_SAMPLES_REASON = "not every sample of it was read, and the straight lines between the others are no measurement"
+MISSING_SAMPLES_REASON = "some of its samples are missing, and interpolated samples are not measurements"
 #: Note on an offset that the initial history makes unidentifiable.
-HIDDEN_OFFSET_NOTE = "not told apart from what the run did before its start; begin the run at rest to learn it"
+HIDDEN_OFFSET_NOTE = "not separately identifiable from the initial conditions; begin the run at rest to identify it"
 
 
 @check_arguments
@@ -271,7 +271,7 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
     runs
         One run or several with the same names and units.
     m
-        Number of block pulses a run for the equation error; default that of the identification, or what the runs carry.
+        Number of block pulses per run for the equation error; default as in the identification, or what runs carry.
 
     Returns
     -------
@@ -358,7 +358,7 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
     """Return offsets of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
 
     Empty for an equation whose run has an initial history, since its powers of t make a constant unidentifiable, and
-    for one whose free run diverges, which determines no constant.
+    for one whose simulation diverges, which determines no constant.
     """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
@@ -384,7 +384,7 @@ def describe_offsets(comparison: Comparison) -> list[str]:
     for (run, _, _), offsets, initial in zip(comparison.per_run, comparison.offsets, comparison.initial, strict=False):
         for output, values in offsets.items():
             if not values:
-                note = HIDDEN_OFFSET_NOTE if initial[output] else "not estimated, since the free run diverges"
+                note = HIDDEN_OFFSET_NOTE if initial[output] else "not estimated, since the simulation diverges"
                 lines.append(f"offset in the equation of {output} in {run}: {note}")
                 continue
             if "level" in values:
@@ -584,13 +584,13 @@ def errors_table(
     if unequated and all(cell is None for row in rows for cell in row[1:own]):
         # Four columns of nothing would push what is known off a narrow screen.
         kept: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
-        single = (("", 1), ("output error (free run)", 4))
+        single = (("", 1), ("output error (simulation)", 4))
         return Table(title, ("output", *_METRIC_LABELS), kept, groups=single, headings=headings, note=" ".join(reasons))
     note = (
         "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
-        "close to one another; only the free run shows what the model knows."
+        "close to one another; only the simulation shows what the model knows."
     )
-    groups = (("", 1), ("equation error", 4), ("output error (free run)", 4))
+    groups = (("", 1), ("equation error", 4), ("output error (simulation)", 4))
     return Table(
         title,
         ("output", *_METRIC_LABELS, *_METRIC_LABELS),
@@ -606,7 +606,7 @@ def filter_state(exponent: float) -> str:
     return f"filter's state {round(-exponent)}"
 
 
-def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the free runs") -> Table | None:
+def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the simulations") -> Table | None:
     """Return initial terms by run and output, or None where every run starts at rest."""
     rows: list[list[Cell]] = [
         [name, symbol_html(output), Exact(exponent) if exponent > -1 else filter_state(exponent), value]

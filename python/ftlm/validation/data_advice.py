@@ -61,7 +61,7 @@ DRIFT_LAGS = 12
 MIN_TREND_RESIDUAL_SHARE = 1e-3
 #: Largest number of rows of the test for feedback.
 MAX_FEEDBACK_SAMPLES = 8_000
-#: Statistic over its limit from which feedback that cannot be told is mentioned. Sweeps in open loop reach a few.
+#: Statistic over its limit from which undecided feedback is mentioned. Sweeps in open loop reach a few.
 MIN_UNDECIDED_RATIO = 3.0
 
 

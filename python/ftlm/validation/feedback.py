@@ -16,7 +16,7 @@ from ftlm.utils.linalg import minimum_norm_solution
 from ftlm.utils.statistics import chi_squared, robust_deviation
 from ftlm.utils.validation import Floats
 
-FeedbackState = Literal["command", "none", "found", "cannot be told"]
+FeedbackState = Literal["command", "none", "found", "undecided"]
 #: Significance level over all sets of regressors, and their numbers of past innovations of the output.
 FEEDBACK_LEVEL = 0.005
 INNOVATION_COUNTS = (3, 12)
@@ -58,14 +58,14 @@ RIDGE_SHARE = 1e-10
 
 @dataclass(frozen=True)
 class FeedbackTest:
-    """Test whether an input answers what an output did before.
+    """Test whether an input depends on past values of an output (feedback).
 
     Parameters
     ----------
     state
-        ``"command"``: the input was made beforehand, or its own past determines it. ``"none"``: nothing comes back.
-        ``"found"``: past outputs determine what is new in the input. An input that was read with noise looks alike.
-        ``"cannot be told"``: the reason is in ``reason``.
+        ``"command"``: the input repeats itself, has few levels, or is determined by its own past. ``"none"``: no
+        feedback. ``"found"``: past outputs explain innovations of the input, as they do if it was measured with noise.
+        ``"undecided"``: see ``reason``.
     reason
         Reason in words; empty if there is none.
     ratio
@@ -75,9 +75,9 @@ class FeedbackTest:
     rows
         Rows that were tested.
     bias
-        Largest bias that the answer can make of a parameter, in its standard errors; None if it is not known.
+        Largest bias of a parameter by the feedback, in its standard errors; None if it is not known.
     response
-        Part of the input that answers the residuals, one array per run in the unit of the input; empty unless found.
+        Part of the input that past residuals explain, one array per run in the unit of the input; empty unless found.
     """
 
     state: FeedbackState
@@ -90,7 +90,7 @@ class FeedbackTest:
 
     @property
     def has_feedback(self) -> bool:
-        """Whether the input answers the output."""
+        """Whether the input depends on past outputs."""
         return self.state == "found"
 
     def to_dict(self) -> dict[str, Any]:
@@ -123,10 +123,10 @@ def feedback_test(
     longest = sum(signal[k].size for k in runs)
     if not runs:
         least = max((u.size for u in signal), default=0)
-        return FeedbackTest("cannot be told", f"runs of {least} rows; {MIN_FEEDBACK_ROWS} are needed")
+        return FeedbackTest("undecided", f"runs of {least} rows; {MIN_FEEDBACK_ROWS} are needed")
     inputs = [signal[k] for k in runs]
     if all(np.ptp(u) == 0 for u in inputs):
-        return FeedbackTest("cannot be told", "the input does not move")
+        return FeedbackTest("undecided", "the input is constant")
     changes = [np.flatnonzero(np.diff(u)) + 1 for u in inputs]
     levels = np.unique(np.concatenate(inputs)).size
     if all(_repeats(u) for u in inputs):
@@ -134,16 +134,16 @@ def feedback_test(
     if levels <= max(MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE * longest):
         if _has_clock(changes):
             return FeedbackTest("command", f"{levels} levels on a clock", rows=longest)
-        return FeedbackTest("cannot be told", f"{levels} levels: a relay switches as a command does", rows=longest)
+        return FeedbackTest("undecided", f"{levels} levels: a relay and a command look alike", rows=longest)
     count = sum(c.size for c in changes)
     dense = 2 * count >= longest
     if not dense and count < MIN_CHANGES:
-        return FeedbackTest("cannot be told", f"{count} changes; {MIN_CHANGES} are needed", rows=longest)
+        return FeedbackTest("undecided", f"{count} changes; {MIN_CHANGES} are needed", rows=longest)
     if not dense:
         # Between its changes a held input has no innovation. The residual before a change is known at the change.
         kept = [k for k, c in enumerate(changes) if c.size >= MIN_CHANGES // 2]
         if not kept:
-            return FeedbackTest("cannot be told", f"{count} changes over {len(runs)} short runs", rows=longest)
+            return FeedbackTest("undecided", f"{count} changes over {len(runs)} short runs", rows=longest)
         runs, inputs, changes = [runs[k] for k in kept], [inputs[k] for k in kept], [changes[k] for k in kept]
         missed = [_fill_missing(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
         moves = [u[c] for u, c in zip(inputs, changes, strict=True)]
@@ -382,10 +382,10 @@ class _Innovations:
         if robust_deviation(self.present) < QUIET_SHARE:
             return FeedbackTest("none", "the output has no noise that could come back", rows=count)
         now = self._present_ratio(clipped)
-        at_once = f"it moves with the output of the same row (ratio {now:.2g}): a controller, or a feedthrough"
+        at_once = f"it is correlated with the output of the same row (ratio {now:.2g}): a controller, or a feedthrough"
         if self.scale < PREDICTED_SHARE or self.noise < QUIET_SHARE:
             if now > 1:
-                return FeedbackTest("cannot be told", at_once, rows=count)
+                return FeedbackTest("undecided", at_once, rows=count)
             return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
         ratio, columns, rows = self._ratio(0, clipped)
         target = clipped[rows]
@@ -401,33 +401,33 @@ class _Innovations:
             return result("found")
         doubt = ""
         if _local_color(clipped) > 1:
-            doubt = "its innovations have a tone of their own"
+            doubt = "its innovations are not white"
         elif _local_past(clipped, self.past[:, :2]) > 1:
-            doubt = "its innovations follow its past here and there, as a sweep's do"
+            doubt = "its innovations depend on its past in parts of the run, as those of a sweep"
         if doubt and ratio <= PLACEBO_RATIO_IN_DOUBT:
-            return result("cannot be told", doubt)
+            return result("undecided", doubt)
         if ratio <= 1 or count * share * self.scale**2 < MIN_FEEDBACK_POWER:
             if now > 1:
-                return result("cannot be told", at_once)
+                return result("undecided", at_once)
             return result("none", "" if ratio <= 1 else "too little to matter")
         if self._ratio_with_noisy_input(rows) <= 1:
-            return result("cannot be told", "a loop, or noise in the measured input")
+            return result("undecided", "a closed loop, or noise in the measured input")
         # A loop acts all the time. Two signals that were made beforehand agree on one stretch by chance.
         gains = np.array([part.sum() for part in np.array_split(fitted * target, STEADY_PARTS)])
         if np.median(gains) < STEADY_SHARE * max(float(gains.sum()), 1e-300):
-            return result("cannot be told", "one stretch alone says so")
+            return result("undecided", "only one part of the run shows it")
         first = max(INNOVATION_COUNTS) + self.input_lags
         last = min(end - begin for begin, end in self.places) // 3
         far = np.unique(np.linspace(first, last, PLACEBO_COUNT).astype(int)).tolist() if last > first else []
         placebo = max((self._ratio(k, clipped)[0] for k in far), default=1.0)
         if ratio < (PLACEBO_RATIO_IN_DOUBT * max(placebo, 1.0) if doubt else PLACEBO_RATIO * placebo):
-            return result("cannot be told", doubt or f"outputs far back explain as much (ratio {placebo:.2g})")
+            return result("undecided", doubt or f"outputs far in the past explain as much (ratio {placebo:.2g})")
         return result("found")
 
     def _present_ratio(self, clipped: Floats) -> float:
-        """Statistic over its limit of the output's innovation of the same row, which an integral controller answers.
+        """Statistic over its limit of the output's innovation of the same row, for integral controllers.
 
-        Such an input shows in its own past all that it answered before, so that past outputs add nothing to it.
+        The past of such an input contains the past outputs already, so that they explain no more of it.
         """
         size = max(robust_deviation(self.present), 1e-300)
         present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)

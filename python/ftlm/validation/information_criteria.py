@@ -71,7 +71,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     Raises
     ------
     ModelError
-        A number of parameters that is none.
+        An invalid number of parameters.
 
     Notes
     -----
@@ -97,7 +97,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
 
 
 def information_table(information: InformationCriteria, *, title: str = "Information criteria") -> Table:
-    """Return AIC, AICc and BIC with what they count."""
+    """Return AIC, AICc and BIC with the numbers of parameters and samples."""
     criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
     # Differences count, not sizes: all digits before the point.
     rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]

@@ -128,7 +128,7 @@ class OutputResiduals:
     inputs
         Cross-correlations with each input, both signals through the whitening filter of the residuals.
     feedback_tests
-        By input of its equation, whether it answers what the output did before.
+        Feedback test of each input of its equation.
     """
 
     residuals: list[Floats]
@@ -297,7 +297,7 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     DataError
         Runs that do not fit the model, or are too short for these lags.
     ModelError
-        A number of lags that is none, an equation that cannot be solved for its output.
+        An invalid number of lags, an equation that cannot be solved for its output.
 
     Notes
     -----
