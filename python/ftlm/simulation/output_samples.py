@@ -121,7 +121,7 @@ def output_simulation(
     if frictions:
         check_uniform_samples(run, model)
         states = initial_tuple(start, plain.offset, plain.filter_states(start))
-        return core, (False, core.fit_friction_terms(states, friction_refinement, stop_flag()), False)
+        return core, (False, core.fit_initial_states(states, friction_refinement, stop_flag()), False)
     names = initial_names(model, start)
     exponents = [[(power, 0.0) for output, power in names if output == o] for o in model.outputs]
     return core, (True, exponents, structure.offset == "level")
