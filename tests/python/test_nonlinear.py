@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ftlm
+from ftlm.simulation.simulate import explicit_euler
 from ftlm.structure.expression import EXPRESSION_FUNCTIONS, add, apply, channel, constant, multiply, power
 from ftlm.structure.grammar import EquationParser
 
@@ -158,3 +159,97 @@ def test_a_saved_model_is_read_back(tmp_path):
     linear = ftlm.Model(ftlm.equation("D y = -1 y + 1 u")).save(tmp_path / "linear.json")
     assert '"schema": 2' in linear.read_text()
     assert "expression" not in linear.read_text()
+
+
+TEXT = "D^1.8 y = -2 y - 0.5 D^0.5 y - 3 y^3 + 0.7 y*u + u - 0.2 abs(D y)*D y"
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ftlm.Model(ftlm.equation(TEXT))
+
+
+@pytest.fixture(scope="module")
+def run():
+    u = np.repeat(np.random.default_rng(1).uniform(-1, 1, 40), 10)
+    return ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0.2 * np.cumsum(u) / 10})
+
+
+LINEAR_ONLY = {
+    "frequency response": lambda m, run: m.frequency_response([1.0]),
+    "bode": lambda m, run: m.bode(),
+    "poles": lambda m, run: m.poles(),
+    "zeros": lambda m, run: m.zeros(),
+    "modes": lambda m, run: m.modes(),
+    "stability": lambda m, run: m.stability(),
+    "is stable": lambda m, run: m.is_stable(),
+    "dcgain": lambda m, run: m.dcgain(),
+    "to_tf": lambda m, run: m.to_tf(),
+    "to_control": lambda m, run: m.to_control(band=(0.1, 10.0)),
+    "series": lambda m, run: m.series(m),
+    "parallel": lambda m, run: m.parallel(m),
+    "feedback": lambda m, run: m.feedback(1.0),
+    "inverse": lambda m, run: m.inverse(),
+    "transfer functions": lambda m, run: ftlm.analysis.transfer_functions(m),
+    "approximation": lambda m, run: ftlm.analysis.approximate(m, band=(0.1, 10.0)),
+    "json": lambda m, run: ftlm.analysis.json_text(m),
+    "matlab": lambda m, run: ftlm.analysis.matlab_text(m),
+    "python-control": lambda m, run: ftlm.analysis.control_text(m, band=(0.1, 10.0)),
+    "pid": lambda m, run: ftlm.control.fractional_pid(m, crossover=1.0, phase_margin=60.0),
+    "lqg": lambda m, run: ftlm.control.lqg(m, max_deviation={"y": 1.0}, max_input=1.0),
+    "shaper": lambda m, run: ftlm.control.input_shaper(m),
+    "Euler": explicit_euler,
+    "next experiment": lambda m, run: ftlm.design_input(m, reference_run=run, peak=1.0),
+    "frequency identification": lambda m, run: ftlm.identify_frequency(
+        ftlm.FrequencyData.from_arrays([1.0, 2.0], [1.0, 0.5j], input="u", output="y"), "D y = a y^2 + b u"
+    ),
+    "instruments": lambda m, run: ftlm.identify(
+        run, ftlm.equation("D y = a y^2 + b u"), method="instrumental-variables"
+    ),
+    "genetic": lambda m, run: ftlm.identify(run, ftlm.equation("D^q y = a y^2 + b u"), method="genetic"),
+    "reference": lambda m, run: ftlm.identify(
+        run, ftlm.equation("D y = a y^2 + b u"), method=ftlm.OutputError(reference="u")
+    ),
+    "offset test": lambda m, run: ftlm.identify(run, ftlm.equation("D y = a y^2 + b u"), offset="auto"),
+    "search by instruments": lambda m, run: ftlm.search_orders(
+        run, ftlm.equation("D^q y = a y^2 + b u"), coefficients="instrumental-variables"
+    ),
+    "certificate": lambda m, run: ftlm.certify_orders(run, ftlm.equation("D^q y = a y^2 + b u", initial="rest")),
+    "stream": lambda m, run: ftlm.estimation.linear.Streaming(
+        ftlm.equation("D y = a y^2 + b u"), step=0.1, longest=9.0, inputs=["u"]
+    ),
+    "trace": lambda m, run: ftlm.estimation.linear.multi_innovation_trace(run, ftlm.equation("D y = a y^2 + b u")),
+}
+
+
+@pytest.mark.parametrize("kind", LINEAR_ONLY)
+def test_what_is_linear_refuses_a_nonlinear_model_by_name(kind, model, run):
+    with pytest.raises(ftlm.ModelError, match=r"non-linear term .* model\.linearized\(at=\{'y': 0\.3"):
+        LINEAR_ONLY[kind](model, run)
+
+
+def test_linear_model_about_a_point(model):
+    linear = model.linearized(at={"y": 0.3, "u": 0.5})
+    assert str(linear) == "D^1.8 y = -2.46 y - 0.5 D^0.5 y + 1.21 u"
+    assert linear.stability().stable
+    moving = model.linearized(at={"y": 0.0, "u": 0.0, "D y": -0.5})
+    assert str(moving) == "D^1.8 y = -2 y - 0.5 D^0.5 y + 1 u - 0.2 D^1 y"
+    assert model.linearized(at={"y": 0.3, "u": 0.5}).structure.is_linear
+    feedthrough = ftlm.Model(ftlm.equation("D^1.5 y = -2 y - D^0.5 (y*D y) + u + u^2"))
+    assert str(feedthrough.linearized(at={"y": 0.5, "u": 1})) == "D^1.5 y = -1.33333 y + 2 u"
+
+
+@pytest.mark.parametrize(
+    ("text", "at", "message"),
+    [
+        (TEXT, {"y": 0.3}, "the operating point of u is not given, and 0.7 (y)*u depends on it; add 'u' to at"),
+        (TEXT, {"y": 0.3, "u": 0, "v": 1}, "operating point 'v' does not occur in the equation"),
+        (TEXT, {"y": 0.3, "u": 0, "sin(y)": 1}, "the operating point 'sin(y)' is no signal"),
+        ("D y = -sqrt(y) + u", {"y": 0.0}, "sqrt(y) has no derivative at y = 0"),
+        ("D^2 y = (y + 1)*D^2 y - y + u", {"y": 0.0}, "the highest derivative of y cancels"),
+    ],
+)
+def test_points_without_a_linear_model_are_refused(text, at, message):
+    with pytest.raises(ftlm.ModelError) as refused:
+        ftlm.Model(ftlm.equation(text)).linearized(at=at)
+    assert message in str(refused.value)

@@ -53,6 +53,11 @@ class Term:
         return self.expression if isinstance(self.expression, Expression) else None
 
     @property
+    def column(self) -> str:
+        """Name of the term's row in a record: its signal, or the text of its expression."""
+        return self.signal if self.nonlinear is None else str(self.nonlinear)
+
+    @property
     def signals(self) -> tuple[str, ...]:
         """Signals of the term, in order of first use."""
         if self.nonlinear is None:

@@ -206,6 +206,11 @@ class Structure:
         return any(e.nonlinear_terms for e in self.equations)
 
     @property
+    def is_linear(self) -> bool:
+        """Whether no equation has friction or a non-linear term."""
+        return not (self.has_friction or self.has_nonlinear_terms)
+
+    @property
     def friction_equations(self) -> tuple[int, ...]:
         """Indices of the equations with friction."""
         return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)
