@@ -33,7 +33,7 @@ GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 def start_not_told_findings(fit: Fit) -> list[Finding]:
     """Return a finding if another start explains the runs as well as the one that was taken, with another gain."""
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
-    if joint is None or structure.has_friction or structure.limits or structure.offset not in ("none", "level"):
+    if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
         return []
     if all(rest_evidence(run, structure) is not None for run in runs):
         # What shows rest, or that it is assumed, is said.

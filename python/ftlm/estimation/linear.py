@@ -16,7 +16,14 @@ from ftlm.errors import DataError, FtlmError, InternalError, ModelError
 from ftlm.findings import Finding, make_finding
 from ftlm.kernels import Recursion
 from ftlm.order_search.options import RowBasis, SearchSettings
-from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
+from ftlm.simulation.discretization import (
+    InitialTuple,
+    Record,
+    check_linear,
+    named_coefficients,
+    prepare,
+    structure_tuple,
+)
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.figure import Figure
@@ -52,6 +59,8 @@ def estimate_coefficients(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None
 ) -> CoefficientFit:
     """Estimate the coefficients at given orders by the method that the settings name."""
+    if settings.coefficients == "instrumental-variables":
+        check_linear(structure.equations, "an instrument")
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
     fit = CoefficientFit(records[0].m, records[0].initial)
     if settings.coefficients == "instrumental-variables":
@@ -231,6 +240,7 @@ def multi_innovation_trace(
     rest = replace(equation, initial="rest")
     rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
     item = equation.equations[0]
+    check_linear([item], "a trace")
     core_structure = structure_tuple(item, rec.signals)
     inputs = list(rec.inputs)
     _, trace = _core.multi_innovation(

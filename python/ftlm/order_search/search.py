@@ -36,11 +36,13 @@ from ftlm.simulation.discretization import (
     InitialTuple,
     Record,
     check_derivative_orders,
+    check_frictionless,
     check_linear,
     named_coefficients,
     named_signals,
     prepare,
 )
+from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, axis_of, check_order_grid
 from ftlm.structure.structure import Structure
@@ -87,7 +89,7 @@ class Job:
             raise ModelError(f"setting {error} is missing") from None
         records = [r.record() for r in request.records]
         structure = replace(request.structure, offset=records[0].offset if records else "none")
-        signals = structure.signals
+        signals = record_signals(structure)
         if not records or (len(structure.equations) != 1 and not structure.has_order_law):
             raise ModelError("it is not the search of one equation, or of some under a law, on a record")
         if any(r.signals != signals or r.inputs != records[0].inputs for r in records):
@@ -107,7 +109,7 @@ class Job:
         """Return the search problem of one equation."""
         item, signals = self.structure.equations[0], self.records[0].signals
         axes = [
-            (signals.index(t.signal), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
+            (signals.index(t.column), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
             for t in item.terms
         ]
         return EquationProblem(
@@ -126,7 +128,7 @@ class Job:
             return order.constant, [weights.get(n, 0.0) for n in names]
 
         laws = [
-            (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
+            (signals.index(e.output), affine(e.order), [(signals.index(t.column), affine(t.order)) for t in e.terms])
             for e in structure.equations
         ]
         points = sum(r.m for r in self.records)
@@ -276,7 +278,9 @@ def make_job(
         raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
     if not equation.order_names:
         raise ModelError("every order is a number, so there is nothing to search; name one, as in D^alpha y")
-    check_linear(equation.equations, "an order search")
+    check_frictionless(equation.equations, "an order search")
+    if settings.coefficients == "instrumental-variables":
+        check_linear(equation.equations, "an instrument")
     if len(equation.equations) > 1 and not equation.has_order_law:
         raise ModelError(
             "the equations share no order law, so they are searched one by one: "

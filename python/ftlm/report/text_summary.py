@@ -93,6 +93,8 @@ def behavior_lines(model: Model) -> list[str]:
     """Return lines on steady-state gains and modes, if the model has them."""
     if model.structure.has_friction:
         return ["  no poles, no gain: a body that may stick answers out of proportion"]
+    if model.structure.has_nonlinear_terms:
+        return ["  no poles, no gain: they are those of a linear model, as linearized(at=…) returns about a point"]
     lines: list[str] = []
     # Equations that cannot be solved for their outputs together have neither; everything else can be told.
     with contextlib.suppress(FtlmError):

@@ -496,7 +496,7 @@ def near_identity_findings(
         close = [
             t.order.constant
             for t in item.terms
-            if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
+            if t.column == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
         ]
         # Negated so that a figure that is not a number counts as bad; an equation error that is not known says nothing.
         unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
