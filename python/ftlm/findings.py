@@ -316,6 +316,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "genetic_on_bound": FindingKind(
         "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
     ),
+    "free_runs_of_some": FindingKind(
+        "search",
+        LEVEL_FACT,
+        "the best {count} of {candidates} candidates by equation error were ranked by free runs: with non-linear terms "
+        "no bound says that none of the others is better|; narrow the intervals of the orders, or identify by output "
+        "error from here",
+    ),
     "rows_repeat": FindingKind(
         "search",
         LEVEL_FACT,
