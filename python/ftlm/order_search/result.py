@@ -298,7 +298,7 @@ class SearchResult:
     def search_findings(self) -> tuple[Finding, ...]:
         """Findings on the table: orders on the edge of their interval, and rows that are one model."""
         edges = [make_finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
-        if self.free_runs:
+        if 0 < self.free_runs < self.candidates:
             edges.append(make_finding("free_runs_of_some", count=self.free_runs, candidates=self.candidates))
         distinct, rows = len(self.distinct_rows), len(self.table)
         if distinct == rows:

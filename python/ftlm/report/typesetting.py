@@ -30,7 +30,7 @@ ORDER_DECIMALS = 4
 THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # our constant
 _DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _LIMITED_INPUT = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
-_PARENTHESES = Markup("<mrow><mo>(</mo>{}<mo>)</mo></mrow>")
+_IN_PARENTHESES = Markup("<mrow><mo>(</mo>{}<mo>)</mo></mrow>")
 _GAUSSIAN_DECAY = Markup(
     "<msup><mi>e</mi><mrow><mo>−</mo><msup><mrow><mo>(</mo>{}<mo>/</mo>{}<mo>)</mo></mrow><mn>2</mn></msup></mrow></msup>"
 )
@@ -154,9 +154,9 @@ def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[Input
         return _derivative_math(term.order, term.signal, delay.get(term.signal, 0.0), limits)
     written = _expression_math(shape, delay, limits)
     if not term.order.names and round(term.order.constant, ORDER_DECIMALS) == 0:
-        return _PARENTHESES.format(written) if shape.operation == "add" else written
+        return _IN_PARENTHESES.format(written) if shape.operation == "add" else written
     value = Markup("<mi>{}</mi>").format(str(term.order)) if term.order.names else _signed_math(term.order.constant)
-    return Markup("<msup><mi>D</mi>{}</msup>{}").format(value, _PARENTHESES.format(written))
+    return Markup("<msup><mi>D</mi>{}</msup>{}").format(value, _IN_PARENTHESES.format(written))
 
 
 def _expression_math(item: Expression, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
@@ -180,19 +180,19 @@ def _expression_math(item: Expression, delay: Mapping[str, float], limits: Seque
             if first.operation == "constant" and first.value == -1.0:
                 parts[0] = Markup("<mo>−</mo>")
             written = [
-                _PARENTHESES.format(part) if argument.operation == "add" else part
+                _IN_PARENTHESES.format(part) if argument.operation == "add" else part
                 for argument, part in zip(item.arguments, parts, strict=True)
             ]
             return THIN_SPACE.join(written)
         case "power":
             plain = first.operation == "abs" or (first.operation == "channel" and first.value == 0)
-            base = parts[0] if plain else _PARENTHESES.format(parts[0])
+            base = parts[0] if plain else _IN_PARENTHESES.format(parts[0])
             return Markup("<msup><mrow>{}</mrow><mn>{}</mn></msup>").format(base, f"{item.value:g}")
         case "abs":
             return Markup("<mrow><mo>|</mo>{}<mo>|</mo></mrow>").format(parts[0])
         case "sqrt":
             return Markup("<msqrt>{}</msqrt>").format(parts[0])
-    return Markup("<mi>{}</mi>{}").format(item.operation, _PARENTHESES.format(parts[0]))
+    return Markup("<mi>{}</mi>{}").format(item.operation, _IN_PARENTHESES.format(parts[0]))
 
 
 def _signed_math(value: float) -> Markup:
