@@ -715,9 +715,8 @@ impl Operators {
                 x[states + q] = known.iter().map(|(at, means)| slopes[q * width + states + at] * means[k]).sum();
             }
             if !known.is_empty() {
-                for a in 0..states {
-                    let gains = &self.gains[a * count + states..(a + 1) * count];
-                    free[a] += gains.iter().zip(&x[states..]).map(|(g, v)| g * v).sum::<f64>();
+                for (free, gains) in free.iter_mut().zip(self.gains.chunks(count)) {
+                    *free += gains[states..].iter().zip(&x[states..]).map(|(g, v)| g * v).sum::<f64>();
                 }
             }
             for a in 0..states {

@@ -1,11 +1,15 @@
 """Non-linear terms: language, values, records."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ftlm
+from ftlm.model.parameter_estimates import parameter_units
+from ftlm.report.typesetting import equations_html
 from ftlm.simulation.simulate import explicit_euler
 from ftlm.structure.expression import EXPRESSION_FUNCTIONS, add, apply, channel, constant, multiply, power
 from ftlm.structure.grammar import EquationParser
@@ -253,3 +257,31 @@ def test_points_without_a_linear_model_are_refused(text, at, message):
     with pytest.raises(ftlm.ModelError) as refused:
         ftlm.Model(ftlm.equation(text)).linearized(at=at)
     assert message in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("term", "unit"),
+    [
+        ("k y^3", "s^-2 rad^-2"),
+        ("k y*u", "s^-2 V^-1"),
+        ("k u^2", "s^-2 rad/V^2"),
+        ("k abs(D y)*D y", "rad^-1"),
+        ("k D^0.5 (y^2*w)", "s^-1.5 rad^-1·(m/s)^-1"),
+        ("k sin(y)", "s^-2 rad"),
+        ("k ((y + 300)^4 - 8.1e9)", "s^-2 rad^-3"),
+        ("k sqrt(u)", "s^-2 rad/V^0.5"),
+        ("k y*n", "s^-2"),
+        ("k y^2*v", ""),
+    ],
+)
+def test_unit_of_the_coefficient_of_a_nonlinear_term(term, unit):
+    units = {"y": "rad", "u": "V", "w": "m/s", "n": "1"}
+    structure = ftlm.equation(f"D^2 y = {term}")
+    model = ftlm.Model(structure.with_coefficients({"k": 1.0}), units=units)
+    assert parameter_units(model).get("k", "") == unit
+
+
+def test_equation_of_a_page():
+    model = ftlm.Model(ftlm.equation("D^1.5 y = -2 y^3 + 0.5 D^0.25 (abs(D y)*y - sqrt(y + 1)) - 3 cos(2 y)"))
+    shown = re.sub(r"<[^>]+>|\s", "", str(equations_html(model)[0]))
+    assert shown == "D1.5y=−2.0000y3+0.50000D0.25(|D1y|y−y+1)−3.0000cos(2y)"

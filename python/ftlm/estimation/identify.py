@@ -33,6 +33,7 @@ from ftlm.estimation.model_checks import (
     start_findings,
     stribeck_findings,
 )
+from ftlm.estimation.nonlinear_checks import nonlinear_findings
 from ftlm.estimation.nuisance_parameters import (
     DEFAULT_PULSES_PER_SAMPLE,
     OffsetTest,
@@ -319,6 +320,7 @@ def assess_fit(fit: Fit) -> Identification:
         + mode_sampling_findings(model, runs)
         + friction_direction_findings(model, free)
         + stribeck_findings(model, runs, free)
+        + nonlinear_findings(model, runs, free)
     )
     tests, criteria = None, None
     try:

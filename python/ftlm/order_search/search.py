@@ -29,6 +29,7 @@ from ftlm.order_search.batches import (
     search_equation,
 )
 from ftlm.order_search.checkpoint import RecordFile, Request, Store, read_store
+from ftlm.order_search.free_run_ranking import FREE_RUN_CANDIDATES, rank_by_free_runs
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.progress import Progress
@@ -131,14 +132,20 @@ class Job:
             (signals.index(e.output), affine(e.order), [(signals.index(t.column), affine(t.order)) for t in e.terms])
             for e in structure.equations
         ]
-        points = sum(r.m for r in self.records)
         return CoupledProblem(
             *self._common_arguments(),
             axes=[list(self.values[n]) for n in names],
             laws=laws,
             fixed=[[t.fixed for t in e.terms] for e in structure.equations],
-            scales=[s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()],
+            scales=self.scales(),
         )
+
+    def scales(self) -> list[float]:
+        """Scales by which the scores of the equations are divided: 1 for one equation without an order law."""
+        if not self.structure.has_order_law:
+            return [1.0] * len(self.structure.equations)
+        points = sum(r.m for r in self.records)
+        return [s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()]
 
     def standard_deviations(self) -> list[float]:
         """Standard deviation of each output, by which the scores of the equations are weighted."""
@@ -168,7 +175,22 @@ def threads_per_task(threads: int | None, executor: Executor | None) -> int:
 
 
 def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
-    """Run a search; with a checkpoint file, as search ``number`` of it."""
+    """Run a search; with a checkpoint file, as search ``number`` of it.
+
+    Candidates with non-linear terms are ranked by equation error first, and the best of them by free runs.
+    """
+    settings = job.settings
+    if job.structure.has_nonlinear_terms and settings.criterion == "output-error":
+        kept = max(settings.top, FREE_RUN_CANDIDATES)
+        first = replace(job, settings=replace(settings, criterion="equation-error", top=kept))
+        found = run_job(first, store=store, number=number, executor=executor)
+        table = rank_by_free_runs(found.table, job.structure, job.records, settings.norm, job.scales())
+        counts = {"candidates": found.candidates, "kept": min(settings.top, len(table)), **found.exclusion_counts}
+        counts["diverged"] += len(found.table) - len(table)
+        counts["beaten"] += len(table) - counts["kept"]
+        counted = cast("_core._Counts", counts)
+        result = _result(job, table[: settings.top], found.failures, counted, found.excluded_by_box)
+        return replace(result, free_runs=len(found.table))
     if job.structure.has_order_law:
         stage = search_coupled(
             job.coupled_problem(), store=store, number=number, executor=executor, progress=job.progress

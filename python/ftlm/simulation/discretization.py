@@ -22,7 +22,7 @@ from ftlm.simulation.initial_conditions import (
     resolve_initial_conditions,
     resolve_start,
 )
-from ftlm.simulation.nonlinear_columns import append_columns, nonlinear_columns, record_signals
+from ftlm.simulation.nonlinear_columns import append_columns, check_columns, nonlinear_columns, record_signals
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import MAX_IMPROPER_ORDER, ORDER_RESOLUTION, Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
@@ -483,6 +483,8 @@ def prepare(
     if common is not None:
         # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
         prepared = records(runs, replace(structure, initial=common), m, smooth=smooth)
+    for run, rec in [] if gaps else zip(runs, prepared, strict=True):
+        check_columns(run, structure, dict(zip(rec.signals, rec.means, strict=True)), rec.step)
     for item in structure.equations:
         for term in item.terms:
             if term.fixed is None and term.column != item.output and not any(r.of(term.column).any() for r in prepared):

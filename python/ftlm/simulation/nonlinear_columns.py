@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.kernels import toeplitz_apply
-from ftlm.structure.expression import Channel, Expression, channel
+from ftlm.structure.expression import Channel, Expression
 from ftlm.structure.structure import Structure
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats
@@ -36,7 +38,31 @@ def append_columns(run: Run, structure: Structure, means: Floats, step: float, *
     """Return pulse means of the signals and, below them, of the expressions of the non-linear terms.
 
     An expression of pulse means is that of the signals to second order in the step. Derivatives are those of the raw
-    means, or with ``smooth`` of local polynomials.
+    means, or with ``smooth`` of local polynomials. A column is NaN where it has no value, and everywhere behind a
+    sensor filter or with the derivative of an input that is held between its samples; see :func:`check_columns`.
+    """
+    columns = nonlinear_columns(structure)
+    if not columns:
+        return means
+    rows = dict(zip(structure.signals, means, strict=True))
+    unknown = np.full(means.shape[1], np.nan)
+    values: dict[Channel, Floats] = {}
+    for signal, order in dict.fromkeys(c for item in columns.values() for c in item.channels):
+        if structure.sensor_filter is not None or _is_held(run, signal, order):
+            values[signal, order] = unknown
+        else:
+            values[signal, order] = differentiate(rows[signal], order, step, smooth=smooth) if order else rows[signal]
+    found = [np.asarray(item.evaluate(values), dtype=np.float64) for item in columns.values()]
+    return np.vstack([means, *(np.where(np.isfinite(row), row, np.nan) for row in found)])
+
+
+def _is_held(run: Run, signal: str, order: float) -> bool:
+    """Whether a signal has no derivative, because a run holds it between its samples."""
+    return order > 0 and run.intersample.get(signal) == "zoh"
+
+
+def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], step: float) -> None:
+    """Raise for a column of a non-linear term without a value, for an estimator that needs all of them.
 
     Raises
     ------
@@ -45,40 +71,28 @@ def append_columns(run: Run, structure: Structure, means: Floats, step: float, *
     ModelError
         The derivative of an input that is held between its samples, or a sensor filter.
     """
-    columns = nonlinear_columns(structure)
-    if not columns:
-        return means
-    if structure.sensor_filter is not None:
-        raise ModelError(
-            f"a non-linear term does not hold for signals behind a sensor filter; use "
-            f"{parameter('method', 'output-error')}, or leave the filter out"
-        )
-    rows = dict(zip(structure.signals, means, strict=True))
-    values: dict[Channel, Floats] = {}
-    for signal, order in dict.fromkeys(c for item in columns.values() for c in item.channels):
-        if order > 0 and run.intersample.get(signal) == "zoh":
+    for name, item in nonlinear_columns(structure).items():
+        bad = np.flatnonzero(np.isnan(rows[name]))
+        if not bad.size:
+            continue
+        if structure.sensor_filter is not None:
             raise ModelError(
-                f"a non-linear term has the derivative of order {order:g} of {signal}, and run {run.name!r} holds "
-                f"{signal} between its samples: its jumps have no derivative; say {parameter('intersample', 'foh')} if "
-                "it moves in between"
+                f"{name} does not hold for signals behind a sensor filter; use {parameter('method', 'output-error')}, "
+                "or leave the filter out"
             )
-        values[signal, order] = differentiate(rows[signal], order, step, smooth=smooth) if order else rows[signal]
-    found = [_column(run, item, values, step) for item in columns.values()]
-    return np.vstack([means, *found])
-
-
-def _column(run: Run, item: Expression, values: dict[Channel, Floats], step: float) -> Floats:
-    """Return the values of an expression, or raise where it is not finite."""
-    column = np.broadcast_to(np.asarray(item.evaluate(values), dtype=np.float64), next(iter(values.values())).shape)
-    bad = np.flatnonzero(~np.isfinite(column))
-    if bad.size:
+        held = next(((signal, order) for signal, order in item.channels if _is_held(run, signal, order)), None)
+        if held is not None:
+            raise ModelError(
+                f"{name} has the derivative of order {held[1]:g} of {held[0]}, and run {run.name!r} holds {held[0]} "
+                f"between its samples: its jumps have no derivative; say {parameter('intersample', 'foh')} if it moves "
+                "in between"
+            )
         first = int(bad[0])
-        where = ", ".join(f"{channel(*c)} = {values[c][first]:g}" for c in item.channels)
+        where = ", ".join(f"{s} = {rows[s][first]:.6g}" for s in dict.fromkeys(s for s, _ in item.channels))
         raise DataError(
-            f"{item} of run {run.name!r} is not finite in {bad.size} pulses, first at {(first + 0.5) * step:.6g} s, "
-            f"where {where}; use another term, or a part of the run"
+            f"{name} of run {run.name!r} is not finite in {bad.size} pulses, first at {(first + 0.5) * step:.6g} s, "
+            f"where {where}; use another term, a part of the run, or {parameter('method', 'output-error')}"
         )
-    return column
 
 
 def differentiate(means: Floats, order: float, step: float, *, smooth: bool) -> Floats:

@@ -28,6 +28,9 @@ use crate::signal::nonuniform::interpolate_gaps;
 /// Half the width of the smoothing window of measured signals whose derivatives enter expressions, in samples.
 const SMOOTHING_HALF_WIDTH: usize = 15;
 
+/// Finest grid of the initial guesses, in block pulses per sampling interval.
+const MAX_START_PULSES_PER_SAMPLE: usize = 4;
+
 /// Run the multistart of a problem with non-linear terms; return the candidates best first.
 ///
 /// # Errors
@@ -64,6 +67,14 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
         if is_at_noise(&reached) {
             break;
         }
+    }
+    // Fast responses need shorter pulses before a residual says anything of a guess.
+    while let Some(best) = reached.first().filter(|_| !is_at_noise(&reached))
+        && grid.sampling.pulses_per_sample < MAX_START_PULSES_PER_SAMPLE
+        && grid.is_refinement_significant(&best.result.iterate, &grid.finer()?)?
+    {
+        grid = grid.finer()?;
+        reached = laps.run(free, &grid, &reached, FIRST_BUDGET_EVALUATIONS)?;
     }
     if !is_at_noise(&reached) {
         let mut more = Vec::new();
