@@ -262,7 +262,7 @@ pub struct DerivedSignal {
 }
 
 impl DerivedSignal {
-    /// Derived signal of an expression.
+    /// Signal that is an expression over these channels.
     ///
     /// # Errors
     /// [`Error::Structure`] for other channels than the expression has, or an order that is negative or above 10.

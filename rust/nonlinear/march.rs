@@ -24,8 +24,8 @@ const MAX_NEWTON_ITERATIONS: usize = 50;
 /// Halvings of a Newton step that does not reduce the residual.
 const MAX_STEP_HALVINGS: usize = 12;
 /// Newton step, relative to the channel, that ends the iteration. Convergence is quadratic, so the next one is below
-/// rounding.
-const NEWTON_TOLERANCE: f64 = 1e-10;
+/// rounding, and the linearization before it is that of the solution to this relative error.
+const NEWTON_TOLERANCE: f64 = 1e-8;
 
 /// Equations with non-linear terms at known orders and coefficients.
 ///
@@ -34,7 +34,7 @@ const NEWTON_TOLERANCE: f64 = 1e-10;
 pub struct NonlinearSystem {
     /// D^α y = Σ c D^ν s over recorded and derived signals.
     pub equations: Vec<Equation>,
-    /// Derived signals.
+    /// Expressions of the derived signals.
     pub derived: Vec<DerivedSignal>,
     /// Number of recorded signals.
     pub recorded: usize,
@@ -214,6 +214,11 @@ impl NonlinearSystem {
     }
 }
 
+/// Error for non-linear terms beside something else.
+pub(crate) fn refuse_beside(what: &str, remedy: &str) -> Error {
+    Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
+}
+
 /// Index of an order in a list, which it joins if it is new.
 fn kernel_index(orders: &mut Vec<f64>, eta: f64) -> usize {
     orders.iter().position(|known| (known - eta).abs() < ORDER_GRAIN).unwrap_or_else(|| {
@@ -356,12 +361,16 @@ impl Operators {
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
                 pulse.free[lane.state] += convolution.past();
             }
-            if k == 0 {
-                pulse.z.clone_from(&pulse.free);
-            }
+            pulse.predict(&run.sources);
             pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
-            if let Err((why, is_overflow)) = pulse.solve() {
-                return (run, Some(End { index: k, why, is_overflow: is_overflow || !self.algebraic }));
+            if let Err(failure) = pulse.solve() {
+                let (why, is_overflow) = match failure {
+                    Failure::Overflow => (String::new(), true),
+                    Failure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
+                    // Integrals of short pulses are small, so that only growth within a pulse has no solution.
+                    Failure::Newton(why) => (why.into(), !self.algebraic),
+                };
+                return (run, Some(End { index: k, why, is_overflow }));
             }
             let positive = pulse.determinant > 0.0;
             if *sign.get_or_insert(positive) != positive {
@@ -419,6 +428,9 @@ struct Pulse<'a> {
     inverse: Vec<f64>,
     determinant: f64,
     residual: Vec<f64>,
+    matrix: Vec<f64>,
+    step: Vec<f64>,
+    before: Vec<f64>,
     fault: Option<(&'static str, f64)>,
     arguments: Vec<f64>,
     work: Values,
@@ -438,6 +450,9 @@ impl<'a> Pulse<'a> {
             inverse: vec![0.0; states * states],
             determinant: 1.0,
             residual: vec![0.0; states],
+            matrix: vec![0.0; states * states],
+            step: vec![0.0; states],
+            before: vec![0.0; states],
             fault: None,
             arguments: Vec::new(),
             work: Values::default(),
@@ -481,33 +496,43 @@ impl<'a> Pulse<'a> {
         norm
     }
 
-    /// Inverse of the linearized equations; false if they are singular or not finite.
+    /// Set z to where the last two pulses lead.
+    fn predict(&mut self, sources: &[Vec<f64>]) {
+        for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
+            *z = match row.as_slice() {
+                [.., before, last] => 2.0 * last - before,
+                [last] => *last,
+                [] => *free,
+            };
+        }
+    }
+
+    /// Invert the linearized equations; false if they are singular or not finite.
     fn linearize(&mut self) -> bool {
         let (states, count, width) = (self.z.len(), self.operators.sources(), self.z.len() + self.known.len());
-        let mut matrix = vec![0.0; states * states];
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
             for b in 0..states {
                 let through: f64 =
                     gains[states..].iter().enumerate().map(|(q, g)| g * self.slopes[q * width + b]).sum();
-                matrix[a * states + b] = f64::from(u8::from(a == b)) - gains[b] - through;
+                self.matrix[a * states + b] = f64::from(u8::from(a == b)) - gains[b] - through;
             }
         }
-        match small::inverse_with_determinant(&matrix, states) {
-            Some((inverse, determinant)) => {
-                self.inverse = inverse;
-                self.determinant = determinant;
-                true
-            }
-            None => false,
+        if let [a] = self.matrix[..] {
+            (self.determinant, self.inverse[0]) = (a, 1.0 / a);
+            return a != 0.0 && self.inverse[0].is_finite();
         }
+        let Some((inverse, determinant)) = small::inverse_with_determinant(&self.matrix, states) else { return false };
+        (self.inverse, self.determinant) = (inverse, determinant);
+        true
     }
 
-    /// Solve the pulse from the current z; the error says why it has no solution, and whether that is an overflow.
-    fn solve(&mut self) -> std::result::Result<(), (String, bool)> {
+    /// Solve the pulse from the current z.
+    fn solve(&mut self) -> std::result::Result<(), Failure> {
+        let states = self.z.len();
         let mut norm = self.evaluate();
         if !norm.is_finite() && self.free.iter().all(|v| v.is_finite()) {
-            // The last pulse may lie beyond what the expressions allow with the present inputs.
+            // The last pulses may lead beyond what the expressions allow with the present inputs.
             self.z.clone_from(&self.free);
             norm = self.evaluate();
         }
@@ -516,46 +541,57 @@ impl<'a> Pulse<'a> {
                 return Err(self.describe_fault());
             }
             if !self.linearize() {
-                return Err(("its linearization is singular".into(), false));
+                return Err(Failure::Newton("its linearization is singular"));
             }
-            let states = self.z.len();
-            let step: Vec<f64> = (0..states)
-                .map(|a| (0..states).map(|b| self.inverse[a * states + b] * self.residual[b]).sum())
-                .collect();
-            let small = step.iter().zip(self.z.iter().zip(&self.free));
-            let small = small.into_iter().all(|(d, (z, free))| d.abs() <= NEWTON_TOLERANCE * (z.abs() + free.abs()));
-            let before = self.z.clone();
+            let mut is_small = true;
+            for a in 0..states {
+                let row = &self.inverse[a * states..(a + 1) * states];
+                self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
+                is_small &= self.step[a].abs() <= NEWTON_TOLERANCE * (self.z[a].abs() + self.free[a].abs());
+            }
+            self.before.clone_from(&self.z);
             let (mut share, mut left) = (1.0, MAX_STEP_HALVINGS);
             loop {
-                self.z.iter_mut().zip(before.iter().zip(&step)).for_each(|(z, (from, d))| *z = from - share * d);
+                let steps = self.before.iter().zip(&self.step);
+                self.z.iter_mut().zip(steps).for_each(|(z, (from, d))| *z = from - share * d);
                 let there = self.evaluate();
-                if there.is_finite() && (there <= norm || small) {
+                if there.is_finite() && (there <= norm || is_small) {
                     norm = there;
                     break;
                 }
                 if left == 0 {
-                    return Err(if there.is_finite() { (NO_DESCENT.into(), false) } else { self.describe_fault() });
+                    return Err(if there.is_finite() { NO_DESCENT } else { self.describe_fault() });
                 }
                 (share, left) = (0.5 * share, left - 1);
             }
-            if small {
-                return if self.linearize() { Ok(()) } else { Err(("its linearization is singular".into(), false)) };
+            if is_small {
+                return Ok(());
             }
         }
-        Err((NO_DESCENT.into(), false))
+        Err(NO_DESCENT)
     }
 
-    fn describe_fault(&self) -> (String, bool) {
+    fn describe_fault(&self) -> Failure {
         match self.fault {
-            Some((name, argument)) if argument.abs() < HUGE => (format!("{name} of {argument:.6} has no value"), false),
-            _ => ("it leaves the range of numbers".into(), true),
+            Some((name, argument)) if argument.abs() < OVERFLOW_SIZE => Failure::Domain(name, argument),
+            _ => Failure::Overflow,
         }
     }
 }
 
+/// Why a pulse has no solution.
+enum Failure {
+    /// A value left the range of numbers.
+    Overflow,
+    /// A function has no value for this argument.
+    Domain(&'static str, f64),
+    /// No Newton iteration converges.
+    Newton(&'static str),
+}
+
 /// Size beyond which a value without a result is an overflow, not outside of a function's domain.
-const HUGE: f64 = 1e60;
-const NO_DESCENT: &str = "no Newton step reduces its residual";
+const OVERFLOW_SIZE: f64 = 1e60;
+const NO_DESCENT: Failure = Failure::Newton("no Newton step reduces its residual");
 
 /// Products of sources with kernels and with their derivatives, computed when first needed.
 pub(super) struct FrozenProducts<'a> {
@@ -679,9 +715,8 @@ impl Operators {
                 x[states + q] = known.iter().map(|(at, means)| slopes[q * width + states + at] * means[k]).sum();
             }
             if !known.is_empty() {
-                for a in 0..states {
-                    let gains = &self.gains[a * count + states..(a + 1) * count];
-                    free[a] += gains.iter().zip(&x[states..]).map(|(g, v)| g * v).sum::<f64>();
+                for (free, gains) in free.iter_mut().zip(self.gains.chunks(count)) {
+                    *free += gains[states..].iter().zip(&x[states..]).map(|(g, v)| g * v).sum::<f64>();
                 }
             }
             for a in 0..states {

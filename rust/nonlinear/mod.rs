@@ -9,10 +9,11 @@ mod forcing;
 mod march;
 mod model;
 
-use crate::error::{check_length, Error, Result};
+pub(crate) use march::refuse_beside;
 pub use march::NonlinearSystem;
 pub use model::{fit, NonlinearModel};
 
+use crate::error::{check_length, Result};
 use crate::regressors::{add_impulses, split_impulses, Record};
 
 impl NonlinearSystem {
@@ -23,7 +24,7 @@ impl NonlinearSystem {
     /// [`Body::run`](crate::friction::Body::run).
     ///
     /// # Errors
-    /// [`Error::NoSolution`] for a pulse whose equations have no solution, although the run is finite; as
+    /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution, although the run is finite; as
     /// [`NonlinearSystem::check`].
     ///
     /// ```
@@ -59,9 +60,4 @@ impl NonlinearSystem {
         add_impulses(&mut outputs, &impulses, record.step());
         Ok(outputs)
     }
-}
-
-/// Error for non-linear terms beside something else that superposition would need.
-pub(crate) fn refuse_beside(what: &str, remedy: &str) -> Error {
-    Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
 }

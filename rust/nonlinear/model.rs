@@ -1,7 +1,6 @@
 //! Parameters of equations with non-linear terms: residuals of all experiments and their derivatives.
 
-use super::march::{FreeRun, FrozenProducts, Moves, NonlinearSystem, Operators};
-use super::refuse_beside;
+use super::march::{refuse_beside, FreeRun, FrozenProducts, Moves, NonlinearSystem, Operators};
 use crate::equation::{Equation, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::optimization::levenberg_marquardt::Settings;
@@ -18,7 +17,7 @@ use crate::regressors::{add_impulses, split_impulses, Record};
 pub struct NonlinearModel {
     /// Equations over recorded signals and, after these, derived ones.
     pub model: FreeModel,
-    /// Derived signals.
+    /// Expressions of the derived signals, which follow the recorded ones.
     pub derived: Vec<DerivedSignal>,
     /// Outputs that pass the filter of every experiment before the comparison. Empty if none does.
     pub filtered: Vec<bool>,

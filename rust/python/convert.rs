@@ -44,7 +44,7 @@ pub enum InitialArg {
     Plain(bool, List<f64>),
 }
 
-/// Derived signal: instructions (name, number) of its expression, and (signal, order of the derivative) of its channels.
+/// Expression as a signal: instructions (name, number) of its expression, and (signal, order of the derivative) of its channels.
 pub type DerivedArg = (List<(String, f64)>, List<(usize, f64)>);
 
 pub fn derived_signals(arguments: List<DerivedArg>) -> PyResult<Vec<DerivedSignal>> {

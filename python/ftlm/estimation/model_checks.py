@@ -153,7 +153,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
             for a, b, e in zip(joint.values.tolist(), values, errors, strict=True)
         )
     ]
-    if not far or joint.robust is not None or problem.structure.has_friction:
+    if not far or joint.robust is not None or not problem.structure.is_linear:
         return []
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     first = max(MAX_SECOND_SAMPLES // len(runs), MIN_SECOND_RUN_SAMPLES)

@@ -22,7 +22,7 @@ from ftlm.simulation.initial_conditions import (
     resolve_initial_conditions,
     resolve_start,
 )
-from ftlm.simulation.nonlinear_columns import append_columns, check_columns, record_signals
+from ftlm.simulation.nonlinear_columns import append_columns, check_columns, nonlinear_columns, record_signals
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import MAX_IMPROPER_ORDER, ORDER_RESOLUTION, Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
@@ -177,7 +177,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
             "filter_states": structure.filter_states(initial),
             "at_rest": initial == "rest",
             "coupled": structure.coupling == "simulated",
-            "friction": structure.has_friction,
+            "friction": not structure.is_linear,
             "free": [(signals.index(item.signal), item.law) for item in structure.free_inputs],
         }
     )
@@ -403,6 +403,17 @@ def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, li
         check_linear([item], "a computation on the signals alone")
     terms = [(index[t.column], t.order.constant) for t in item.terms]
     return index[item.output], item.order.constant, terms
+
+
+def derived_signals(structure: Structure) -> list[_core._Derived]:
+    """Return the expressions of non-linear terms as the core takes them; they follow the signals of the structure."""
+    return [
+        (
+            item.program({channel: i for i, channel in enumerate(item.channels)}),
+            [(structure.signals.index(signal), order) for signal, order in item.channels],
+        )
+        for item in nonlinear_columns(structure).values()
+    ]
 
 
 def order_grid_tuple(

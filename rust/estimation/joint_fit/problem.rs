@@ -21,7 +21,7 @@ pub struct Problem {
     pub model: FreeModel,
     /// Friction laws by index of their equation.
     pub frictions: Vec<(usize, FreeFrictionLaw)>,
-    /// Derived signals, numbered after the recorded ones, of non-linear terms.
+    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
 }
 

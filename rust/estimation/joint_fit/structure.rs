@@ -192,7 +192,7 @@ pub struct Hints {
 pub struct Structure {
     /// Names of the signals, for messages: recorded ones, then derived ones.
     pub signals: Vec<String>,
-    /// Derived signals, of non-linear terms.
+    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
     /// One equation per output.
     pub equations: Vec<Equation>,
@@ -235,7 +235,7 @@ impl Structure {
 
     /// Number of recorded signals.
     #[must_use]
-    pub fn recorded(&self) -> usize {
+    pub fn recorded_count(&self) -> usize {
         self.signals.len() - self.derived.len().min(self.signals.len())
     }
 
@@ -283,8 +283,8 @@ impl Structure {
         }
         let channels = self.derived.iter().flat_map(|derived| &derived.channels).map(|channel| channel.0);
         let outputs = self.equations.iter().map(|e| e.output);
-        if let Some(signal) = channels.chain(outputs).find(|&signal| signal >= self.recorded()) {
-            return Err(missing_signal_error(signal, self.recorded()));
+        if let Some(signal) = channels.chain(outputs).find(|&signal| signal >= self.recorded_count()) {
+            return Err(missing_signal_error(signal, self.recorded_count()));
         }
         self.equations.iter().try_for_each(Equation::check)
     }

@@ -8,8 +8,8 @@
 use super::coarse_grid::coarse_sampling;
 use super::friction::{guess_at, values_of};
 use super::halving::{
-    is_same_iterate, merge_duplicates, RungExecutor, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MIN_SURVIVORS,
-    SECOND_BUDGET_EVALUATIONS,
+    is_same_iterate, is_same_optimum, merge_duplicates, sort_by_cost, RungExecutor, FIRST_BUDGET_EVALUATIONS,
+    MAX_FINAL_SURVIVORS, MIN_SURVIVORS, SECOND_BUDGET_EVALUATIONS,
 };
 use super::search::{none_if_invalid_model, run_multistart, MultistartContext, NOISE_FLOOR_FACTOR};
 use crate::error::Result;
@@ -27,6 +27,9 @@ use crate::signal::nonuniform::interpolate_gaps;
 
 /// Half the width of the smoothing window of measured signals whose derivatives enter expressions, in samples.
 const SMOOTHING_HALF_WIDTH: usize = 15;
+
+/// Finest grid of the initial guesses, in block pulses per sampling interval.
+const MAX_START_PULSES_PER_SAMPLE: usize = 4;
 
 /// Run the multistart of a problem with non-linear terms; return the candidates best first.
 ///
@@ -48,13 +51,32 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
         starts.extend(none_if_invalid_model(guesses)?.unwrap_or_default());
     }
     let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
-    let mut reached = best_of(laps, free, &grid, &starts)?;
-    while reached.is_empty() && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+    let mut ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
+    while ranked.is_empty() && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         grid = grid.finer()?;
-        reached = best_of(laps, free, &grid, &starts)?;
+        ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
     }
-    let level = reached.first().map_or(f64::INFINITY, Candidate::cost_per_residual);
-    if level > NOISE_FLOOR_FACTOR * course.floor {
+    let laps = RungExecutor { told: None, ..laps };
+    let is_at_noise = |reached: &[Candidate]| {
+        reached.first().is_some_and(|best| best.cost_per_residual() <= NOISE_FLOOR_FACTOR * course.floor)
+    };
+    let mut reached = Vec::new();
+    for going in ranked.chunks(MAX_FINAL_SURVIVORS).take(MIN_SURVIVORS.div_ceil(MAX_FINAL_SURVIVORS)) {
+        reached.extend(laps.run(free, &grid, going, FIRST_BUDGET_EVALUATIONS)?);
+        reached = sort_by_cost(reached);
+        if is_at_noise(&reached) {
+            break;
+        }
+    }
+    // Fast responses need shorter pulses before a residual says anything of a guess.
+    while let Some(best) = reached.first().filter(|_| !is_at_noise(&reached))
+        && grid.sampling.pulses_per_sample < MAX_START_PULSES_PER_SAMPLE
+        && grid.is_refinement_significant(&best.result.iterate, &grid.finer()?)?
+    {
+        grid = grid.finer()?;
+        reached = laps.run(free, &grid, &reached, FIRST_BUDGET_EVALUATIONS)?;
+    }
+    if !is_at_noise(&reached) {
         let mut more = Vec::new();
         for source in &sources {
             let starts = course.starts.for_recordings(source);
@@ -70,26 +92,14 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
             let found = none_if_invalid_model(run_multistart(&less, own))?.unwrap_or_default();
             more.extend(embed(free, &less, &found)?);
         }
-        reached.extend(best_of(RungExecutor { told: None, ..laps }, free, &grid, &more)?);
-        reached.sort_by(|a, b| a.cost_per_residual().total_cmp(&b.cost_per_residual()));
+        reached.extend(laps.run(free, &grid, &more, FIRST_BUDGET_EVALUATIONS)?);
+        reached = sort_by_cost(reached);
     }
-    let going = merge_duplicates(&reached, is_same_iterate);
+    let going = merge_duplicates(&reached, is_same_optimum);
     let (first, rest) = going.split_at(MAX_FINAL_SURVIVORS.min(going.len()));
     let mut ended = laps.run(free, &grid, first, SECOND_BUDGET_EVALUATIONS)?;
     ended.extend(rest.iter().cloned());
     Ok(ended)
-}
-
-/// Candidates after the first budget, best first: those of the best free runs.
-fn best_of(
-    laps: RungExecutor<'_>,
-    free: &ParameterSet,
-    grid: &Objective<'_>,
-    starts: &[Candidate],
-) -> Result<Vec<Candidate>> {
-    let mut ranked = merge_duplicates(&laps.run(free, grid, starts, 0)?, is_same_iterate);
-    ranked.truncate(MIN_SURVIVORS);
-    laps.run(free, grid, &ranked, FIRST_BUDGET_EVALUATIONS)
 }
 
 /// Best candidates of a problem with some of the parameters as guesses of the full one.
@@ -106,7 +116,7 @@ fn embed(free: &ParameterSet, less: &ParameterSet, found: &[Candidate]) -> Resul
 
 /// Problem without the non-linear terms; None if an equation has no others.
 fn without_nonlinear_terms(structure: &Structure) -> Option<ParameterSet> {
-    let recorded = structure.recorded();
+    let recorded = structure.recorded_count();
     let of = |item: &Equation| {
         let terms = item.terms.iter().filter(|term| term.signal < recorded).cloned().collect();
         Equation { terms, ..item.clone() }
@@ -129,7 +139,7 @@ fn with_derived_signals(structure: &Structure, source: &Recordings, half_width: 
             return Err(refuse_beside("samples at times of their own", "resample the runs"));
         }
         let mut channels = run.channels().to_vec();
-        for (derived, name) in structure.derived.iter().zip(&structure.signals[structure.recorded()..]) {
+        for (derived, name) in structure.derived.iter().zip(&structure.signals[structure.recorded_count()..]) {
             channels.push(derived_channel(run, derived, name, half_width)?);
         }
         let mut with = run.with_channels(channels, run.outputs().to_vec())?;
