@@ -1,13 +1,19 @@
 """Non-linear terms in identifications: equation error, order searches, results from file to page."""
 
+import re
+
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import ftlm
+from ftlm.cli.main import app
 from ftlm.estimation.linear import _estimate_coefficients, estimate_coefficients
+from ftlm.estimation.nonlinear_checks import nonlinear_findings
 from ftlm.order_search import free_run_ranking
 from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.nonlinear_columns import differentiate
+from ftlm.simulation.output_samples import OutputSamples, simulate_samples
 from nonlinear_plants import PLANTS
 
 
@@ -116,7 +122,10 @@ def test_a_record_is_the_run_of_its_pulse_means(runs):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("D y = a sqrt(y) + b u", "sqrt(y) of run 'run' is not finite in 95 pulses, first at 3.15 s, where y = -0.00839674; use"),
+        (
+            "D y = a sqrt(y) + b u",
+            "sqrt(y) of run 'run' is not finite in 95 pulses, first at 3.15 s, where y = -0.00839674; use",
+        ),
         ("D y = a y + b D^0.5 (u*D u)", "holds u between its samples: its jumps have no derivative"),
         ("D y = a y + b exp(1000 y)", "exp(1000*y) of run 'run' is not finite"),
     ],
@@ -141,3 +150,84 @@ def test_a_term_without_a_value_has_no_equation_error_but_a_free_run():
     assert result.parameters["k"].value == pytest.approx(0.5, abs=0.05)
     reason = "a non-linear term of the measured signals has no value in some of the rows"
     assert result.comparison.without_equation_error == {"y": reason}
+
+
+def test_the_linear_model_is_the_derivative_of_the_free_run():
+    step, rows = 0.02, 1500
+    model = ftlm.Model(ftlm.equation("D^1.8 y = -2 y - 0.5 D^0.5 y - 3 y^3 + 0.7 y*u + u - 0.2 abs(D y)*D y"))
+    # The equilibrium of a constant input: 2 y + 3 y^3 - 0.7 y u - u = 0.
+    y = 0.3
+    u = (2 * y + 3 * y**3) / (1 + 0.7 * y)
+    settle = rows - 300
+    change = np.where(np.arange(rows) >= settle, np.sin(0.05 * np.arange(rows)), 0.0)
+
+    def output(model, input):
+        run = ftlm.Run.from_arrays(step=step, inputs={"u": input}, outputs={"y": np.zeros(rows)})
+        return model.simulate(run, tolerance=1e-5)["y"]
+
+    moved, still = (output(model, u + size * change) for size in (1e-3, 0.0))
+    linear = output(model.linearized(at={"y": y, "u": u}), change)
+    difference = (moved - still)[settle:] / 1e-3
+    assert np.abs(difference - linear[settle:]).max() < 0.02 * np.abs(linear).max()
+
+
+def test_findings_say_range_and_share_of_each_term(runs):
+    result = ftlm.identify(runs["drag"], at_true_orders("drag"), method="least-squares")
+    (found,) = (f for f in result.findings if f.code == "nonlinear_range")
+    assert (found.output, found.numbers["term"]) == ("y", "abs(D y)*D y")
+    assert re.search(r"D y from -\d\.\d+ to \d\.\d+", str(found))
+    velocity = np.gradient(runs["drag"]["y"], 0.01)
+    assert 20 < found.numbers["share"] < 100
+    assert f"{velocity.max():.1f}"[:1] in str(found)
+
+
+def test_a_run_that_forgets_its_parameters_is_said():
+    rows, step = 4000, 0.05
+    u = np.cos(1.2 * step * np.arange(rows))
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": np.zeros(rows)})
+
+    def codes(text):
+        model = ftlm.Model(ftlm.equation(text))
+        free = OutputSamples(*simulate_samples(model, run, 1, None), 1, np.zeros(1))
+        return {f.code: f for f in nonlinear_findings(model, [run], [free])}
+
+    chaos = codes("D^2 y = -0.3 D^0.9 y + 1 y - 1 y^3 + 0.6 u")["run_forgets"]
+    assert chaos.level == "do not use"
+    assert 20 < chaos.numbers["seconds"] < 150
+    assert "run_forgets" not in codes("D^2 y = -0.3 D^0.9 y - 1 y - 1 y^3 + 0.6 u")
+    # A linear unstable model grows with its output.
+    assert "run_forgets" not in codes("D y = 0.1 y - 1e-9 y^3 + 0.1 u")
+
+
+def test_from_the_command_line_to_a_page(runs, tmp_path):
+    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    plant = PLANTS["rotor"]
+    runs["rotor"].to_csv(first)
+    plant.run(plant.clean(), 2).to_csv(second)
+    model, page = tmp_path / "model.json", tmp_path / "page.html"
+
+    def call(*arguments):
+        return CliRunner().invoke(app, [*map(str, arguments)])
+
+    found = call("identify", first, "--structure", plant.text, "-o", model, "--report", page, "--validation", second)
+    assert found.exit_code == 0, found.output
+    assert "TRUST" in found.output
+    assert "y^2 in the equation of y is" in " ".join(found.output.split())
+    assert "<msup><mrow><mi>y</mi></mrow><mn>2</mn></msup>" in page.read_text(encoding="utf-8")
+    assert "only its linear model about a point has poles" in page.read_text(encoding="utf-8")
+    compared = call("compare", model, second)
+    assert compared.exit_code == 0
+    assert "99" in compared.output
+    simulated = call("simulate", model, second, "-o", tmp_path / "simulated.csv")
+    assert simulated.exit_code == 0, simulated.output
+    assert call("resid", model, second).exit_code == 0
+    assert call("report", model, "-o", tmp_path / "saved.html", "--force").exit_code == 0
+    refused = call("export", model, "--to", "matlab", "-o", tmp_path / "model.m")
+    assert refused.exit_code == 2
+    assert "Model.linearized in Python" in refused.output
+
+
+def test_selection_finds_the_nonlinear_term(runs):
+    structure = ftlm.equation("D^0.9 y = c u^2 - w y^2 + k y + e y*u", initial="rest")
+    selection = ftlm.select(runs["rotor"].window(0.0, 30.0), structure)
+    assert {"c", "w"} <= {t.name for t in selection.model.equations[0].terms}
