@@ -116,6 +116,16 @@ pub enum Error {
         /// Index of the first value that is not finite.
         index: usize,
     },
+    /// Pulse of a free run whose non-linear equations have no solution.
+    #[error("the free run has no solution at {time:.4} s (pulse {index}): {why}; shorten the step, or check the coefficients of the non-linear terms")]
+    NoSolution {
+        /// Middle of the pulse \[s\].
+        time: f64,
+        /// Index of the pulse.
+        index: usize,
+        /// Cause.
+        why: String,
+    },
     /// Every start of a fit leads to a simulation that overflows.
     #[error("wherever it starts, the free run of {output} ends beyond the range of numbers: it grows; leave out the term that pushes, or bound its coefficient")]
     Beyond {
@@ -165,12 +175,20 @@ pub enum Kind {
 }
 
 impl Error {
+    /// Whether a simulation ends before its record does, so that an optimization shortens its step.
+    #[must_use]
+    pub fn ends_simulation(&self) -> bool {
+        matches!(self, Self::Diverged { .. } | Self::NoSolution { .. } | Self::LeadingZero { .. })
+    }
+
     /// Category of this error.
     #[must_use]
     pub fn kind(&self) -> Kind {
         match self {
             Self::NotFinite { .. } | Self::Length { .. } | Self::Recording { .. } => Kind::Data,
-            Self::Diverged { .. } | Self::Singular { .. } | Self::Beyond { .. } => Kind::Convergence,
+            Self::Diverged { .. } | Self::NoSolution { .. } | Self::Singular { .. } | Self::Beyond { .. } => {
+                Kind::Convergence
+            }
             Self::Interrupted => Kind::Interrupted,
             Self::Internal { .. } => Kind::Internal,
             _ => Kind::Model,

@@ -9,7 +9,7 @@
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
 //! 5. [`estimation`]: coefficients at fixed orders by least squares, multi-innovation least squares and instrumental
 //!    variables; orders and coefficients together by joint output error; [`friction`]: simulation and output error
-//!    with dry friction;
+//!    with dry friction; [`expression`], [`nonlinear`]: the same with non-linear terms;
 //! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, limits and sensor filters, sampled on any grid;
 //! 7. [`order_search`]: orders by exhaustive search over an order grid;
 //! 8. [`simulate`], [`state_space`], [`output_samples`], [`signal::metrics`]: simulation by pulse means, exactly, and at
@@ -65,6 +65,7 @@ pub mod fractional;
 pub mod series;
 
 pub mod equation;
+pub mod expression;
 pub mod regressors;
 mod series_system;
 pub mod simulate;
@@ -72,6 +73,7 @@ pub mod state_space;
 
 pub mod estimation;
 pub mod friction;
+pub mod nonlinear;
 pub mod order_search;
 pub mod output_samples;
 pub mod recording;

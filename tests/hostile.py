@@ -34,7 +34,7 @@ COUNTS = {
     "Recording.experiment": (0, 1 << 12),
     "OutputSimulation.samples": (0, 1 << 12),
     "OutputSimulation.refine": (2, 1 << 12),
-    "OutputSimulation.fit_friction_terms": (1, 16),
+    "OutputSimulation.fit_initial_states": (1, 16),
 }
 
 
@@ -279,6 +279,7 @@ class Sound:
         hints = {"highest": None, "natural": [("alpha", [1.0])], "exceeds": [], "positive": [], "known": [("b", 1.0)]}
         told = {
             "signals": ["y", "u"],
+            "derived": [],
             "equations": [(0, (0.0, [("alpha", 1.0)]), terms, None)],
             "bounds": self.one([], [("alpha", (0.5, 2.0))]),
             "coupled": self.one(True, False),
@@ -524,7 +525,7 @@ class Sound:
         _, (_, terms) = self.output_simulation_samples()
         return _core.OutputSimulation(run, model, [], None), (terms,)
 
-    def output_simulation_fit_friction_terms(self):
+    def output_simulation_fit_initial_states(self):
         run, model, _, times = self.output_simulation_new()
         return _core.OutputSimulation(run, model, [(0, (0.3, 0.1, 0.5))], times), ((True, []), self.one(1, 2))
 

@@ -98,6 +98,8 @@ _Record: TypeAlias = tuple[float, _Floats, _Floats | None] | tuple[float, _Float
 _Structure: TypeAlias = tuple[int, float, Sequence[tuple[int, float]]]
 #: a structure and one coefficient a term
 _Equation: TypeAlias = tuple[_Structure, Sequence[float]]
+#: instructions (name, number) of an expression, and (signal, order of the derivative) of its channels
+_Derived: TypeAlias = tuple[Sequence[tuple[str, float]], Sequence[tuple[int, float]]]
 #: (whether Caputo's powers, else these exponents; terms of an offset: 1 a constant, 2 a ramp too)
 _Initial: TypeAlias = (
     tuple[bool, Sequence[float]] | tuple[bool, Sequence[float], int] | tuple[bool, Sequence[float], int, int]
@@ -543,6 +545,7 @@ class OutputSimulation:
         model: Sequence[_Equation],
         frictions: Sequence[tuple[int, tuple[float, float, float]]],
         times: _Floats | None,
+        derived: Sequence[_Derived] = ...,
     ) -> OutputSimulation: ...
     def samples(
         self, /, every: int, terms: _Terms, stop: Stop | None = None
@@ -560,7 +563,7 @@ class OutputSimulation:
         memory: int,
         stop: Stop | None = None,
     ) -> tuple[tuple[_Matrix, list[list[tuple[float, float]]]], int, _Vector]: ...
-    def fit_friction_terms(
+    def fit_initial_states(
         self, /, start: _Initial, every: int, stop: Stop | None = None
     ) -> list[list[tuple[float, float]]]: ...
 

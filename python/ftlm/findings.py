@@ -56,6 +56,10 @@ FINDING_TOPICS: dict[str, Topic] = {
         "leave out the term that makes it unstable, bound its coefficient, or, in a closed loop, name the "
         "reference signal with {ask[reference]}",
     ),
+    "chaos": Topic(
+        "the simulation forgets its parameters",
+        "fit parts of the run that are shorter than that, or use {ask[method is least-squares]}",
+    ),
     "range": Topic("the simulation overflows", "choose other orders, or fewer terms"),
     "unseen": Topic(
         "some parameters are not separately identifiable from the runs",
@@ -336,6 +340,26 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
     "genetic_on_bound": FindingKind(
         "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
+    ),
+    "nonlinear_range": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "{term} in the equation of {output} is {share:.3g} % of {whole} (rms) with {ranges}|; nothing is known of it "
+        "beyond",
+    ),
+    "run_forgets": FindingKind(
+        "chaos",
+        LEVEL_DO_NOT_USE,
+        "a small change of a parameter moves the free run {growth:.2g} times as much in its second half as in its "
+        "first: the motion is chaotic or nearly so, the run forgets its parameters after {seconds:.3g} s|, and "
+        "intervals of a fit to all of it mean nothing; {remedy}",
+    ),
+    "free_runs_of_some": FindingKind(
+        "search",
+        LEVEL_FACT,
+        "the best {count} of {candidates} candidates by equation error were ranked by free runs: with non-linear terms "
+        "no bound says that none of the others is better|; narrow the intervals of the orders, or identify by output "
+        "error from here",
     ),
     "rows_repeat": FindingKind(
         "search",

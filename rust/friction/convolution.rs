@@ -28,6 +28,12 @@ impl Heads {
         }
         Self { kernel: kernel.to_vec(), spectra }
     }
+
+    /// The kernel.
+    #[must_use]
+    pub fn kernel(&self) -> &[f64] {
+        &self.kernel
+    }
 }
 
 /// Online convolution of one signal with a kernel.
@@ -138,7 +144,7 @@ impl InputKernels {
 }
 
 /// Product with a cached series.
-pub(super) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
+pub(crate) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; series.len()];
     cached.apply(series, &mut out, &mut Buffers::default());
     out

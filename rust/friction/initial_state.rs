@@ -9,13 +9,13 @@ use crate::regressors::is_impulse;
 
 /// Term of an equation with a simulated output as signal.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Link {
+pub(crate) struct Link {
     /// Equation of the output.
-    pub(super) output: usize,
-    pub(super) order: f64,
+    pub(crate) output: usize,
+    pub(crate) order: f64,
     /// Integration order: α of the equation minus the order of the term.
-    pub(super) integration: f64,
-    pub(super) coefficient: f64,
+    pub(crate) integration: f64,
+    pub(crate) coefficient: f64,
 }
 
 /// Initial states and constant forces as inputs at the levels of outputs and velocities, by equation.
@@ -120,10 +120,10 @@ impl InitialForcing {
 
 /// Sum of powers of t with distinct exponents.
 #[derive(Debug, Clone, Default)]
-struct Sum(Vec<(f64, f64, f64)>);
+pub(crate) struct Sum(Vec<(f64, f64, f64)>);
 
 impl Sum {
-    fn add(&mut self, exponent: f64, value: f64) {
+    pub(crate) fn add(&mut self, exponent: f64, value: f64) {
         match self.0.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
             Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
             None => self.0.push((exponent, value, value.abs())),
@@ -131,13 +131,13 @@ impl Sum {
     }
 
     /// (exponent, coefficient) of the powers that do not cancel up to rounding.
-    fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
+    pub(crate) fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
         self.0.iter().filter(|r| r.1.abs() > 1e-13 * r.2).map(|r| (r.0, r.1))
     }
 }
 
 /// Pulse means of t^e. Negative powers are those of the derivative kernels applied to a step.
-fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+pub(crate) fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent >= 0.0 {
         return power_means(exponent, m, step);
     }
@@ -150,7 +150,7 @@ fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 }
 
 /// Initial outputs or velocities from the given values, with direct feedthrough between equations.
-fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+pub(crate) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
     let n = given.len();
     if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
         return Ok(given.to_vec());
@@ -168,7 +168,7 @@ fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
 
 /// Free initial state of a run: a combination of powers of t in the named equation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum State {
+pub(crate) enum State {
     /// Initial level of the output.
     Level(usize),
     /// Initial velocity of the output.
@@ -191,7 +191,7 @@ impl State {
     ///
     /// `free` says whether the integration order of an equation's term depends on a free order. Each filtered output
     /// (`filtered`, empty if none) also has the transients of the filter.
-    pub(super) fn all(
+    pub(crate) fn all(
         equations: &[Equation],
         initial: &Initial,
         filtered: &[bool],
@@ -231,12 +231,12 @@ impl State {
     }
 
     /// Whether the state acts on the filter of an output only and not on a body.
-    pub(super) fn is_impulse(&self) -> bool {
+    pub(crate) fn is_impulse(&self) -> bool {
         matches!(self, Self::Power(_, e) if is_impulse(*e))
     }
 
     /// Powers of t of a unit of this state at the level of the outputs: equation, exponent, coefficient.
-    pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
+    pub(crate) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
         // Caputo derivatives of a constant are 0, so only terms of order 0 respond to a level.
         let unseen = |output: usize, whole: f64| {
             let mut all = vec![(output, whole, 1.0)];
@@ -262,7 +262,7 @@ impl State {
 }
 
 /// Merge the powers of t of several states by equation and exponent.
-pub(super) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+pub(crate) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
     let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
     for (i, exponent, value) in parts {
         match out[i].iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {

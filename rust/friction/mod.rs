@@ -14,9 +14,9 @@ pub mod contact;
 pub mod convolution;
 pub mod dynamics;
 pub mod fit;
-mod initial_state;
+pub(crate) mod initial_state;
 pub mod law;
-mod model;
+pub(crate) mod model;
 
 pub use dynamics::{Body, Motion};
 pub use fit::{fit, fit_until, Fit, Start};

@@ -7,6 +7,7 @@ use super::law::FrictionLaw;
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
+use crate::estimation::state_fit::{Evaluation, Parameter, Point, StateModel};
 use crate::parallel::Stop;
 use crate::regressors::{add_impulses, split_impulses, Record};
 use crate::series::Kernel;
@@ -71,25 +72,8 @@ pub struct FrictionModel {
     pub filtered: Vec<bool>,
 }
 
-/// Values of all free parameters.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Point {
-    pub(super) orders: Vec<f64>,
-    pub(super) coefficients: Vec<f64>,
-    /// Free parameters of inputs.
-    pub(super) inputs: Vec<f64>,
-    /// Initial states of each run.
-    pub(super) states: Vec<Vec<f64>>,
-}
-
-/// Residuals at a point, with intermediate results for their derivatives.
-pub(super) struct Evaluation {
-    pub(super) residuals: Vec<f64>,
-    pub(super) size: f64,
-    parts: Vec<Part>,
-}
-
-struct Part {
+/// Intermediate results of an experiment.
+pub(crate) struct Part {
     operators: Operators,
     run: Run,
     /// Derivatives of the means of each input with respect to its free parameter.
@@ -102,15 +86,9 @@ const FIRST_SAMPLES: usize = 8;
 /// Step of central differences. Powers of t are smooth in the orders, so the error is about 1e−10.
 const DIFFERENCE_STEP: f64 = 1e-5;
 
-/// Parameter of a derivative.
-enum Parameter {
-    /// Free order, free coefficient, or state of one run.
-    Order(usize),
-    Coefficient(usize),
-    State(usize, usize),
-    /// Free parameter of an input.
-    Input(usize),
-}
+/// Constant forces tried as initial guesses, relative to each friction. The rest position depends on the sign of the
+/// net force, which a local optimization does not change.
+const INITIAL_FORCE_RATIOS: [f64; 2] = [0.5, -0.5];
 
 impl FrictionModel {
     /// Return an error for an inconsistent model, or for experiments that do not fit it.
@@ -168,17 +146,6 @@ impl FrictionModel {
         self.initial.check()
     }
 
-    /// Whether a coefficient is a friction force, which must not be negative.
-    pub(super) fn is_friction_force(&self, coefficient: usize) -> bool {
-        self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
-    }
-
-    /// Return an error for invalid free orders.
-    pub(super) fn check_orders(&self, orders: &[f64]) -> Result<()> {
-        let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
-        body.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
-    }
-
     fn body(&self, orders: &[f64], coefficients: &[f64]) -> Body {
         let at = |law: &crate::equation::AffineOrder| {
             law.constant + law.weights.iter().zip(orders).map(|(w, x)| w * x).sum::<f64>()
@@ -198,7 +165,7 @@ impl FrictionModel {
     }
 
     /// States of every run at these orders, and the equations with zero coefficients.
-    pub(super) fn states(&self, orders: &[f64]) -> (Vec<State>, Vec<Equation>) {
+    fn states(&self, orders: &[f64]) -> (Vec<State>, Vec<Equation>) {
         let moves = |i: usize, term: usize| {
             let alpha = &self.equations[i].order.weights;
             let own = &self.equations[i].terms[term].1.weights;
@@ -210,7 +177,7 @@ impl FrictionModel {
 
     /// Initial states from the first samples of a run: positions and velocities of the bodies, given constants for the
     /// frictions, all other states 0.
-    pub(super) fn first_states(&self, orders: &[f64], experiment: &Experiment, constants: &[f64]) -> Vec<f64> {
+    fn first_states(&self, orders: &[f64], experiment: &Experiment, constants: &[f64]) -> Vec<f64> {
         let (states, equations) = self.states(orders);
         let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
         let value = |state: &State| match *state {
@@ -226,7 +193,7 @@ impl FrictionModel {
     }
 
     /// Initial terms of a run's states by equation: (exponent, coefficient).
-    pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
+    fn initial_powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
         let body = self.body(orders, coefficients);
         let links = body.links();
         let (states, _) = self.states(orders);
@@ -244,7 +211,7 @@ impl FrictionModel {
         record: &Record,
     ) -> Result<InitialForcing> {
         let body = self.body(orders, coefficients);
-        let (powers, _) = split_impulses(&self.powers(orders, coefficients, values));
+        let (powers, _) = split_impulses(&self.initial_powers(orders, coefficients, values));
         InitialForcing::of(&powers, &body.links(), record.m(), record.step())
     }
 
@@ -263,12 +230,12 @@ impl FrictionModel {
         Ok((Some(Record::new(record.step(), signals, None)?), bent))
     }
 
-    pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation> {
+    fn simulate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation<Part>> {
         let body = self.body(&point.orders, &point.coefficients);
         // Same error as for a step that is too long, so that an optimizer shortens it.
         let far = |_| Error::Diverged { what: "orders or friction out of range; the free run".into(), index: 0 };
         body.check(usize::MAX).map_err(far)?;
-        let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
+        let mut out = Evaluation::empty();
         for (experiment, values) in experiments.iter().zip(&point.states) {
             stop.check()?;
             let (acting, bent) = self.transform_inputs(&experiment.record, &point.inputs)?;
@@ -278,7 +245,7 @@ impl FrictionModel {
             let mut residuals = experiment.measured_samples();
             out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
             let mut outputs = run.outputs.clone();
-            let (_, impulses) = split_impulses(&self.powers(&point.orders, &point.coefficients, values));
+            let (_, impulses) = split_impulses(&self.initial_powers(&point.orders, &point.coefficients, values));
             add_impulses(&mut outputs, &impulses, experiment.record.step());
             let sampled = experiment.weighted_samples(&outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
@@ -288,27 +255,15 @@ impl FrictionModel {
         Ok(out)
     }
 
-    /// Derivatives of the residuals with respect to orders, coefficients and inputs, then to the states of run after
-    /// run.
-    ///
-    /// Without `numbers` only with respect to the states.
-    pub(super) fn jacobian(
+    fn derivatives(
         &self,
         experiments: &[Experiment],
         point: &Point,
-        at: &Evaluation,
+        at: &Evaluation<Part>,
         numbers: bool,
         stop: &Stop,
     ) -> Result<Vec<Vec<f64>>> {
-        let mut all: Vec<Parameter> = Vec::new();
-        if numbers {
-            all.extend((0..point.orders.len()).map(Parameter::Order));
-            all.extend((0..point.coefficients.len()).map(Parameter::Coefficient));
-            all.extend((0..point.inputs.len()).map(Parameter::Input));
-        }
-        for (run, states) in point.states.iter().enumerate() {
-            all.extend((0..states.len()).map(|state| Parameter::State(run, state)));
-        }
+        let all = Parameter::all(point, numbers);
         let body = self.body(&point.orders, &point.coefficients);
         let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
@@ -483,6 +438,81 @@ impl FrictionModel {
     }
 }
 
+impl StateModel for FrictionModel {
+    type Part = Part;
+
+    fn order_bounds(&self) -> &[(f64, f64)] {
+        &self.order_bounds
+    }
+
+    fn coordinates(&self) -> &[Coordinate] {
+        &self.coordinates
+    }
+
+    fn inputs(&self) -> &[FreeInput] {
+        &self.inputs
+    }
+
+    /// Friction forces are not negative.
+    fn is_nonnegative(&self, coefficient: usize) -> bool {
+        self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
+    }
+
+    /// Times at which a body stops or reverses move from pulse to pulse with any parameter.
+    fn has_kinks(&self) -> bool {
+        true
+    }
+
+    fn check(&self, experiments: &[Experiment]) -> Result<()> {
+        Self::check(self, experiments)
+    }
+
+    fn check_orders(&self, orders: &[f64]) -> Result<()> {
+        let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
+        body.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
+    }
+
+    fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
+        let held: Vec<f64> = self.frictions.iter().map(|(_, law)| law.at(coefficients).breakaway()).collect();
+        let plain = self.first_states(orders, experiment, &vec![0.0; held.len()]);
+        let mut guesses = vec![plain];
+        for share in INITIAL_FORCE_RATIOS {
+            for which in 0..held.len() {
+                let of = |(a, most): (usize, &f64)| if a == which { share * most } else { 0.0 };
+                let constants: Vec<f64> = held.iter().enumerate().map(of).collect();
+                let guess = self.first_states(orders, experiment, &constants);
+                if guess != guesses[0] {
+                    guesses.push(guess);
+                }
+            }
+        }
+        guesses
+    }
+
+    fn state_count(&self, orders: &[f64]) -> usize {
+        self.states(orders).0.len()
+    }
+
+    fn powers(&self, orders: &[f64], coefficients: &[f64], states: &[f64]) -> Vec<Vec<(f64, f64)>> {
+        self.initial_powers(orders, coefficients, states)
+    }
+
+    fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation<Part>> {
+        self.simulate(experiments, point, stop)
+    }
+
+    fn jacobian(
+        &self,
+        experiments: &[Experiment],
+        point: &Point,
+        at: &Evaluation<Part>,
+        numbers: bool,
+        stop: &Stop,
+    ) -> Result<Vec<Vec<f64>>> {
+        self.derivatives(experiments, point, at, numbers, stop)
+    }
+}
+
 /// Derivatives of each α, of (coefficient, integration order) of each term, and of each fc, fs and vs.
 struct BodyDerivatives {
     alphas: Vec<f64>,
@@ -491,7 +521,7 @@ struct BodyDerivatives {
 }
 
 /// Initial position and velocity of an output from its first samples.
-fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
+pub(crate) fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     let near = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]
     let (count, step) = (near.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);

@@ -38,6 +38,29 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
     }
 }
 
+/// Inverse and determinant of a row-major n × n matrix; None for a singular matrix, or one that is not finite.
+///
+/// ```
+/// use ftlm::linalg::small::inverse_with_determinant;
+/// assert_eq!(inverse_with_determinant(&[0.0, 2.0, -4.0, 0.0], 2), Some((vec![0.0, -0.25, 0.5, 0.0], 8.0)));
+/// ```
+#[must_use]
+pub fn inverse_with_determinant(matrix: &[f64], n: usize) -> Option<(Vec<f64>, f64)> {
+    let (found, determinant) = match (matrix, n) {
+        (&[a], 1) => (vec![1.0 / a], a),
+        (&[a, b, c, d], 2) => {
+            let determinant = a * d - b * c;
+            ([d, -b, -c, a].iter().map(|v| v / determinant).collect(), determinant)
+        }
+        _ => {
+            let a = DMatrix::from_row_slice(n, n, matrix);
+            let determinant = a.determinant();
+            (a.try_inverse()?.transpose().as_slice().to_vec(), determinant)
+        }
+    };
+    (determinant != 0.0 && found.iter().all(|v| v.is_finite())).then_some((found, determinant))
+}
+
 /// Most steps of an iteration for eigenvalues, of which a polynomial of degree ten needs about thirty.
 const MAX_EIGENVALUE_STEPS: usize = 1000;
 

@@ -80,7 +80,7 @@ impl OutputSimulation {
                 && (peak == 0.0 || peak >= MIN_SIGNAL_PEAK)
                 && !(enters(signal) && samples.iter().any(|v| v.is_nan()))
         };
-        self.frictions.is_empty()
+        self.is_linear()
             && recording.filter.is_none()
             && uniform
             && self.equations.iter().all(orders)

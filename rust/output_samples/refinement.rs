@@ -153,8 +153,8 @@ struct Piece {
 impl<'a> SampleResponses<'a> {
     /// Responses for a recording; None if superposition does not apply.
     fn new(simulation: &'a OutputSimulation, units: Vec<(usize, f64)>, stop: &'a Stop) -> Option<Self> {
-        let OutputSimulation { recording, equations, frictions, times } = simulation;
-        let special = !frictions.is_empty() || recording.is_all_filtered() || recording.has_nonuniform_samples();
+        let OutputSimulation { recording, equations, times, .. } = simulation;
+        let special = !simulation.is_linear() || recording.is_all_filtered() || recording.has_nonuniform_samples();
         if special || times.is_some() || simulation.has_improper_term() {
             return None;
         }

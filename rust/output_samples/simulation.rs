@@ -4,12 +4,14 @@ use std::sync::Arc;
 
 use super::initial_terms::{self, fit_initial_terms, OutputSamples};
 use super::richardson::{add_multiple, combine, Rows};
-use crate::equation::{AffineOrder, Equation, Filter, Initial};
+use crate::equation::{AffineOrder, Equation, Filter, Initial, Term};
 use crate::error::{check_length, Error, Result};
-use crate::estimation::output_error::{FreeEquation, Monomial, Settings};
+use crate::estimation::output_error::{FreeEquation, FreeModel, Monomial, Settings};
+use crate::expression::DerivedSignal;
 use crate::fractional::kernels::first_coefficient;
 use crate::friction::{self, Body, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
 use crate::linalg::small;
+use crate::nonlinear::{self, NonlinearModel, NonlinearSystem};
 use crate::parallel::Stop;
 use crate::recording::{Recording, Role, Sampling};
 use crate::regressors::Record;
@@ -24,9 +26,9 @@ pub(super) type Terms = Vec<Vec<(f64, f64)>>;
 pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
 /// Order of integration from which on a slope discontinuity is resolved by the pulses.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
-/// Maximum number of evaluations for level, velocity and offset of a run with friction, and relative change of the cost
+/// Maximum number of evaluations for the initial states of a run that is not linear in them, and relative change of the cost
 /// that terminates.
-const FRICTION_SETTINGS: Settings = Settings { evaluations: 60, tolerance: 1e-12 };
+const INITIAL_STATE_SETTINGS: Settings = Settings { evaluations: 60, tolerance: 1e-12 };
 
 /// Initial terms of a simulation. Exponents −1, −2, … are an impulse and its derivatives before the sensor filter, the
 /// exponent ∞ is the level of an output.
@@ -50,6 +52,7 @@ pub struct OutputSimulation {
     pub(super) equations: Vec<Equation>,
     pub(super) frictions: Vec<(usize, FrictionLaw)>,
     pub(super) times: Option<Vec<f64>>,
+    pub(super) derived: Vec<DerivedSignal>,
 }
 
 impl OutputSimulation {
@@ -91,12 +94,91 @@ impl OutputSimulation {
             let what = format!("equations of signals {own:?} for outputs {:?}", recording.outputs());
             return Err(Error::Structure { what, remedy: "give one equation an output, in their sequence".into() });
         }
-        Ok(Self { recording, equations, frictions, times })
+        Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
 
-    /// Initial terms of a model with friction, fitted on a grid of `every` pulses per sampling interval.
+    /// Simulation of equations with non-linear terms, which are terms of derived signals. These are numbered after the
+    /// signals of the recording.
     ///
-    /// They affect when a body sticks and slides, so they are found by optimization, from level and velocity at the
+    /// # Errors
+    /// As [`NonlinearSystem::check`]; [`Error::Structure`] for other outputs than the recording's own, for a term of an
+    /// input as high as its equation, and where the equations would have to hold for filtered signals.
+    ///
+    /// ```
+    /// # use ftlm::equation::{Equation, Structure, Term};
+    /// # use ftlm::expression::{DerivedSignal, Expression, Instruction};
+    /// # use ftlm::output_samples::{InitialTerms, OutputSimulation};
+    /// # use ftlm::recording::{Channel, Recording, Role};
+    /// # use ftlm::signal::block_pulse::Intersample;
+    /// // D y = u − y² after a step is tanh t. Signal 2 is y².
+    /// let square = Expression::new(vec![Instruction::Channel(0), Instruction::Power(2.0)], 1)?;
+    /// let terms = vec![Term { signal: 1, order: 0.0 }, Term { signal: 2, order: 0.0 }];
+    /// let plant = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![1.0, -1.0])?;
+    /// let u = Channel::new("u", vec![1.0; 21], Role::Input(Intersample::Hold));
+    /// let run = Recording::new("run", 0.05, None, vec![Channel::new("y", vec![0.0; 21], Role::Output), u], vec![0])?;
+    /// let derived = vec![DerivedSignal::new(square, vec![(0, 0.0)])?];
+    /// let simulation = OutputSimulation::with_derived(run.into(), vec![plant], derived, None)?;
+    /// let rest = InitialTerms::Given(vec![Vec::new()]);
+    /// assert!((simulation.samples(8, &rest)?.outputs[0][20] - 1.0_f64.tanh()).abs() < 1e-4);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn with_derived(
+        recording: Arc<Recording>,
+        equations: Vec<Equation>,
+        derived: Vec<DerivedSignal>,
+        times: Option<Vec<f64>>,
+    ) -> Result<Self> {
+        let recorded = recording.channels().len();
+        let own: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
+        if own != recording.outputs() {
+            let what = format!("equations of signals {own:?} for outputs {:?}", recording.outputs());
+            return Err(Error::Structure { what, remedy: "give one equation an output, in their sequence".into() });
+        }
+        if recording.is_all_filtered() {
+            let remedy = "the sensor filter does not commute with them: use coupling='simulated' and inputs before it";
+            return Err(nonlinear::refuse_beside("inputs behind the sensor filter", remedy));
+        }
+        let found = Self { recording, equations, frictions: Vec::new(), times, derived };
+        found.system().check()?;
+        for (i, Equation { structure, .. }) in found.equations.iter().enumerate() {
+            let driven = |signal: usize| match signal.checked_sub(recorded) {
+                None => found.system().output_index(i, signal).is_none(),
+                Some(at) => {
+                    let channels = &found.derived[at].channels;
+                    channels.iter().any(|channel| found.system().output_index(i, channel.0).is_none())
+                }
+            };
+            let beyond = |t: &&Term| t.order >= structure.order - ORDER_TOLERANCE && driven(t.signal);
+            if let Some(term) = structure.terms.iter().find(beyond) {
+                return Err(Error::OutOfRange {
+                    name: "order of an input beside non-linear terms".into(),
+                    value: term.order,
+                    range: format!("below {}, that of the equation", structure.order),
+                    remedy: "lower it".into(),
+                });
+            }
+        }
+        Ok(found)
+    }
+
+    /// Equations with their derived signals.
+    fn system(&self) -> NonlinearSystem {
+        NonlinearSystem {
+            equations: self.equations.clone(),
+            derived: self.derived.clone(),
+            recorded: self.recording.channels().len(),
+            coupled: self.recording.is_coupled,
+        }
+    }
+
+    /// True if outputs are linear in inputs and initial terms.
+    pub(super) fn is_linear(&self) -> bool {
+        self.frictions.is_empty() && self.derived.is_empty()
+    }
+
+    /// Initial terms of a model with friction or non-linear terms, fitted on a grid of `every` pulses per sampling interval.
+    ///
+    /// Outputs are not linear in them, so they are found by optimization, from level and velocity at the
     /// start of the run.
     ///
     /// # Errors
@@ -116,11 +198,11 @@ impl OutputSimulation {
     /// let block = Equation::new(structure, vec![1.0])?;
     /// let friction = vec![(0, FrictionLaw::coulomb(0.5))];
     /// let simulation = OutputSimulation::new(run.into(), vec![block], friction, None)?;
-    /// let terms = simulation.fit_friction_terms(Initial::Caputo, 1, &Stop::default())?;
+    /// let terms = simulation.fit_initial_states(Initial::Caputo, 1, &Stop::default())?;
     /// assert!((terms[0][0].1 - 2.0).abs() < 1e-6);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn fit_friction_terms(&self, initial: Initial, every: usize, stop: &Stop) -> Result<Vec<Vec<(f64, f64)>>> {
+    pub fn fit_initial_states(&self, initial: Initial, every: usize, stop: &Stop) -> Result<Vec<Vec<(f64, f64)>>> {
         let experiment = self.recording.experiment(Sampling { pulses_per_sample: every, ..Sampling::default() })?;
         let weights: Vec<f64> = (self.recording.outputs().iter())
             .map(|&output| initial_terms::weight(&self.recording.channels()[output].samples))
@@ -140,16 +222,19 @@ impl OutputSimulation {
             stribeck: known(law.stribeck),
             speed: known(law.speed),
         };
-        let model = FrictionModel {
-            equations: self.equations.iter().map(fixed).collect(),
-            frictions: self.frictions.iter().map(|(place, friction)| (*place, law(*friction))).collect(),
-            inputs: Vec::new(),
-            order_bounds: Vec::new(),
-            coordinates: Vec::new(),
-            initial,
-            filtered: friction::filtered_outputs(&experiments),
+        let (equations, filtered) =
+            (self.equations.iter().map(fixed).collect(), friction::filtered_outputs(&experiments));
+        let (order_bounds, coordinates, inputs) = (Vec::new(), Vec::new(), Vec::new());
+        let found = if self.derived.is_empty() {
+            let frictions = self.frictions.iter().map(|(place, friction)| (*place, law(*friction))).collect();
+            let model = FrictionModel { equations, frictions, inputs, order_bounds, coordinates, initial, filtered };
+            friction::fit_until(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?
+        } else {
+            let coupled = self.recording.is_coupled;
+            let model = FreeModel { equations, order_bounds, coordinates, inputs, coupled, initial };
+            let model = NonlinearModel { model, derived: self.derived.clone(), filtered };
+            nonlinear::fit(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?
         };
-        let found = friction::fit_until(&model, &experiments, &Start::default(), FRICTION_SETTINGS, stop)?;
         Ok(found.initial.into_iter().flatten().collect())
     }
 
@@ -267,7 +352,7 @@ impl<'a> Grid<'a> {
         let recording = &simulation.recording;
         let filtered = recording.is_all_filtered();
         let pulses = recording.pulses((recording.len() - 1).saturating_mul(every), filtered)?;
-        let is_simple = !simulation.frictions.is_empty();
+        let is_simple = !simulation.is_linear();
         let record = if is_simple { pulses.into_record()? } else { pulses.into_record_with_initial_state()? };
         let (m, step) = (record.m(), record.step());
         let filter = recording.filter.as_ref().filter(|_| !filtered);
@@ -283,6 +368,9 @@ impl<'a> Grid<'a> {
         if !frictions.is_empty() {
             let body = Body { equations: equations.clone(), frictions: frictions.clone() };
             return Ok(body.run(&self.record, terms)?.outputs);
+        }
+        if !self.simulation.derived.is_empty() {
+            return self.simulation.system().run(&self.record, terms);
         }
         if recording.is_coupled {
             return simulate::respond(equations, &self.record, terms);
@@ -341,7 +429,7 @@ impl<'a> Grid<'a> {
             // a jump of one.
             start[i][0] = if self.record.is_filtered() { after_filter(i) } else { coefficient(&terms[i], 0.0) };
             for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
-                if structure.integration(k).abs() > ORDER_TOLERANCE {
+                if structure.integration(k).abs() > ORDER_TOLERANCE || self.is_derived(term.signal) {
                     continue;
                 }
                 if let Some(j) = self.simulation.simulated_output(term.signal) {
@@ -418,6 +506,11 @@ impl<'a> Grid<'a> {
             add_multiple(row, gain, now);
         }
         Ok(out)
+    }
+
+    /// Whether a signal is a derived one, which the record does not have.
+    fn is_derived(&self, signal: usize) -> bool {
+        signal >= self.record.len()
     }
 
     fn is_filtered(&self, signal: usize) -> bool {
@@ -507,7 +600,10 @@ impl<'a> Grid<'a> {
                 let jump = at.jumps(&[0.0], &[value * libm::tgamma(power + 1.0)]);
                 add_multiple(&mut out[i], 1.0, &at.kink_corrections(&jump, power, step));
             }
-            let known = |k: usize| self.simulation.simulated_output(structure.terms[k].signal).is_some();
+            let known = |k: usize| {
+                let signal = structure.terms[k].signal;
+                self.is_derived(signal) || self.simulation.simulated_output(signal).is_some()
+            };
             let own: Vec<usize> =
                 (0..coefficients.len()).filter(|&k| structure.terms[k].signal == structure.output).collect();
             for k in (0..coefficients.len()).filter(|&k| is_driven && !own.contains(&k) && !known(k)) {

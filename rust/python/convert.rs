@@ -11,6 +11,7 @@ use pyo3::types::{PyDict, PyList, PyString, PyTuple};
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_finite, check_points, Error};
 use crate::estimation::multi_innovation::Prior;
+use crate::expression::{DerivedSignal, Expression, Instruction};
 use crate::regressors::Record;
 
 /// Most values of a two-dimensional array: eight gigabytes.
@@ -41,6 +42,17 @@ pub enum InitialArg {
     /// With offset: 0 none, 1 a constant, 2 a constant and a ramp, 3 an output level.
     Offset(bool, List<f64>, u8),
     Plain(bool, List<f64>),
+}
+
+/// Expression as a signal: instructions (name, number) of its expression, and (signal, order of the derivative) of its channels.
+pub type DerivedArg = (List<(String, f64)>, List<(usize, f64)>);
+
+pub fn derived_signals(arguments: List<DerivedArg>) -> PyResult<Vec<DerivedSignal>> {
+    let of = |(program, channels): DerivedArg| {
+        let program = program.iter().map(|(name, value)| Instruction::parse(name, *value)).collect::<Result<_, _>>()?;
+        DerivedSignal::new(Expression::new(program, channels.len())?, channels.into())
+    };
+    Ok(arguments.into_iter().map(of).collect::<Result<_, Error>>()?)
 }
 
 /// One-dimensional array as a vector. Return an error for a value that is not finite.
@@ -161,6 +173,12 @@ const MOST_ITEMS: usize = 1 << 24;
 #[derive(IntoPyObject)]
 #[pyo3(transparent)]
 pub struct List<T>(Vec<T>);
+
+impl<T> Default for List<T> {
+    fn default() -> Self {
+        Self(Vec::new())
+    }
+}
 
 impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
     type Error = PyErr;

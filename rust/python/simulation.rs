@@ -6,14 +6,15 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use super::convert::{
-    copy_vector, equations, initial, record, rows, stack_rows, structure, to_vectors, vector, EquationArg, InitialArg,
-    List, RecordArg, StructureArg,
+    copy_vector, derived_signals, equations, initial, record, rows, stack_rows, structure, to_vectors, vector,
+    DerivedArg, EquationArg, InitialArg, List, RecordArg, StructureArg,
 };
 use super::errors::run_detached;
 use super::estimation::jumps_near;
 use super::recording::Recording;
 use crate::error::check_length;
 use crate::friction::FrictionLaw;
+use crate::nonlinear::refuse_beside;
 use crate::output_samples::{self, InitialTerms, OutputSamples, Refinement};
 use crate::python::order_search::watch::{run_interruptible, Stop};
 use crate::signal::block_pulse::SampleInterpolation;
@@ -201,22 +202,32 @@ fn initial_terms((fitted, terms, has_level): TermsArg) -> InitialTerms {
 #[pymethods]
 impl OutputSimulation {
     #[new]
+    #[pyo3(signature = (run, model, frictions, times, derived=List::default()))]
     #[allow(clippy::needless_pass_by_value)]
     fn new(
         run: Py<Recording>,
         model: List<EquationArg>,
         frictions: List<(usize, (f64, f64, f64))>,
         times: Option<PyReadonlyArray1<'_, f64>>,
+        derived: List<DerivedArg>,
     ) -> PyResult<Self> {
         let run = Arc::clone(&run.get().inner);
-        let equations = equations(model, run.channels().len(), &vec![true; run.channels().len()])?;
+        let derived = derived_signals(derived)?;
+        let signals = run.channels().len() + derived.len();
+        let equations = equations(model, signals, &vec![true; signals])?;
         let law = |(place, (coulomb, stribeck, speed))| (place, FrictionLaw { coulomb, stribeck, speed });
         let frictions = frictions.into_iter().map(law).collect();
         let times = times.as_ref().map(|times| vector("sample times", times)).transpose()?;
         let points = run.len().saturating_mul(run.channels().len());
         super::errors::run_attached(|| {
-            let inner = Arc::new(output_samples::OutputSimulation::new(run, equations, frictions, times)?);
-            Ok(Self { inner, points })
+            let inner = if derived.is_empty() {
+                output_samples::OutputSimulation::new(run, equations, frictions, times)?
+            } else if frictions.is_empty() {
+                output_samples::OutputSimulation::with_derived(run, equations, derived, times)?
+            } else {
+                return Err(refuse_beside("dry friction", "leave one of them out"));
+            };
+            Ok(Self { inner: Arc::new(inner), points })
         })
     }
 
@@ -267,9 +278,9 @@ impl OutputSimulation {
         Ok((samples_tuple(py, found.samples)?, found.refinement, PyArray1::from_vec(py, found.change)))
     }
 
-    /// (exponent, coefficient) of the initial terms of a model with friction by equation, fitted on a grid.
+    /// (exponent, coefficient) of the initial terms of a model with friction or non-linear terms by equation, fitted on a grid.
     #[pyo3(signature = (start, every, stop=None))]
-    fn fit_friction_terms(
+    fn fit_initial_states(
         &self,
         py: Python<'_>,
         start: InitialArg,
@@ -277,7 +288,7 @@ impl OutputSimulation {
         stop: Option<&Stop>,
     ) -> PyResult<Vec<Vec<(f64, f64)>>> {
         let (inner, initial) = (Arc::clone(&self.inner), initial(start)?);
-        run_interruptible(py, usize::MAX, stop, move |stop| inner.fit_friction_terms(initial, every, stop))
+        run_interruptible(py, usize::MAX, stop, move |stop| inner.fit_initial_states(initial, every, stop))
     }
 }
 

@@ -91,7 +91,7 @@ pub struct Recording {
     pub is_at_rest: bool,
     /// Whether each equation is driven by the simulated other outputs, not by the measured ones.
     pub is_coupled: bool,
-    /// Whether a body has friction, so that outputs are simulated before the filter.
+    /// Whether a body has friction or an equation non-linear terms, so that outputs are simulated before the filter.
     pub has_friction: bool,
     /// Signal and law of each delay, saturation and dead zone that is to be estimated.
     pub free_inputs: Vec<(usize, InputLaw)>,

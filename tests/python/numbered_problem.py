@@ -51,6 +51,7 @@ class NumberedProblem:
         self.core = _core.JointProblem(
             {
                 "signals": [f"s{k}" for k in range(signals)],
+                "derived": [],
                 "equations": equations,
                 "bounds": [(f"o{k}", ends) for k, ends in enumerate(bounds)],
                 "coupled": True,

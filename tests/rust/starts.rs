@@ -64,6 +64,7 @@ fn structure(alpha: Order, beta: f64) -> Structure {
         vec![term(0, Order::free("nu"), "a"), term(0, Order::number(0.0), "b"), term(1, Order::number(beta), "c")];
     Structure {
         signals: vec!["y".into(), "u".into()],
+        derived: Vec::new(),
         equations: vec![Equation { output: 0, order: alpha, terms, friction: None }],
         bounds: [].into(),
         coupled: true,

@@ -1,10 +1,10 @@
-"""Transfer functions as models and their connections, for real powers of s without approximation."""
+"""Transfer functions as models and their connections, for real powers of s; linear models of non-linear ones."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from numbers import Real
 
 from ftlm.analysis.frequency_response import (
@@ -16,11 +16,17 @@ from ftlm.analysis.frequency_response import (
 )
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
-from ftlm.structure.order import MAX_ORDER
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.expression import Channel, channel
+from ftlm.structure.grammar import EquationParser
+from ftlm.structure.order import MAX_ORDER, Order
 from ftlm.structure.parser import equation
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import check_known, real_number
 
+#: Relative size below which the coefficient of the highest derivative has cancelled.
+CANCELLATION_TOLERANCE = 1e-12
 #: Coefficient and power of a term.
 Pair = tuple[float, float]
 
@@ -183,3 +189,57 @@ def inverse(model: Model) -> Model:
 def _distinct_name(output: str, signal: str) -> str:
     """Return the name of an output that is not that of the input."""
     return output if output != signal else f"{output}_out"
+
+
+def linearize(model: Model, at: Mapping[str, float]) -> Model:
+    """Return the linear model of small deviations from an operating point; see :meth:`ftlm.Model.linearized`."""
+    found = [(c, t) for e in model.equations for t in e.nonlinear_terms for c in (t.nonlinear or channel("")).channels]
+    channels = list(dict.fromkeys(c for c, _ in found))
+    names = {str(channel(*c)): c for c in channels}
+    point = {_channel_of(name): real_number(f"operating point of {name}", value) for name, value in at.items()}
+    check_known("operating point", [str(channel(*c)) for c in point], list(names))
+    for c in channels:
+        if c not in point and c[1] == 0:
+            raise ModelError(
+                f"the operating point of {c[0]} is not given, and {next(t for k, t in found if k == c)} depends on it; "
+                f"add {c[0]!r} to at"
+            )
+    values = {c: point.get(c, 0.0) for c in channels}
+    equations = tuple(_linearized_equation(item, values) for item in model.equations)
+    return replace(model, structure=replace(model.structure, equations=equations), estimate=None)
+
+
+def _channel_of(name: str) -> Channel:
+    """Return the channel that a text such as ``y`` or ``D^0.5 y`` names."""
+    parsed = EquationParser(name).parse_expression()
+    if parsed.operation != "channel":
+        raise ModelError(f"the operating point {name!r} is no signal or derivative of one; write 'y' or 'D y'")
+    return parsed.signal, parsed.value
+
+
+def _linearized_equation(item: Equation, values: Mapping[Channel, float]) -> Equation:
+    """Return an equation with every non-linear term replaced by its derivatives; constants are dropped."""
+    if not item.nonlinear_terms:
+        return item
+    terms = [t for t in item.terms if t.nonlinear is None]
+    slopes: dict[tuple[str, Order], float] = {}
+    for term in item.nonlinear_terms:
+        shape = term.nonlinear
+        assert shape is not None
+        for (signal, order), slope in shape.gradient(values).items():
+            if not math.isfinite(slope):
+                where = ", ".join(f"{channel(*c)} = {values[c]:g}" for c in shape.channels)
+                raise ModelError(f"{shape} has no derivative at {where}; choose another operating point")
+            place = signal, Order(round(term.order.constant + order, 9))
+            slopes[place] = slopes.get(place, 0.0) + float(term.fixed or 0.0) * float(slope)
+    leading = 1.0 - slopes.pop((item.output, item.order), 0.0)
+    if abs(leading) <= CANCELLATION_TOLERANCE:
+        raise ModelError(f"the highest derivative of {item.output} cancels at this operating point; choose another one")
+    for k, term in enumerate(terms):
+        if (term.signal, term.order) in slopes:
+            value = float(term.fixed or 0.0) + slopes.pop((term.signal, term.order))
+            terms[k] = Term(term.signal, term.order, value)
+    terms += [Term(signal, order, slope) for (signal, order), slope in slopes.items() if slope or signal != item.output]
+    if leading != 1.0:
+        terms = [Term(t.signal, t.order, float(t.fixed or 0.0) / leading) for t in terms]
+    return replace(item, terms=tuple(terms))

@@ -72,8 +72,8 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     """
     check_model(model)
     if time is None:
-        # Friction has no poles, and no time of its own that a program could tell.
-        span = 10.0 if model.structure.has_friction else settling_time(model)
+        # A model that is not linear has no poles, and no time of its own that a program could tell.
+        span = settling_time(model) if model.structure.is_linear else 10.0
         time = np.linspace(0.0, span, DEFAULT_TIME_POINTS)
     instants = as_floats("time", time)
     centre = step_response(model, instants)

@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Mapping
 
 from ftlm.errors import DataError
+from ftlm.structure.expression import Expression
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import as_mapping, join_names, nearest
 
@@ -265,3 +266,68 @@ def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal
     below = f"({below})" if "/" in below or "·" in below else below
     ratio = above if below == "1" else f"{above}/{below}"
     return f"{time} {ratio}".strip()
+
+
+def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[str, float] | None:
+    """Return the powers of units and of s of an expression; None if the unit of a signal is unknown.
+
+    A sum has the unit of its first term with a signal. Functions other than abs and sqrt have none.
+    """
+    match expression.operation:
+        case "constant":
+            return {}
+        case "channel":
+            unit = units.get(expression.signal, "")
+            own = {} if unit == "1" else {unit: 1.0}
+            return _multiply_units(own, {"s": -expression.value}) if unit else None
+        case "add":
+            return expression_unit(units, next(a for a in expression.arguments if a.channels))
+        case "multiply":
+            found: dict[str, float] | None = {}
+            for argument in expression.arguments:
+                more = expression_unit(units, argument)
+                found = None if found is None or more is None else _multiply_units(found, more)
+            return found
+        case "power" | "abs" | "sqrt":
+            exponent = {"power": expression.value, "abs": 1.0, "sqrt": 0.5}[expression.operation]
+            inner = expression_unit(units, expression.arguments[0])
+            return None if inner is None else {unit: exponent * power for unit, power in inner.items()}
+    return {}
+
+
+def _multiply_units(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
+    """Return the product of two units as powers."""
+    powers = {unit: first.get(unit, 0.0) + second.get(unit, 0.0) for unit in dict.fromkeys([*first, *second])}
+    return {unit: power for unit, power in powers.items() if round(power, 9)}
+
+
+def nonlinear_coefficient_unit(
+    units: Mapping[str, str], output: str, alpha: float, expression: Expression, order: float
+) -> str:
+    """Unit of the coefficient of D^order of an expression in the equation of D^alpha of an output, ``s^-2 rad^-2``.
+
+    Empty if the unit of a signal is unknown or the coefficient is dimensionless.
+    """
+    own, inner = units.get(output, ""), expression_unit(units, expression)
+    if not own or inner is None:
+        return ""
+    above = {"s": order - alpha} | ({} if own == "1" else {own: 1.0})
+    powers = _multiply_units(above, {unit: -power for unit, power in inner.items()})
+    time = powers.pop("s", 0.0)
+    top = [_unit_power(unit, power) for unit, power in powers.items() if power > 0]
+    bottom = [_unit_power(unit, -power) for unit, power in powers.items() if power < 0]
+    if top and bottom:
+        below = "·".join(bottom)
+        ratio = f"{'·'.join(top)}/{f'({below})' if len(bottom) > 1 else below}"
+    else:
+        ratio = "·".join(top) or "·".join(_unit_power(unit, power) for unit, power in powers.items())
+    seconds = f"s^{round(time, 4):g}" if round(time, 4) else ""
+    return f"{seconds} {ratio}".strip()
+
+
+def _unit_power(unit: str, power: float) -> str:
+    """Return a unit to a power as text."""
+    compound = "/" in unit or "·" in unit
+    if power == 1:
+        return f"({unit})" if compound else unit
+    return f"{f'({unit})' if compound else unit}^{power:g}"

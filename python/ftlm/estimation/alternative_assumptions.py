@@ -41,7 +41,7 @@ _BETWEEN_SAMPLES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 def undetermined_start_findings(fit: Fit) -> list[Finding]:
     """Return a finding if other initial conditions explain the runs as well and give another gain."""
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
-    if joint is None or structure.has_friction or structure.limits or structure.offset not in ("none", "level"):
+    if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
         return []
     if all(rest_evidence(run, structure) is not None for run in runs):
         # Another finding states the evidence of rest, or that rest is assumed.

@@ -16,7 +16,8 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
-from ftlm.simulation.discretization import affine, initial_tuple
+from ftlm.simulation.discretization import affine, derived_signals, initial_tuple
+from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.structure.equation import Friction, Stribeck
 from ftlm.structure.input_nonlinearity import FreeInputParameter
 from ftlm.structure.order import Order
@@ -136,7 +137,7 @@ class FreeProblem:
 
 def core_arguments(structure: Structure) -> Any:
     """Return a structure with decided initial terms as keyword data of the core."""
-    signals, hints = structure.signals, structure.hints or Hints()
+    signals, hints = record_signals(structure), structure.hints or Hints()
     states = structure.filter_states(structure.initial)
     # What is free does not hang on an offset that is still to be decided.
     offset: Offset = "none" if structure.offset == "auto" else structure.offset
@@ -156,7 +157,7 @@ def core_arguments(structure: Structure) -> Any:
             order(e.order),
             # Rounding, and with it the optimum of a difficult fit, does not depend on how the equation is written.
             sorted(
-                ((signals.index(t.signal), order(t.order), t.coefficient, t.factor) for t in e.terms),
+                ((signals.index(t.column), order(t.order), t.coefficient, t.factor) for t in e.terms),
                 key=lambda term: (term[0] != signals.index(e.output), term[0], -term[1][0], repr(term)),
             ),
             friction(e.friction),
@@ -165,6 +166,7 @@ def core_arguments(structure: Structure) -> Any:
     ]
     return {
         "signals": list(signals),
+        "derived": derived_signals(structure),
         "equations": equations,
         "bounds": [(name, (values[0], values[-1])) for name, values in structure.order_values.items()],
         "coupled": structure.coupling == "simulated",
@@ -259,7 +261,8 @@ COLLINEARITY_TOLERANCE = 1e-9
 def describe_collinear_inputs(runs: Sequence[Run], structure: Structure) -> str | None:
     """Return a message that names two proportional inputs of one equation and order, or None."""
     for item in structure.equations:
-        driving = [t for t in item.terms if t.signal != item.output and isinstance(t.coefficient, str)]
+        linear = [t for t in item.terms if t.nonlinear is None]
+        driving = [t for t in linear if t.signal != item.output and isinstance(t.coefficient, str)]
         for one, other in itertools.combinations(driving, 2):
             if one.signal == other.signal or one.order != other.order:
                 continue

@@ -27,6 +27,7 @@ from ftlm.estimation.objective import covariance_of
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.progress import Progress, ShareTracker
+from ftlm.simulation.discretization import check_linear
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import MAX_DEFAULT_SEARCH_ORDER, MAX_IMPROPER_ORDER, MAX_ORDER, MIN_INPUT_ORDER, Order, Values
 from ftlm.structure.parser import equation
@@ -684,6 +685,7 @@ def _structure(
     lacking = "which a frequency response does not know"
     if wanted.has_friction:
         raise ModelError(f"the equations have friction, {lacking}; identify runs over time, or leave it out")
+    check_linear(wanted.equations, "a frequency response")
     if wanted.limits:
         raise ModelError(f"{wanted.limits[0].signal} saturates or has a dead zone, {lacking}; identify runs over time")
     if wanted.offset != "none":

@@ -22,7 +22,7 @@ from ftlm.findings import make_finding
 from ftlm.kernels import block_pulse_kernel
 from ftlm.order_search.options import Norm
 from ftlm.progress import Progress
-from ftlm.simulation.discretization import Record, order_grid_tuple, prepare
+from ftlm.simulation.discretization import Record, check_linear, order_grid_tuple, prepare
 from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
@@ -536,6 +536,7 @@ class GeneticAlgorithm:
     ) -> Fit:
         """Estimate orders and coefficients, one equation at a time or jointly; see :func:`ftlm.identify`."""
         check_no_friction(structure, self.name)
+        check_linear(structure.equations, "the genetic baseline")
         check_order_grid_names(self.order_grid, structure)
         task = Task(tuple(runs), structure, self.order_grid)
         parts = (

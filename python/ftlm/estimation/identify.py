@@ -33,6 +33,7 @@ from ftlm.estimation.model_checks import (
     start_findings,
     stribeck_findings,
 )
+from ftlm.estimation.nonlinear_checks import nonlinear_findings
 from ftlm.estimation.nuisance_parameters import (
     DEFAULT_PULSES_PER_SAMPLE,
     OffsetTest,
@@ -48,7 +49,7 @@ from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_find
 from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
-from ftlm.simulation.discretization import default_m
+from ftlm.simulation.discretization import check_linear, default_m
 from ftlm.simulation.initial_conditions import START_SETTINGS
 from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
@@ -109,8 +110,8 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
 def _fit_with_level_decision(structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit:
     """Fit a structure, with a level of the outputs if the runs prefer one, and with findings on offsets."""
     fit = estimate(structure)
-    # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
-    if fit.task.structure.offset != "none" or structure.has_friction or not _is_testable(fit.task.runs):
+    # In a model that is not linear a constant is no sensitivity alone: it decides where a body rests.
+    if fit.task.structure.offset != "none" or not structure.is_linear or not _is_testable(fit.task.runs):
         return fit
     shown = _shows_level(fit)
     level = _fit_with_level(fit, structure, estimate) if shown else None
@@ -177,7 +178,7 @@ def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
     """Return an input with a free coefficient that is constant on every run, or None."""
     for item in structure.equations:
         for term in item.terms:
-            plain = term.fixed is None and not term.order.names and term.order.constant == 0
+            plain = term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
             if plain and all(term.signal in r.inputs and float(np.ptp(r[term.signal])) == 0.0 for r in runs):
                 return term.signal
     return None
@@ -295,6 +296,7 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
             f"{parameter('offset', 'auto')} does not know; use {parameter('offset', 'constant')}, whose interval "
             f"says whether it is 0, or {parameter('offset', 'none')}"
         )
+    check_linear(structure.equations, f"the test of {parameter('offset', 'auto')}")
     if getattr(method, "store", None) is not None:
         raise ModelError(
             f"{parameter('offset', 'auto')} may need two searches, and a store keeps those of one; use "
@@ -317,6 +319,7 @@ def assess_fit(fit: Fit) -> Identification:
         + mode_sampling_findings(model, runs)
         + friction_direction_findings(model, free)
         + stribeck_findings(model, runs, free)
+        + nonlinear_findings(model, runs, free)
     )
     tests, criteria = None, None
     try:
@@ -402,7 +405,7 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
         if test.response
     }
     runs = fit.task.runs
-    plain = not fit.task.structure.has_friction and all(run.sample_times is None for run in runs)
+    plain = fit.task.structure.is_linear and all(run.sample_times is None for run in runs)
     if fit.joint is None or not fed or has_loop_noise_model(fit.settings) or not plain:
         return tests
     answers = [

@@ -15,8 +15,18 @@ from ftlm.data.sampling import check_step
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError
 from ftlm.findings import Finding, make_finding
 from ftlm.kernels import Recursion
+from ftlm.model.model import Model
+from ftlm.order_search.free_run_ranking import free_run_score, record_run
 from ftlm.order_search.options import RowBasis, SearchSettings
-from ftlm.simulation.discretization import InitialTuple, Record, named_coefficients, prepare, structure_tuple
+from ftlm.simulation.discretization import (
+    InitialTuple,
+    Record,
+    check_linear,
+    named_coefficients,
+    prepare,
+    structure_tuple,
+)
+from ftlm.simulation.nonlinear_columns import has_derivative_channels
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.figure import Figure
@@ -51,12 +61,33 @@ class CoefficientFit:
 def estimate_coefficients(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None
 ) -> CoefficientFit:
-    """Estimate the coefficients at given orders by the method that the settings name."""
-    records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
+    """Estimate the coefficients at given orders by the method that the settings name.
+
+    Derivatives in non-linear terms are those of the raw signals or of smooth ones, whichever gives the better free run.
+    """
+    if settings.coefficients == "instrumental-variables":
+        check_linear(structure.equations, "an instrument")
+    if not has_derivative_channels(structure):
+        return _estimate_coefficients(runs, structure, settings, m, smooth=True)[0]
+    found = [_estimate_coefficients(runs, structure, settings, m, smooth=smooth) for smooth in (True, False)]
+    tracks = [record_run(rec, structure) for rec in found[0][1]]
+
+    def score(pair: tuple[CoefficientFit, list[Record]]) -> float:
+        model = Model(structure.with_coefficients(pair[0].values))
+        return free_run_score(model, pair[1], tracks, "l2", [1.0] * len(model.outputs))
+
+    return min(found, key=score)[0]
+
+
+def _estimate_coefficients(
+    runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None, *, smooth: bool
+) -> tuple[CoefficientFit, list[Record]]:
+    """Estimate the coefficients as :func:`estimate_coefficients`, and return the records too."""
+    records = prepare(runs, structure, m, power_of_two=settings.needs_haar, smooth=smooth)
     fit = CoefficientFit(records[0].m, records[0].initial)
     if settings.coefficients == "instrumental-variables":
         _instrumental(fit, structure, records)
-        return fit
+        return fit, records
     for item in structure.equations:
         if settings.coefficients == "least-squares":
             raw = _core.least_squares(*_linear(item, records))[0]
@@ -67,7 +98,7 @@ def estimate_coefficients(
                 weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
                 fit.findings.extend(_prior_findings(item.output, raw, weak, settings))
         fit.values.update(named_coefficients(item, raw))
-    return fit
+    return fit, records
 
 
 def _linear(
@@ -231,6 +262,7 @@ def multi_innovation_trace(
     rest = replace(equation, initial="rest")
     rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
     item = equation.equations[0]
+    check_linear([item], "a trace")
     core_structure = structure_tuple(item, rec.signals)
     inputs = list(rec.inputs)
     _, trace = _core.multi_innovation(

@@ -22,6 +22,7 @@ from ftlm.findings import Finding
 from ftlm.model.model import Model
 from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
 from ftlm.order_search.search import check_executor, threads_per_task
+from ftlm.simulation.discretization import check_linear
 from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
@@ -128,6 +129,8 @@ class OutputError:
                 f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the "
                 f"instrument {parameter('reference', self.reference)} does not know; leave one of the two out"
             )
+        if self.reference is not None:
+            check_linear(structure.equations, f"the instrument {parameter('reference', self.reference)}")
         workers, answers, weak = check_threads(threads), None, list[Finding]()
         if self.reference is not None:
             answers, weak = instrument_runs(runs, structure, self.reference)

@@ -153,7 +153,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
             for a, b, e in zip(joint.values.tolist(), values, errors, strict=True)
         )
     ]
-    if not far or joint.robust is not None or problem.structure.has_friction:
+    if not far or joint.robust is not None or not problem.structure.is_linear:
         return []
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     first = max(MAX_SECOND_SAMPLES // len(runs), MIN_SECOND_RUN_SAMPLES)
@@ -465,7 +465,7 @@ def discretization_findings(model: Model, comparison: Comparison) -> list[Findin
         own = [
             (float(t.fixed or 0.0), item.order.constant - t.order.constant)
             for t in item.terms
-            if t.signal == item.output
+            if t.column == item.output
         ]
         margin = min(_core.nyquist_margin(own, step) for step in comparison.step)
         if margin <= 0:
@@ -514,8 +514,8 @@ def stability_findings(model: Model) -> list[Finding]:
     They are a fault where one of them exceeds 0 by more than its standard error allows; where none does, an integrator
     or a mode that decays slowly explains the run as well.
     """
-    if model.structure.has_friction:
-        # Friction holds what would grow slowly; no poles say so.
+    if not model.structure.is_linear:
+        # Friction holds what would grow slowly, and a spring that hardens what would grow; no poles say so.
         return []
     stable = model.stability(coupling=model.structure.coupling)
     if not stable.unstable_poles > 0:
@@ -526,7 +526,7 @@ def stability_findings(model: Model) -> list[Finding]:
 
 def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
     """Return a finding on the fastest oscillation that has too few samples per period."""
-    if model.structure.has_friction:
+    if not model.structure.is_linear:
         return []
     try:
         swings = [m for m in modes(model, coupling=model.structure.coupling) if m.oscillatory]

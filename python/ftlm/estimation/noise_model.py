@@ -35,8 +35,10 @@ def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
     asked = parameter("noise", "ar")
     if len(structure.outputs) > 1:
         raise ModelError(f"{asked} is of one output, not of {', '.join(structure.outputs)}; fit each one")
-    if structure.has_friction or structure.limits:
-        raise ModelError(f"{asked} filters inputs and output alike, and friction and limits do not commute with it")
+    if not structure.is_linear or structure.limits:
+        raise ModelError(
+            f"{asked} filters inputs and output alike, and friction, non-linear terms and limits do not commute with it"
+        )
     if any(run.sample_times is not None for run in runs):
         raise ModelError(f"{asked} needs samples on a regular grid; resample the runs, or leave it out")
 

@@ -279,7 +279,7 @@ def fit_with_initial_conditions(
         begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
         return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)
 
-    decided = structure.initial != "auto" or not has_memory(structure) or structure.has_friction
+    decided = structure.initial != "auto" or not has_memory(structure) or not structure.is_linear
     if not decided and isinstance(start, History):
         # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
         # for more terms, not for fewer.

@@ -113,7 +113,7 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
 
 def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], comparison: Comparison) -> list[Finding]:
     """Return a finding if pieces of the runs show an unstable plant, by the model or by a linear fit at its orders."""
-    if model.structure.has_friction:
+    if not model.structure.is_linear:
         return []
     explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
     if any(f.code == "free_run_grows" for f in stability_findings(model)):

@@ -255,11 +255,11 @@ def _free_runs(result: Identification) -> Iterator[Finding]:
 
 
 def _unstable_poles(model: Model) -> Iterator[Finding]:
-    """Yield findings about unstable poles and undamped modes; none with friction.
+    """Yield findings about unstable poles and undamped modes; none if the model is not linear.
 
     A pole at the origin is an integrator, which is common in machines and no fault.
     """
-    if model.structure.has_friction:
+    if not model.structure.is_linear:
         return
     growth = stability_findings(model)
     yield from growth

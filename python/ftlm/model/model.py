@@ -174,6 +174,28 @@ class Model:
         return self.structure.outputs
 
     @check_arguments
+    def linearized(self, at: Mapping[str, float]) -> Model:
+        """Return the linear model of small deviations from an operating point.
+
+        Every non-linear term is replaced by its derivatives with respect to its signals; constants are dropped, so that
+        outputs and inputs of the linear model count from the point.
+
+        Parameters
+        ----------
+        at
+            Values of the signals in non-linear terms, such as ``{"y": 0.3, "u": 1.0}``. Derivatives are 0 unless given,
+            as in ``{"y": 0.3, "D y": 0.1}``.
+
+        Raises
+        ------
+        ModelError
+            A signal without a value, a name that is in no non-linear term, or a point without a derivative.
+        """
+        from ftlm.analysis.model_algebra import linearize
+
+        return linearize(self, at)
+
+    @check_arguments
     def simulate(
         self,
         run: Run,

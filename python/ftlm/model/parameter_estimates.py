@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ftlm.data.units import coefficient_unit
+from ftlm.data.units import coefficient_unit, nonlinear_coefficient_unit
 from ftlm.model.model import Model
 from ftlm.utils.files import to_frame
 
@@ -105,8 +105,12 @@ def parameter_units(model: Model) -> dict[str, str]:
         alpha = item.order.constant
         for term in item.terms:
             if term.name is not None:
-                unit = coefficient_unit(model.units, item.output, alpha, term.signal, term.order.constant)
-                out[term.name] = unit
+                place, shape, order = (model.units, item.output, alpha), term.nonlinear, term.order.constant
+                out[term.name] = (
+                    coefficient_unit(*place, term.signal, order)
+                    if shape is None
+                    else nonlinear_coefficient_unit(*place, shape, order)
+                )
         if item.friction is not None:
             own = model.units.get(item.output, "")
             force = f"s^-{alpha:g} {own}" if own else ""

@@ -13,6 +13,7 @@ from msgspec import UNSET, UnsetType
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Estimate, Model
 from ftlm.structure.equation import Equation, Friction, Stribeck, Term
+from ftlm.structure.grammar import EquationParser
 from ftlm.structure.input_nonlinearity import InputNonlinearity, NonlinearityKind
 from ftlm.structure.order import Order
 from ftlm.structure.sensor_filter import SensorFilter
@@ -22,19 +23,35 @@ from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import error_text
 
 #: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are no outputs,
-#: friction, input nonlinearities, Stribeck friction, free parameters of the fit, findings as records.
+#: friction, input nonlinearities, Stribeck friction, free parameters of the fit, findings as records, levels,
+#: non-linear terms.
 BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
-STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA = 7, 8, 9, 10
+STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA, NONLINEAR_SCHEMA = 7, 8, 9, 10, 11
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Term of an equation: coefficient without its factor, name of the free parameter it was."""
+    """Term of an equation: coefficient without its factor, name of the free parameter it was.
+
+    A non-linear term has the text of its expression.
+    """
 
     signal: str
     order: float
     coefficient: float
     factor: float = 1.0
     name: str | None = None
+    expression: str | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, item: Term) -> TermFile:
+        """Convert a term to its file form."""
+        shape = UNSET if item.nonlinear is None else str(item.nonlinear)
+        return cls(item.signal, item.order.constant, float(item.coefficient), item.factor, item.name, shape)
+
+    def term(self) -> Term:
+        """Return the term."""
+        shape = UNSET if isinstance(self.expression, UnsetType) else EquationParser(self.expression).parse_expression()
+        return Term(self.signal, Order(self.order), self.coefficient, self.factor, self.name, shape)
 
 
 class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -95,13 +112,13 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
     @classmethod
     def of(cls, item: Equation) -> EquationFile:
         """Convert an equation to its file form."""
-        terms = [TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in item.terms]
+        terms = [TermFile.of(t) for t in item.terms]
         friction = UNSET if item.friction is None else FrictionFile.of(item.friction)
         return cls(item.output, item.order.constant, terms, friction)
 
     def equation(self) -> Equation:
         """Return the equation."""
-        terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in self.terms)
+        terms = tuple(t.term() for t in self.terms)
         rubs = UNSET if self.friction is UNSET else self.friction.friction()
         return Equation(self.output, Order(self.order), terms, rubs)
 
@@ -111,8 +128,10 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
         return 1 + 2 * len(self.terms) + (0 if self.friction is UNSET else self.friction.count)
 
     @property
-    def friction_schema(self) -> int:
-        """Schema version that the friction needs."""
+    def schema(self) -> int:
+        """Schema version that friction and non-linear terms need."""
+        if any(t.expression is not UNSET for t in self.terms):
+            return NONLINEAR_SCHEMA
         if self.friction is UNSET:
             return BASE_SCHEMA
         return FRICTION_SCHEMA if self.friction.stribeck is UNSET else STRIBECK_SCHEMA
@@ -229,7 +248,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 #: Model files have a few kilobytes; the default size limit suffices.
-MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, LEVEL_SCHEMA)
+MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, NONLINEAR_SCHEMA)
 
 
 def schema_of(
@@ -248,7 +267,7 @@ def schema_of(
         BASE_SCHEMA if isinstance(offset, UnsetType) else LEVEL_SCHEMA if offset == "level" else OFFSET_SCHEMA,
         PROFILE_SCHEMA if profiled or named else BASE_SCHEMA,
         BASE_SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA,
-        *(e.friction_schema for e in equations),
+        *(e.schema for e in equations),
         FIT_SCHEMA if known else BASE_SCHEMA,
         FINDING_SCHEMA if doubted else BASE_SCHEMA,
     )

@@ -14,7 +14,7 @@ from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job, run_job
-from ftlm.simulation.discretization import named_signals
+from ftlm.simulation.discretization import check_linear, named_signals
 from ftlm.structure.equation import Equation
 from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
 from ftlm.structure.structure import Structure
@@ -148,6 +148,7 @@ def _check_certifiable(job: Job) -> None:
         raise ModelError(
             "there is no certificate over all orders of a stage under its law; take its equations one by one"
         )
+    check_linear(job.structure.equations, "a certificate")
     item = job.structure.equations[0]
     if tuple(job.records[0].start) != (False, []):
         raise ModelError(

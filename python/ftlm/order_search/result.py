@@ -203,6 +203,9 @@ class SearchResult:
         Orders of the first row at an end of their interval, by name.
     excluded_by_box
         Number of candidates under "bound" that were excluded with a whole box of orders.
+    free_runs
+        Number of candidates that got a free run, the best by equation error; 0 for linear equations, of which a bound
+        excludes every other one.
     verdict, model_findings
         Verdict and findings of :func:`ftlm.identify` at the orders of rank 1; None and empty for a search resumed from
         a checkpoint file, which keeps no runs.
@@ -217,6 +220,7 @@ class SearchResult:
     settings: dict[str, Any]
     at_grid_edge: dict[str, float]
     excluded_by_box: int = 0
+    free_runs: int = 0
     verdict: Verdict | None = field(default=None, compare=False)
     model_findings: tuple[Finding, ...] = field(default=(), compare=False)
 
@@ -295,6 +299,8 @@ class SearchResult:
     def search_findings(self) -> tuple[Finding, ...]:
         """Findings on the table: orders on the edge of their interval, and rows that are one model."""
         edges = [make_finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
+        if 0 < self.free_runs < self.candidates:
+            edges.append(make_finding("free_runs_of_some", count=self.free_runs, candidates=self.candidates))
         distinct, rows = len(self.distinct_rows), len(self.table)
         if distinct == rows:
             return tuple(edges)

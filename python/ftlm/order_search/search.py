@@ -29,6 +29,7 @@ from ftlm.order_search.batches import (
     search_equation,
 )
 from ftlm.order_search.checkpoint import Request, Store, check_record, read_store
+from ftlm.order_search.free_run_ranking import FREE_RUN_CANDIDATES, rank_by_free_runs
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.progress import Progress
@@ -36,11 +37,13 @@ from ftlm.simulation.discretization import (
     InitialTuple,
     Record,
     check_derivative_orders,
+    check_frictionless,
     check_linear,
     named_coefficients,
     named_signals,
     prepare,
 )
+from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, axis_of, check_order_grid
 from ftlm.structure.structure import Structure
@@ -90,7 +93,7 @@ class Job:
         for record in records:
             check_record(record)
         structure = replace(request.structure, offset=records[0].offset if records else "none")
-        signals = structure.signals
+        signals = record_signals(structure)
         if not records or (len(structure.equations) != 1 and not structure.has_order_law):
             raise ModelError("it is not the search of one equation, or of some under a law, on a record")
         if any(r.signals != signals or r.inputs != records[0].inputs for r in records):
@@ -110,7 +113,7 @@ class Job:
         """Return the search problem of one equation."""
         item, signals = self.structure.equations[0], self.records[0].signals
         axes = [
-            (signals.index(t.signal), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
+            (signals.index(t.column), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
             for t in item.terms
         ]
         return EquationProblem(
@@ -129,17 +132,23 @@ class Job:
             return order.constant, [weights.get(n, 0.0) for n in names]
 
         laws = [
-            (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
+            (signals.index(e.output), affine(e.order), [(signals.index(t.column), affine(t.order)) for t in e.terms])
             for e in structure.equations
         ]
-        points = sum(r.m for r in self.records)
         return CoupledProblem(
             *self._common_arguments(),
             axes=[list(self.values[n]) for n in names],
             laws=laws,
             fixed=[[t.fixed for t in e.terms] for e in structure.equations],
-            scales=[s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()],
+            scales=self.scales(),
         )
+
+    def scales(self) -> list[float]:
+        """Scales by which the scores of the equations are divided: 1 for one equation without an order law."""
+        if not self.structure.has_order_law:
+            return [1.0] * len(self.structure.equations)
+        points = sum(r.m for r in self.records)
+        return [s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()]
 
     def standard_deviations(self) -> list[float]:
         """Standard deviation of each output, by which the scores of the equations are weighted."""
@@ -169,7 +178,22 @@ def threads_per_task(threads: int | None, executor: Executor | None) -> int:
 
 
 def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
-    """Run a search; with a checkpoint file, as search ``number`` of it."""
+    """Run a search; with a checkpoint file, as search ``number`` of it.
+
+    Candidates with non-linear terms are ranked by equation error first, and the best of them by free runs.
+    """
+    settings = job.settings
+    if job.structure.has_nonlinear_terms and settings.criterion == "output-error":
+        kept = max(settings.top, FREE_RUN_CANDIDATES)
+        first = replace(job, settings=replace(settings, criterion="equation-error", top=kept))
+        found = run_job(first, store=store, number=number, executor=executor)
+        table = rank_by_free_runs(found.table, job.structure, job.records, settings.norm, job.scales())
+        counts = {"candidates": found.candidates, "kept": min(settings.top, len(table)), **found.exclusion_counts}
+        counts["diverged"] += len(found.table) - len(table)
+        counts["beaten"] += len(table) - counts["kept"]
+        counted = cast("_core._Counts", counts)
+        result = _result(job, table[: settings.top], found.failures, counted, found.excluded_by_box)
+        return replace(result, free_runs=len(found.table))
     if job.structure.has_order_law:
         stage = search_coupled(
             job.coupled_problem(), store=store, number=number, executor=executor, progress=job.progress
@@ -279,7 +303,9 @@ def make_job(
         raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
     if not equation.order_names:
         raise ModelError("every order is a number, so there is nothing to search; name one, as in D^alpha y")
-    check_linear(equation.equations, "an order search")
+    check_frictionless(equation.equations, "an order search")
+    if settings.coefficients == "instrumental-variables":
+        check_linear(equation.equations, "an instrument")
     if len(equation.equations) > 1 and not equation.has_order_law:
         raise ModelError(
             "the equations share no order law, so they are searched one by one: "

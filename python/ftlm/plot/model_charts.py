@@ -82,9 +82,9 @@ def bode_figures(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
 
 
 def pole_points(model: Model) -> tuple[float, Complex]:
-    """Order q of the plane s^q and the poles in it with their conjugates; empty for a model with friction."""
+    """Order q of the plane s^q and the poles in it with their conjugates; empty for a model that is not linear."""
     q = plane_order(model)
-    found = () if model.structure.has_friction else modes(model)
+    found = modes(model) if model.structure.is_linear else ()
     points = []
     for m in found:
         angle = math.acos(max(-1.0, min(1.0, -m.damping)))

@@ -112,7 +112,7 @@ def title_of(model: Model) -> str:
 
 def behavior_tables(model: Model) -> list[Table]:
     """Return tables of steady-state gains and modes with standard errors; empty if the model has none."""
-    if model.structure.has_friction:
+    if not model.structure.is_linear:
         return []
     tables = []
     try:
@@ -168,7 +168,7 @@ def behavior_tables(model: Model) -> list[Table]:
 def behavior_figures(model: Model) -> list[Figure]:
     """Return pole maps and step responses; outputs without poles or with overflow are omitted."""
     figures: list[Figure] = []
-    if model.structure.has_friction or model.structure.limits:
+    if not model.structure.is_linear or model.structure.limits:
         return figures
     with contextlib.suppress(FtlmError):
         figures += pole_charts(model)
@@ -189,6 +189,14 @@ SERIES_POINTS = 600
 TRACE_POINTS = 64
 #: Text for models with friction, in place of their stability.
 FRICTION_STABILITY_NOTE = "A model with friction is not linear, so it has no poles."
+NONLINEAR_STABILITY_NOTE = "The model is not linear: only its linear model about a point has poles."
+
+
+def stability_note(model: Model) -> str:
+    """Return a sentence on the stability of a model."""
+    if model.structure.has_nonlinear_terms:
+        return NONLINEAR_STABILITY_NOTE
+    return FRICTION_STABILITY_NOTE if model.structure.has_friction else f"As a whole, the model is {model.stability()}."
 
 
 def identification_page(
@@ -284,7 +292,7 @@ def first_sections(
     own = compared[0][1] if compared and compared[0][0] == "estimation" else None
     equations = [
         *equations_html(model, None if own is None else own.offsets),
-        FRICTION_STABILITY_NOTE if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
+        stability_note(model),
     ]
     unseen = [(label, c) for label, c in compared if label == "validation"]
     fitted = [(label, c) for label, c in compared if label != "validation"]
@@ -375,6 +383,9 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     """Return Bode charts over the frequency range of runs with these steps and durations."""
     if model.structure.has_friction:
         words = "A body that may stick has none: its answer is not in proportion to what drives it."
+        return Section("Frequency response", words)
+    if model.structure.has_nonlinear_terms:
+        words = "A non-linear model has none: see that of its linear model about a point, model.linearized(at=…)."
         return Section("Frequency response", words)
     if model.structure.limits:
         words = "A model whose inputs saturate or have a dead zone has none: its answer is not in proportion to them."

@@ -93,6 +93,8 @@ def behavior_lines(model: Model) -> list[str]:
     """Return lines on steady-state gains and modes, if the model has them."""
     if model.structure.has_friction:
         return ["  no poles and no gain: a model with friction is not linear"]
+    if model.structure.has_nonlinear_terms:
+        return ["  no poles and no gain: only a linear model has them, such as linearized(at=…) about a point"]
     lines: list[str] = []
     # Equations that cannot be solved for their outputs together have neither; everything else can be told.
     with contextlib.suppress(FtlmError):

@@ -12,7 +12,8 @@ from msgspec import UNSET
 from ftlm.estimation.output_error import JointFit
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import parameter_units
-from ftlm.structure.equation import Equation
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.expression import Expression
 from ftlm.structure.input_nonlinearity import (
     INPUT_EFFECT_ABBREVIATIONS,
     INPUT_EFFECT_LABELS,
@@ -29,6 +30,7 @@ ORDER_DECIMALS = 4
 THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # our constant
 _DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _LIMITED_INPUT = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
+_IN_PARENTHESES = Markup("<mrow><mo>(</mo>{}<mo>)</mo></mrow>")
 _GAUSSIAN_DECAY = Markup(
     "<msup><mi>e</mi><mrow><mo>−</mo><msup><mrow><mo>(</mo>{}<mo>/</mo>{}<mo>)</mo></mrow><mn>2</mn></msup></mrow></msup>"
 )
@@ -62,10 +64,7 @@ def equation_html(
         lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
         parts.append(
             _math(
-                lead
-                + _number_math(abs(value))
-                + THIN_SPACE
-                + _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0), limits),
+                lead + _number_math(abs(value)) + THIN_SPACE + _operand_math(term, delay or {}, limits),
                 "term",
             )
         )
@@ -148,6 +147,54 @@ def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequ
     return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN_SPACE, written)
 
 
+def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
+    """Return what a coefficient multiplies: a derivative of a signal, or of an expression."""
+    shape = term.nonlinear
+    if shape is None:
+        return _derivative_math(term.order, term.signal, delay.get(term.signal, 0.0), limits)
+    written = _expression_math(shape, delay, limits)
+    if not term.order.names and round(term.order.constant, ORDER_DECIMALS) == 0:
+        return _IN_PARENTHESES.format(written) if shape.operation == "add" else written
+    value = Markup("<mi>{}</mi>").format(str(term.order)) if term.order.names else _signed_math(term.order.constant)
+    return Markup("<msup><mi>D</mi>{}</msup>{}").format(value, _IN_PARENTHESES.format(written))
+
+
+def _expression_math(item: Expression, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
+    """Return an expression of signals as MathML."""
+    match item.operation:
+        case "constant":
+            sign = Markup("<mo>−</mo>") if item.value < 0 else Markup("")
+            return sign + _number_math(_short(abs(item.value)))
+        case "channel":
+            return _derivative_math(Order(item.value), item.signal, delay.get(item.signal, 0.0), limits)
+    parts = [_expression_math(argument, delay, limits) for argument in item.arguments]
+    first = item.arguments[0]
+    match item.operation:
+        case "add":
+            out = parts[0]
+            for argument, part in zip(item.arguments[1:], parts[1:], strict=True):
+                # A term with a negative factor brings its own sign.
+                out += part if argument.split_factor()[0] < 0 else Markup("<mo>+</mo>") + part
+            return out
+        case "multiply":
+            if first.operation == "constant" and first.value == -1.0:
+                parts[0] = Markup("<mo>−</mo>")
+            written = [
+                _IN_PARENTHESES.format(part) if argument.operation == "add" else part
+                for argument, part in zip(item.arguments, parts, strict=True)
+            ]
+            return THIN_SPACE.join(written)
+        case "power":
+            plain = first.operation == "abs" or (first.operation == "channel" and first.value == 0)
+            base = parts[0] if plain else _IN_PARENTHESES.format(parts[0])
+            return Markup("<msup><mrow>{}</mrow><mn>{}</mn></msup>").format(base, f"{item.value:g}")
+        case "abs":
+            return Markup("<mrow><mo>|</mo>{}<mo>|</mo></mrow>").format(parts[0])
+        case "sqrt":
+            return Markup("<msqrt>{}</msqrt>").format(parts[0])
+    return Markup("<mi>{}</mi>{}").format(item.operation, _IN_PARENTHESES.format(parts[0]))
+
+
 def _signed_math(value: float) -> Markup:
     value = round(value, ORDER_DECIMALS) + 0.0
     text = number(Exact(abs(value)))
@@ -205,7 +252,8 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
         for term in item.terms:
             if term.name is None:
                 continue
-            derivative = derivative_html(term.order, term.signal)
+            linear = term.nonlinear is None
+            derivative = derivative_html(term.order, term.signal) if linear else term.operand_as_text({})
             place = Markup("of {} in the equation of {}").format(derivative, symbol_html(item.output))
             stated = reference.get(term.name)
             shown.add(term.name)

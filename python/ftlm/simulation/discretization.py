@@ -22,10 +22,11 @@ from ftlm.simulation.initial_conditions import (
     resolve_initial_conditions,
     resolve_start,
 )
+from ftlm.simulation.nonlinear_columns import append_columns, check_columns, nonlinear_columns, record_signals
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import MAX_IMPROPER_ORDER, ORDER_RESOLUTION, Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.parameters import choose_text, parameter, setting
 from ftlm.utils.validation import Floats, check_pulses, nearest
 
 #: Default number of block pulses, that of the paper, for runs with as many samples.
@@ -120,12 +121,13 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     return m
 
 
-def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> Record:
-    """Return pulse means of every signal of a structure, with delays and sensor filter applied.
+def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True) -> Record:
+    """Return pulse means of every signal and non-linear term of a structure, with delays and sensor filter applied.
 
     Outputs are interpolated linearly between samples; inputs by the intersample behavior of the run. m may exceed the
     grid of the run only if nothing is compared with measurements. ``filtered`` passes signals that were not measured
     through the sensor filter through it (equation error); a simulation without filtered inputs does not need that.
+    ``smooth`` smooths the signals whose derivatives are in non-linear terms.
     Raises for missing signals, signals whose squares underflow, delays of outputs, and missing samples of inputs. Other
     missing samples are interpolated and must not be fitted.
     """
@@ -133,11 +135,12 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     _check_known_inputs(structure)
     initial = resolve_initial_conditions(run, structure)
     step, means, sensor, _ = recording(run, structure, initial).pulses(m, filtered)
+    signals = record_signals(structure)
     return Record(
-        structure.signals,
+        signals,
         step,
-        make_read_only(means),
-        tuple(s in run.inputs for s in structure.signals),
+        make_read_only(append_columns(run, structure, means, step, smooth=smooth)),
+        tuple(s in run.inputs or s not in structure.signals for s in signals),
         sensor,
         initial,
         structure.offset,
@@ -174,7 +177,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
             "filter_states": structure.filter_states(initial),
             "at_rest": initial == "rest",
             "coupled": structure.coupling == "simulated",
-            "friction": structure.has_friction,
+            "friction": not structure.is_linear,
             "free": [(signals.index(item.signal), item.law) for item in structure.free_inputs],
         }
     )
@@ -190,7 +193,7 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
         "delay": None,
         "limits": [],
         "filtered": structure.is_filtered(name),
-        "enters_others": any(t.signal == name for e in structure.equations if e.output != name for t in e.terms),
+        "enters_others": any(name in t.signals for e in structure.equations if e.output != name for t in e.terms),
     }
     moving = name.removeprefix(COULOMB_PREFIX)
     if name not in run and moving != name and moving in run:
@@ -273,27 +276,29 @@ def _check_excess_order(signal: str, order: float, output: str, alpha: float) ->
         )
 
 
-def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True) -> list[Record]:
+def records(
+    runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True
+) -> list[Record]:
     """Return records of several runs (see :func:`record`), cached for runs that were checked together.
 
     Records with a finer grid than the runs are large and used once, so they are not cached.
     """
 
     def build() -> list[Record]:
-        return [record(run, resolve_start([run], structure), m, filtered=filtered) for run in runs]
+        return [record(run, resolve_start([run], structure), m, filtered=filtered, smooth=smooth) for run in runs]
 
     if not isinstance(runs, Runs) or m >= min(run.length for run in runs):
         return build()
     filtered = filtered or structure.sensor_filter is None
     inputs = (structure.delay, structure.free_delays, structure.limits)
-    read = (structure.signals, inputs, structure.sensor_filter, structure.initial)
+    read = (record_signals(structure), inputs, structure.sensor_filter, structure.initial)
     start = (
         structure.offset,
         structure.outputs,
         has_memory(structure),
         [e.order.constant for e in structure.equations],
     )
-    return list(runs.get_or_compute(repr((read, start, m, filtered)), build))
+    return list(runs.get_or_compute(repr((read, start, m, filtered, smooth)), build))
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
@@ -364,12 +369,25 @@ def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float,
     ModelError
         An equation with friction, which nothing linear follows.
     """
-    check_linear([item], "what is linear in its coefficients")
+    check_frictionless([item], "what is linear in its coefficients")
     return linear_tuple(item, signals)
 
 
 def check_linear(equations: Sequence[Equation], what: str) -> None:
-    """Raise ModelError for friction in a linear analysis."""
+    """Raise ModelError for friction or a non-linear term in a linear analysis."""
+    check_frictionless(equations, what)
+    for item in equations:
+        for term in item.nonlinear_terms:
+            point = parameter("at", dict.fromkeys(term.signals, 0.3))
+            linear = choose_text(f"model.linearized({point})", "Model.linearized in Python")
+            raise ModelError(
+                f"the equation of {item.output} has the non-linear term {term}, which {what} does not know; use the "
+                f"linear model about an operating point, {linear}, or free runs (simulate, compare)"
+            )
+
+
+def check_frictionless(equations: Sequence[Equation], what: str) -> None:
+    """Raise ModelError for friction, which is not linear in its coefficients."""
     for item in equations:
         if item.friction is not None:
             raise ModelError(
@@ -379,17 +397,30 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
 
 
 def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
-    """Return the linear part of an equation as an argument of the core."""
+    """Return an equation without friction as an argument of the core; non-linear terms are columns of a record."""
     index = {name: i for i, name in enumerate(signals)}
-    terms = [(index[t.signal], t.order.constant) for t in item.terms]
+    if any(t.column not in index for t in item.nonlinear_terms):
+        check_linear([item], "a computation on the signals alone")
+    terms = [(index[t.column], t.order.constant) for t in item.terms]
     return index[item.output], item.order.constant, terms
+
+
+def derived_signals(structure: Structure) -> list[_core._Derived]:
+    """Return the expressions of non-linear terms as the core takes them; they follow the signals of the structure."""
+    return [
+        (
+            item.program({channel: i for i, channel in enumerate(item.channels)}),
+            [(structure.signals.index(signal), order) for signal, order in item.channels],
+        )
+        for item in nonlinear_columns(structure).values()
+    ]
 
 
 def order_grid_tuple(
     item: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
 ) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
     """Output, values of alpha, and (signal, values of the order, whether both are free) of each term."""
-    check_linear([item], "an order search")
+    check_linear([item], "a genetic algorithm")
 
     def axis(order: Order) -> list[float]:
         return list(values[order.names[0]]) if order.names else [order.constant]
@@ -428,7 +459,13 @@ def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
 
 
 def prepare(
-    runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool, gaps: bool = False
+    runs: Sequence[Run],
+    structure: Structure,
+    m: int | None,
+    *,
+    power_of_two: bool,
+    gaps: bool = False,
+    smooth: bool = True,
 ) -> list[Record]:
     """Return the records of runs for an equation-error estimator, or raise for unsuitable data.
 
@@ -441,21 +478,23 @@ def prepare(
     m = check_m(default_m(runs, power_of_two=power_of_two) if m is None else m, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])
-    prepared = records(runs, structure, m)
+    prepared = records(runs, structure, m, smooth=smooth)
     common = common_initial_conditions([r.initial for r in prepared])
     if common is not None:
         # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
-        prepared = records(runs, replace(structure, initial=common), m)
+        prepared = records(runs, replace(structure, initial=common), m, smooth=smooth)
+    for run, rec in [] if gaps else zip(runs, prepared, strict=True):
+        check_columns(run, structure, dict(zip(rec.signals, rec.means, strict=True)), rec.step)
     for item in structure.equations:
         for term in item.terms:
-            if term.fixed is None and term.signal != item.output and not any(r.of(term.signal).any() for r in prepared):
+            if term.fixed is None and term.column != item.output and not any(r.of(term.column).any() for r in prepared):
                 raise DataError(
-                    f"{term.signal} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
+                    f"{term.column} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
                     "identified; leave the term out, fix its coefficient, or add a run in which it moves"
                 )
             if structure.offset in ("constant", "ramp") and _is_offset(term, item, prepared):
                 raise DataError(
-                    f"{term.signal} is constant on every run, so {term} and the offset in the equation of "
+                    f"{term.column} is constant on every run, so {term} and the offset in the equation of "
                     f"{item.output} are not separately identifiable; add a run in which it changes, fix its "
                     f"coefficient, "
                     f"or use {parameter('offset', 'none')}"
@@ -465,9 +504,9 @@ def prepare(
 
 def _is_offset(term: Term, item: Equation, prepared: Sequence[Record]) -> bool:
     """Whether a free term of order 0 is equivalent to an offset on every run."""
-    if term.fixed is not None or term.signal == item.output or term.order.names or term.order.constant != 0:
+    if term.fixed is not None or term.column == item.output or term.order.names or term.order.constant != 0:
         return False
-    return all(float(np.ptp(r.of(term.signal))) == 0.0 for r in prepared)
+    return all(float(np.ptp(r.of(term.column))) == 0.0 for r in prepared)
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:

@@ -238,7 +238,7 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
     the equations is a level where the plant rested under it.
     """
     automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
-    if structure.has_friction or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
+    if not structure.is_linear or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
         return structure
     found = [rest_evidence(run, structure) for run in runs]
     known = [f for f in found if f is not None]
@@ -304,8 +304,8 @@ def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
     if initial == "auto":
         if structure.offset != "level" and starts_at_rest(run, structure):
             return "rest"
-        # A body with friction has no velocities but its own, so that only level and velocity are asked for.
-        initial = "history" if has_memory(structure) and not structure.has_friction else "caputo"
+        # Past inputs are superposed, so that a model that is not linear has only its initial states.
+        initial = "history" if has_memory(structure) and structure.is_linear else "caputo"
     return history(run, structure) if initial == "history" else initial
 
 

@@ -17,6 +17,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.discretization import (
     compared_times,
     compared_values,
+    derived_signals,
     has_nonuniform_samples,
     initial_tuple,
     linear_tuple,
@@ -35,6 +36,7 @@ from ftlm.simulation.initial_conditions import (
     resolve_start,
     rest_evidence,
 )
+from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.structure.equation import Equation, Friction
 from ftlm.structure.structure import History, Initial, Offset, Structure, offset_exponents
 from ftlm.utils.resources import stop_flag
@@ -44,8 +46,8 @@ from ftlm.utils.validation import Floats
 #: First refinement of the record's grid, doubled until converged. Two pulses per interval are the minimum for a sample
 #: that is independent of a jump of a zero-order-hold input at its time.
 FIRST_REFINEMENT = 2
-#: Refinement of the fit of initial terms with friction. The relative error there is a few 1e-5.
-FRICTION_REFINEMENT = 4
+#: Refinement of the fit of initial terms with friction or non-linear terms. The relative error is a few 1e-5.
+INITIAL_STATE_REFINEMENT = 4
 #: Difference below which two orders count as equal.
 ORDER_TOLERANCE = 1e-9
 #: Distance of a power of t from that of an offset below which both are not separately identifiable. An order just above
@@ -104,24 +106,24 @@ InitialTermsTuple: TypeAlias = tuple[bool, list[list[tuple[float, float]]], bool
 
 
 def output_simulation(
-    model: Model, run: Run, initial: Terms | None, times: Floats | None, friction_refinement: int
+    model: Model, run: Run, initial: Terms | None, times: Floats | None, state_refinement: int
 ) -> tuple[_core.OutputSimulation, InitialTermsTuple]:
     """Return a simulation by the core, at uniform samples or at given times [s], and its initial terms.
 
-    Initial terms of a model with friction are fitted on a grid of its own.
+    Initial terms of a model that is not linear in them are fitted on a grid of its own.
     """
-    structure, signals = model.structure, model.structure.signals
+    structure, signals = model.structure, record_signals(model.structure)
     run, plain = without_level(run, structure)
     start = resolve_initial_conditions(run, plain)
     frictions = [(i, (model.equations[i].friction or Friction(0.0)).law) for i in structure.friction_equations]
     equations = [(linear_tuple(e, signals), [float(t.fixed or 0.0) for t in e.terms]) for e in model.equations]
-    core = _core.OutputSimulation(recording(run, plain, start), equations, frictions, times)
+    core = _core.OutputSimulation(recording(run, plain, start), equations, frictions, times, derived_signals(structure))
     if initial is not None:
         return core, (False, [list(initial.get(o, {}).items()) for o in model.outputs], False)
-    if frictions:
+    if not structure.is_linear:
         check_uniform_samples(run, model)
         states = initial_tuple(start, plain.offset, plain.filter_states(start))
-        return core, (False, core.fit_friction_terms(states, friction_refinement, stop_flag()), False)
+        return core, (False, core.fit_initial_states(states, state_refinement, stop_flag()), False)
     names = initial_names(model, start)
     exponents = [[(power, 0.0) for output, power in names if output == o] for o in model.outputs]
     return core, (True, exponents, structure.offset == "level")
@@ -157,9 +159,11 @@ def named_terms(model: Model, terms: Sequence[Sequence[tuple[float, float]]]) ->
 def check_uniform_samples(run: Run, model: Model) -> None:
     """Raise ModelError for nonuniform samples."""
     if has_nonuniform_samples(run, model.structure):
-        output = model.outputs[model.structure.friction_equations[0]]
+        structure = model.structure
+        what = "friction" if structure.has_friction else "a non-linear term"
+        output = next(e.output for e in structure.equations if e.friction is not None or e.nonlinear_terms)
         raise ModelError(
-            f"run {run.name!r} has rows at times of their own, and the equation of {output} has friction, "
+            f"run {run.name!r} has rows at times of their own, and the equation of {output} has {what}, "
             "which is followed at regular times; resample the run yourself"
         )
 
@@ -275,7 +279,7 @@ def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
 def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
     """Return names of the runs that start near zero but had nonzero initial conditions."""
     structure = model.structure
-    if structure.initial != "auto" or structure.has_friction or not has_memory(structure):
+    if structure.initial != "auto" or not structure.is_linear or not has_memory(structure):
         return []
     looked = (
         (run.name, _start_residuals(structure, run))

@@ -21,7 +21,7 @@ from ftlm.errors import FtlmError
 from ftlm.model.model import Model
 from ftlm.simulation.output_samples import (
     FIRST_REFINEMENT,
-    FRICTION_REFINEMENT,
+    INITIAL_STATE_REFINEMENT,
     LEVEL_EXPONENT,
     InitialTermsTuple,
     initial_names,
@@ -176,7 +176,7 @@ def _past_responses(model: Model, run: Run, times: Floats, max_m: int) -> list[F
         step_model = Model(replace(structure, input_nonlinearities=msgspec.UNSET, coefficient_law=()))
         none: dict[str, dict[float, float]] = {o: {} for o in outputs}
         try:
-            core, terms = output_simulation(step_model, longer, none, None, FRICTION_REFINEMENT)
+            core, terms = output_simulation(step_model, longer, none, None, INITIAL_STATE_REFINEMENT)
             exact = core.exact_samples(terms, stop_flag())
             if exact is None:
                 steps = core.refine(terms, RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag())[

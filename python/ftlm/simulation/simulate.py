@@ -86,9 +86,9 @@ def simulate(
     """Simulate the outputs of a model on the inputs of a run, at its sample times.
 
     Integer orders are simulated exactly, by the matrix exponential of one sampling interval, if the samples are uniform
-    and the model has neither a sensor filter nor friction. For all other models the step of the record is refined under
-    the intersample behavior of the inputs (a zero-order hold stays exact), with Richardson extrapolation (powers 2, 3
-    and 4), until halving the step changes no output by more than ``tolerance`` of its largest value.
+    and the model has no sensor filter, friction or non-linear term. For all other models the step of the record is
+    refined under the intersample behavior of the inputs (a zero-order hold stays exact), with Richardson extrapolation
+    (powers 2, 3 and 4), until halving the step changes no output by more than ``tolerance`` of its largest value.
 
     A sample is the value just after the input of its row has changed. A term of the equation's own order (direct
     feedthrough) acts without delay; everything else is continuous there.
@@ -193,7 +193,7 @@ def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
         needed[float(i)] = needed.get(float(i), 0.0) + value
         for term in item.terms:
             order, power = term.order.constant, round(alpha - term.order.constant + i, 9)
-            if term.signal == item.output and i < math.ceil(order - 1e-9):
+            if term.column == item.output and i < math.ceil(order - 1e-9):
                 share = float(term.fixed or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
                 needed[power] = needed.get(power, 0.0) - share * value
     lacking = [e for e in needed if e != round(e) and not any(abs(e - given) < 1e-6 for given in terms)]

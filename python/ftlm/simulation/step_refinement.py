@@ -12,7 +12,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
 from ftlm.simulation.initial_conditions import deviations, resolve_initial_conditions, resolve_start, start_score
 from ftlm.simulation.output_samples import (
-    FRICTION_REFINEMENT,
+    INITIAL_STATE_REFINEMENT,
     LEVEL_EXPONENT,
     InitialTermsTuple,
     OutputSamples,
@@ -86,12 +86,12 @@ def _simulate_refined(
     model: Model, run: Run, initial: Terms | None, tolerance: float, max_m: int, on_grid: bool
 ) -> OutputSamples:
     """Simulate as :func:`simulate_refined`, with a start that is resolved, and deviations for a level."""
-    if initial is None and not model.structure.has_friction:
+    if initial is None and model.structure.is_linear:
         model = with_initial_conditions(model, run)
     times = (
         run.time if on_grid and has_nonuniform_samples(run, model.structure) else nonuniform_sample_times(model, run)
     )
-    core, terms = output_simulation(model, run, initial, times, FRICTION_REFINEMENT)
+    core, terms = output_simulation(model, run, initial, times, INITIAL_STATE_REFINEMENT)
     exact = exact_samples(core, terms)
     if exact is not None:
         return OutputSamples(exact[0], named_terms(model, exact[1]), 1, np.zeros(len(model.outputs)))

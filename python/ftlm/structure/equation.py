@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from msgspec import UNSET, UnsetType
 
 from ftlm.errors import ModelError
-from ftlm.structure.order import MAX_ORDER, MIN_INPUT_ORDER, Order
+from ftlm.structure.expression import Expression
+from ftlm.structure.order import MAX_ORDER, MIN_INPUT_ORDER, ORDER_RESOLUTION, Order
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import real_number
 
@@ -20,18 +21,22 @@ from ftlm.utils.validation import real_number
 class Term:
     """Term ``factor * coefficient * D^order signal`` on the right-hand side of an equation.
 
+    A non-linear term has an expression of signals in place of the signal, such as ``y^3`` or ``abs(D y)*D y``.
+
     Parameters
     ----------
     signal
-        Name of the signal.
+        Name of the signal; the first one of an expression.
     order
-        Order of the derivative.
+        Order of the derivative, also that of an expression as a whole.
     coefficient
         Name of a free coefficient, or its value.
     factor
         Known factor of the coefficient, such as a sign.
     name
         Name that the coefficient had before it got its value.
+    expression
+        Expression of a non-linear term.
     """
 
     signal: str
@@ -39,6 +44,25 @@ class Term:
     coefficient: str | float
     factor: float = 1.0
     name: str | None = None
+    # Omitted when unset, so that digests and files of older equations do not change.
+    expression: Expression | UnsetType = UNSET
+
+    @property
+    def nonlinear(self) -> Expression | None:
+        """Expression of a non-linear term; None if the term is linear."""
+        return self.expression if isinstance(self.expression, Expression) else None
+
+    @property
+    def column(self) -> str:
+        """Name of the term's row in a record: its signal, or the text of its expression."""
+        return self.signal if self.nonlinear is None else str(self.nonlinear)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Signals of the term, in order of first use."""
+        if self.nonlinear is None:
+            return (self.signal,)
+        return tuple(dict.fromkeys(signal for signal, _ in self.nonlinear.channels))
 
     @property
     def fixed(self) -> float | None:
@@ -46,17 +70,37 @@ class Term:
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
     @check_arguments
-    def as_text(self, signal: str) -> str:
-        """Format the term with a given text for its signal."""
+    def as_text(self, inputs: Mapping[str, str]) -> str:
+        """Format the term; ``inputs`` maps an input to its text after delay and nonlinearity."""
         if isinstance(self.coefficient, str):
             factor = "" if self.factor == 1 else "-" if self.factor == -1 else f"{self.factor!r} "
             text = f"{factor}{self.coefficient} "
         else:
             text = f"{self.factor * self.coefficient!r} "
-        return text + derivative(self.order, signal)
+        return text + self.operand_as_text(inputs)
+
+    @check_arguments
+    def operand_as_text(self, inputs: Mapping[str, str]) -> str:
+        """Format the derivative of the signal or expression, without the coefficient."""
+        shape = self.nonlinear
+        if shape is None:
+            return derivative(self.order, inputs.get(self.signal, self.signal))
+        text = shape.as_text(inputs)
+        if self.order.names or self.order.constant != 0:
+            return derivative(self.order, f"({text})")
+        if shape.operation == "add":
+            # A number would be multiplied into a sum without a constant.
+            bare = isinstance(self.coefficient, str) or shape.arguments[-1].operation == "constant"
+            return f"({text})" if bare else f"(({text}))"
+        first = shape.arguments[0]
+        product = shape.operation == "multiply" and (first.operation, first.value) == ("channel", 0.0)
+        if product and not isinstance(self.coefficient, str):
+            # The first of two names in a product is read as a coefficient.
+            return text.replace(first.as_text(inputs), f"({first.as_text(inputs)})", 1)
+        return text
 
     def __str__(self) -> str:
-        return self.as_text(self.signal)
+        return self.as_text({})
 
 
 def derivative(order: Order, signal: str) -> str:
@@ -253,6 +297,9 @@ class Equation:
                     f"coefficient of {term.signal} in the equation of {self.output} is {term.fixed:g}, which is not "
                     "finite; give a number"
                 )
+            if term.nonlinear is not None:
+                self._check_expression(term, term.nonlinear)
+                continue
             if term.order.names or self.order.names:
                 continue
             own, alpha, order = term.signal == self.output, self.order.constant, term.order.constant
@@ -265,6 +312,24 @@ class Equation:
 
         if self.friction is not None:
             self._check_friction(self.friction)
+
+    def _check_expression(self, term: Term, shape: Expression) -> None:
+        """Raise for a non-linear term that the highest derivative of the output does not determine."""
+        words = f"{term} in the equation of {self.output}"
+        if term.order.names or self.order.names:
+            return
+        alpha, order = self.order.constant, term.order.constant
+        lowest = 0.0 if self.output in term.signals else MIN_INPUT_ORDER
+        if not lowest <= order <= alpha:
+            raise ModelError(
+                f"order {order:g} of the non-linear term {words} is outside [{lowest:g}, {alpha:g}]; change it"
+            )
+        for signal, inner in shape.channels:
+            if signal == self.output and inner > alpha - order + ORDER_RESOLUTION:
+                raise ModelError(
+                    f"{words} has the derivative of order {inner:g} of {signal}, above {alpha - order:g}, the order "
+                    f"alpha = {alpha:g} less that of the term; lower it"
+                )
 
     def _check_friction(self, friction: Friction) -> None:
         """Raise for friction that adds energy, or for an order alpha without a velocity."""
@@ -306,7 +371,7 @@ class Equation:
             A fixed input order that is not below a fixed alpha.
         """
         for item in self.terms:
-            known = not (self.order.names or item.order.names or item.signal in outputs)
+            known = not (self.order.names or item.order.names or set(item.signals) <= set(outputs))
             if known and item.order.constant >= self.order.constant - 1e-9:
                 raise ModelError(
                     f"order {item.order.constant:g} of {item.signal} is not below alpha = {self.order.constant:g}, and "
@@ -319,9 +384,14 @@ class Equation:
         return self.coulomb if isinstance(self.coulomb, Friction) else None
 
     @property
+    def nonlinear_terms(self) -> tuple[Term, ...]:
+        """Non-linear terms, in order of appearance."""
+        return tuple(t for t in self.terms if t.nonlinear is not None)
+
+    @property
     def signals(self) -> tuple[str, ...]:
         """Signal names: the output, then the others in order of appearance."""
-        return tuple(dict.fromkeys([self.output, *(t.signal for t in self.terms)]))
+        return tuple(dict.fromkeys([self.output, *(s for t in self.terms for s in t.signals)]))
 
     @property
     def order_names(self) -> tuple[str, ...]:
@@ -372,7 +442,7 @@ class Equation:
     @check_arguments
     def as_text(self, inputs: Mapping[str, str]) -> str:
         """Format the equation; ``inputs`` maps an input to its text after delay and nonlinearity."""
-        right = " + ".join(t.as_text(inputs.get(t.signal, t.signal)) for t in self.terms).replace("+ -", "- ")
+        right = " + ".join(t.as_text(inputs) for t in self.terms).replace("+ -", "- ")
         friction = "" if self.friction is None else f" {self.friction.as_text(self.output)}"
         return f"{derivative(self.order, self.output)} = {right}{friction}"
 
@@ -383,7 +453,7 @@ class Equation:
 def format_equation(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
     """Format an identified equation with six significant digits; ``inputs`` holds texts such as ``u(t - 0.035 s)``."""
     texts = inputs or {}
-    parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, texts.get(t.signal, t.signal))}" for t in item.terms]
+    parts = [f"{t.fixed or 0.0:+.6g} {t.operand_as_text(texts)}" for t in item.terms]
     right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
     if item.friction is not None:
         fc, fs, vs = item.friction.law

@@ -10,9 +10,13 @@ an expression in parentheses. Blanks between names, numbers and symbols do not m
     sum         = {sign} item {sign {sign} item}      (a sign is + or -)
     item        = "c"  |  "(c + ramp t)"  |  "(c if the runs ask for it)"  |  friction  |  term
                 |  number ["*"] "(" sum ")" ["/" number]
-    term        = {number ["*" | "/"]} [name ["*"]] derivative ["/" number]
+    term        = {number ["*" | "/"]} [name ["*"]] (derivative | product | "D" ["^" order] group) ["/" number]
     derivative  = ["D" ["^" order]] signal  |  signal {"'"}  |  "dy/dt"  |  "d^2 y/dt^2"  |  "d/dt" signal
     signal      = name ["(t" ["-" delay ["s"]] ")"]  |  "sat(" signal "," limit ")"  |  "dead(" signal "," limit ")"
+    product     = power {"*" power}
+    power       = (number | group | function group | derivative) ["^" number]
+    group       = "(" {sign} product {sign {sign} product} ")"
+    function    = "sin" | "cos" | "exp" | "tanh" | "abs" | "sqrt"
     friction    = [strength [*]] ["exp(-(D y/" speed ")^2)" [*]] "sign(D y)"
     transfer    = signal "=" {sign} ratio signal {sign ratio signal}  |  signal "/" signal "=" ratio
     ratio       = factor {("*" | "/" | "") factor}
@@ -23,11 +27,23 @@ an expression in parentheses. Blanks between names, numbers and symbols do not m
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from ftlm.errors import ModelError
 from ftlm.structure.equation import Friction, Stribeck
+from ftlm.structure.expression import (
+    EXPRESSION_FUNCTIONS,
+    MAX_INSTRUCTIONS,
+    Expression,
+    add,
+    apply,
+    channel,
+    constant,
+    multiply,
+    power,
+)
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_ABBREVIATIONS, NonlinearityKind, Value
 from ftlm.structure.order import Order
 from ftlm.utils.parameters import parameter
@@ -44,18 +60,29 @@ _TOKEN_PATTERN = re.compile(
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
 #: Functions that an error message names where they are applied to a signal.
 FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt", "sign", "atan", "arctan")
+#: Limit of nested parentheses and functions in a non-linear term.
+MAX_DEPTH = 30
 #: Largest power of a polynomial in s that is multiplied out.
 MAX_POLYNOMIAL_POWER = 10
 
 
 @dataclass(frozen=True)
 class ParsedTerm:
-    """Term ``factor * name * D^order signal`` of one side; ``name`` is None if the coefficient is known."""
+    """Term ``factor * name * D^order signal`` of one side; ``name`` is None if the coefficient is known.
+
+    A non-linear term has an expression, and the first of its signals.
+    """
 
     factor: float
     name: str | None
     order: Order
     signal: str
+    expression: Expression | None = None
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Signals of the term."""
+        return (self.signal,) if self.expression is None else tuple(signal for signal, _ in self.expression.channels)
 
 
 #: Terms (factor, name, order) of a sum of ``factor * name * s^order``; orders may be fractional.
@@ -70,6 +97,8 @@ class EquationParser:
     ----------
     text
         Text of the equation.
+    signals
+        Names that are signals, where they would else be read as coefficients.
 
     Attributes
     ----------
@@ -87,8 +116,10 @@ class EquationParser:
         Delays [s] by signal: a number if known, (lower, upper) if estimated in that interval.
     """
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, signals: Collection[str] = ()) -> None:
         self.text = text
+        self._signals = signals
+        self._depth = 0
         self.left: list[ParsedTerm] = []
         self.right: list[ParsedTerm] = []
         self.friction: tuple[Friction, str] | None = None
@@ -111,7 +142,6 @@ class EquationParser:
             self._tokens.append((kind, token[kind], token.start(kind)))
             at = token.end()
         self._readable = readable
-        self._parse()
 
     # -------------------------------------------------------------------------------------------------- tokens
 
@@ -153,11 +183,11 @@ class EquationParser:
 
     # ------------------------------------------------------------------------------------------------ equation
 
-    def _parse(self) -> None:
-        """Parse the whole text."""
+    def parse(self) -> EquationParser:
+        """Parse the whole text as an equation; the result is in the attributes."""
         if self._is_transfer():
             self._transfer()
-            return
+            return self
         self.left = self._sum(left=True)
         self._expect("=")
         if self._sees("0", "the end"):
@@ -166,6 +196,14 @@ class EquationParser:
             self.right = self._sum()
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-' or the end")
+        return self
+
+    def parse_expression(self) -> Expression:
+        """Parse the whole text as the expression of a non-linear term."""
+        found = self._expression()
+        if self._peek()[0] != "end":
+            raise self._syntax_error("'+', '-', '*' or the end")
+        return found
 
     def _sum(self, *, left: bool = False, closed: bool = False) -> list[ParsedTerm]:
         """Parse a sum up to a token that does not continue it."""
@@ -189,7 +227,8 @@ class EquationParser:
         """Parse a product, or a number times a sum in parentheses."""
         factor = self._numbers(sign)
         name: str | None = None
-        if self._accept("("):
+        if self._sees("(") and not self._is_expression_group():
+            self._take()
             inner = self._sum(closed=True)
             self._expect(")")
             factor = self._divisors(factor)
@@ -204,23 +243,29 @@ class EquationParser:
                     f"{self._peek()[1]} at character {self._peek()[2] + 1} follows the coefficient {name}; write "
                     "numbers first"
                 )
-            if self._sees("("):
-                raise self._error(
-                    f"{name} at character {at + 1} multiplies a sum; multiply it out, with a coefficient of its own "
-                    "in each term"
-                )
-        order, signal = self._derivative()
-        after, end = self._peek()[1], self._peek()[2] + 1
-        if after == "^":
-            raise self._error(
-                f"a power of {signal} at character {end}: terms that are not linear in the signals are not computed"
-            )
-        if after == "*":
-            raise self._error(
-                f"{signal} is multiplied at character {end}: products of signals are not computed, and a coefficient "
-                "stands before its signal"
-            )
-        return [ParsedTerm(self._divisors(factor), name, order or Order(), signal)]
+            if self._sees("(") and self._is_plain_sum():
+                raise self._multiplied_sum(name, at)
+        begin = self._peek()[2]
+        order, operand = self._operand()
+        if isinstance(operand, str):
+            return [ParsedTerm(self._divisors(factor), name, order, operand)]
+        scale, shape = operand.split_factor()
+        factor = self._divisors(factor * scale)
+        if shape.operation == "channel":
+            return [ParsedTerm(factor, name, add_orders(order, Order(shape.value)), shape.signal)]
+        if shape.is_linear:
+            if not shape.channels:
+                raise self._error(f"the term at character {begin + 1} is a constant without a signal; leave it out")
+            raise self._multiplied_sum(name or f"{factor:g}", at)
+        if len(shape.program({c: 0 for c in shape.channels})) > MAX_INSTRUCTIONS:
+            raise self._error(f"the non-linear term at character {begin + 1} has too many operations; shorten it")
+        return [ParsedTerm(factor, name, order, shape.channels[0][0], shape)]
+
+    def _multiplied_sum(self, name: str, at: int) -> ModelError:
+        return self._error(
+            f"{name} at character {at + 1} multiplies a sum; multiply it out, with a coefficient of its own in each "
+            "term"
+        )
 
     def _numbers(self, factor: float) -> float:
         """Parse the numbers at the head of a product."""
@@ -246,6 +291,8 @@ class EquationParser:
     def _continues_after_name(self) -> bool:
         """Whether the name at hand is a coefficient: a signal, a derivative or a sum follows."""
         kind, value, _ = self._peek(1)
+        if self._peek()[1] in self._signals:
+            return False
         if kind == "name" or value == "*":
             return self._peek()[1] not in FUNCTION_NAMES or kind == "name"
         if value != "(" or self._peek()[1] in FUNCTION_NAMES or self._peek()[1] in INPUT_EFFECT_ABBREVIATIONS.values():
@@ -289,6 +336,181 @@ class EquationParser:
                     self._position += 3 + len(phrase)
                     return True
         return False
+
+    # ------------------------------------------------------------------------------------------ non-linear terms
+
+    def _closing_distance(self, ahead: int = 0) -> int:
+        """Return the distance to the token behind the parenthesis that closes the next one."""
+        depth = 0
+        while True:
+            kind, value, _ = self._peek(ahead)
+            depth += (value == "(") - (value == ")")
+            ahead += 1
+            if not depth or kind == "end":
+                return ahead
+
+    def _is_curved(self, end: int) -> bool:
+        """Whether a power or a function is among the tokens up to a distance."""
+        return any(self._peek(k)[1] == "^" or self._peek(k)[1] in EXPRESSION_FUNCTIONS for k in range(end))
+
+    def _is_plain_sum(self) -> bool:
+        """Whether parentheses hold a sum without powers and functions, and are no factor of a product."""
+        end, depth, signs = self._closing_distance(), 0, 0
+        for k in range(end):
+            value = self._peek(k)[1]
+            depth += (value == "(") - (value == ")")
+            signs += depth == 1 and k > 1 and value in "+-"
+        return signs > 0 and not self._is_curved(end) and self._peek(end)[1] not in ("^", "*")
+
+    def _is_expression_group(self) -> bool:
+        """Whether parentheses after a number are a factor of a non-linear term, not a sum that is multiplied out.
+
+        They are raised or multiplied, or hold a constant beside a power or a function, or are double.
+        """
+        end = self._closing_distance()
+        if self._peek(end)[1] in ("^", "*"):
+            return True
+        if not self._is_curved(end):
+            return False
+        if self._sees("(", "(") and self._closing_distance(1) == end - 1:
+            return True
+        depth, pure = 0, False
+        for k in range(end):
+            kind, value, _ = self._peek(k)
+            depth += value == "("
+            if depth == 1 and (value in "(+-" or k == end - 1):
+                if pure and self._peek(k - 1)[0] == "number":
+                    return True
+                pure = True
+            else:
+                pure = pure and (kind == "number" or value in "^*/")
+            depth -= value == ")"
+        return False
+
+    def _operand(self) -> tuple[Order, str | Expression]:
+        """Parse what a coefficient multiplies: order and signal, or order and expression of a non-linear term."""
+        begin = self._position
+        operator = self._operator()
+        if operator is not None and self._sees("("):
+            shape = self._group()
+            if self._peek()[1] in ("^", "*"):
+                raise self._error(
+                    f"{self._peek()[1]!r} at character {self._peek()[2] + 1} follows the derivative of an expression; "
+                    "only signals and their derivatives are multiplied"
+                )
+            return operator, shape
+        self._position = begin
+        kind, value, _ = self._peek()
+        if kind == "name" and not (value in FUNCTION_NAMES and self._peek(1)[1] == "("):
+            order, signal = self._derivative()
+            if self._peek()[1] not in ("^", "*"):
+                return order or Order(), signal
+            self._position = begin
+        if kind == "symbol" and value != "(":
+            raise self._syntax_error("the name of a signal")
+        return Order(), self._product(divide=False)
+
+    def _operator(self) -> Order | None:
+        """Parse ``D``, ``D^order`` or ``d/dt`` before a signal or parentheses; None for other text."""
+        found = self._leibniz()
+        if found is not None and not found[1]:
+            self._position += found[2]
+            return found[0]
+        if self._peek()[:2] != ("name", "D"):
+            return None
+        self._take()
+        return self._order() if self._accept("^") else Order(1.0)
+
+    def _group(self) -> Expression:
+        """Parse an expression in parentheses."""
+        self._expect("(")
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise self._error(f"parentheses are nested more than {MAX_DEPTH} times; write the term without some")
+        found = self._expression()
+        if self._peek()[0] == "name":
+            at = self._peek()[2]
+            raise self._error(
+                f"{self._peek()[1]!r} at character {at + 1} follows another name inside a non-linear term: write * "
+                "between signals; a free parameter inside one is not estimated: give its value"
+            )
+        self._expect(")")
+        self._depth -= 1
+        return found
+
+    def _expression(self) -> Expression:
+        """Parse a sum of products of numbers, signals and functions, without free parameters."""
+        terms = []
+        while True:
+            sign = self._signs()
+            terms.append(multiply(constant(sign), self._product()))
+            if self._peek()[1] not in "+-" or self._peek()[0] != "symbol":
+                return add(*terms)
+
+    def _product(self, *, divide: bool = True) -> Expression:
+        """Parse a product of numbers, signals, their derivatives, powers and functions."""
+        factors = [self._power()]
+        while True:
+            kind, value, _ = self._peek()
+            number = factors[-1].operation == "constant"
+            if self._accept("*") or (number and (kind == "name" or value == "(")):
+                factors.append(self._power())
+            elif divide and value == "/":
+                if self._peek(1)[0] != "number":
+                    raise self._error(
+                        f"{self._peek(1)[1]!r} at character {self._peek(1)[2] + 1} divides inside a non-linear term: "
+                        "give its value if it is a parameter, and the quotient as a signal of the run if it is a signal"
+                    )
+                factors.append(constant(self._divisors(1.0)))
+            else:
+                return multiply(*factors)
+
+    def _power(self) -> Expression:
+        """Parse one factor of a product, with its power."""
+        kind, value, at = self._peek()
+        derived = value == "D" or self._leibniz() is not None
+        if kind == "number":
+            self._take()
+            base = constant(float(value))
+        elif value == "(":
+            base = self._group()
+        elif kind == "name" and value in FUNCTION_NAMES and self._peek(1)[1] == "(":
+            base = self._function()
+        else:
+            order, signal = self._derivative()
+            if order is not None and order.names:
+                raise self._error(
+                    f"the order {order} at character {at + 1} is free inside a non-linear term; give its value"
+                )
+            if derived and self._sees("^"):
+                whole = self._readable[at : self._peek()[2]].strip()
+                raise self._error(
+                    f"a power of {whole} at character {self._peek()[2] + 1} has two meanings; write ({whole})^…"
+                )
+            base = channel(signal, 0.0 if order is None else order.constant)
+        if not self._accept("^"):
+            return base
+        sign = -1.0 if self._accept("-") else 1.0
+        if self._peek()[0] != "number":
+            raise self._syntax_error("a power: a number")
+        try:
+            return power(base, sign * float(self._take()[1]))
+        except ModelError as error:
+            raise self._error(f"at character {at + 1}: {error}") from error
+
+    def _function(self) -> Expression:
+        """Parse a function of an expression."""
+        _, name, at = self._take()
+        if name not in EXPRESSION_FUNCTIONS:
+            known = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
+            friction = "; friction is '- fc*sign(D y)', and drag '- w abs(D y)*D y'" if name == "sign" else ""
+            raise self._error(f"{name}(…) at character {at + 1}: {known}{friction}")
+        try:
+            return apply(name, self._group())
+        except ModelError as error:
+            if str(error).startswith("equation "):
+                raise
+            raise self._error(f"at character {at + 1}: {error}") from error
 
     # ------------------------------------------------------------------------------------ derivatives and signals
 
@@ -337,18 +559,13 @@ class EquationParser:
 
     def _signal(self) -> str:
         """Parse a signal, at time t or delayed, or an input behind a saturation or a dead zone."""
-        kind, value, at = self._peek()
+        kind, value, _ = self._peek()
         if kind != "name" or value == "D":
             raise self._syntax_error("the name of a signal")
         law = next(
             (law for law in NONLINEARITY_KINDS if INPUT_EFFECT_ABBREVIATIONS[law] == value and self._peek(1)[1] == "("),
             None,
         )
-        if law is None and value in FUNCTION_NAMES and self._peek(1)[1] == "(":
-            raise self._error(
-                f"{value}(…) at character {at + 1}: of the functions of signals only sign(D y), sat(u, …) and "
-                "dead(u, …) are computed"
-            )
         self._take()
         if law is None:
             self.plain.add(value)
@@ -451,6 +668,10 @@ class EquationParser:
             ahead += 1 + (self._peek(ahead + 1)[1] == "*")
         if self._peek(ahead)[1] not in ("sign", "exp") or self._peek(ahead + 1)[1] != "(":
             return False
+        if self._peek(ahead)[1] == "exp":
+            after = self._closing_distance(ahead + 1)
+            if self._peek(after + (self._peek(after)[1] == "*"))[1] != "sign":
+                return False
         self._position += ahead
         near = self._stribeck_factor() if self._sees("exp") else None
         if near is not None:

@@ -94,9 +94,8 @@ def equation(
     lines = [line for line in re.split(r"[;\n]", text) if line.strip()]
     if not lines:
         raise ModelError("the equation is empty; write it as in 'D^1.5 y = a0 y + b0 u'")
-    parsed = [EquationParser(line) for line in lines]
+    parsed = _parse_lines(lines)
     equations = [_equation_of(words) for words in parsed]
-    _check_signal_products(equations)
     fixed = dict(fixed or {})
     check_known("fixed coefficient", fixed, [n for e in equations for n in e.coefficient_names])
     for name, value in fixed.items():
@@ -121,16 +120,14 @@ def equation(
     return structure.with_limits(saturation=saturation, dead_zone=dead_zone)
 
 
-def _check_signal_products(equations: Sequence[Equation]) -> None:
-    """Raise if a coefficient has the name of a signal: ``u y`` would be a product of signals."""
-    signals = {signal for item in equations for signal in item.signals}
-    for item in equations:
-        product = next((t for t in item.terms if t.coefficient in signals), None)
-        if product is not None:
-            raise ModelError(
-                f"{product.coefficient} {product.signal} in the equation of {item.output} is a product of signals, "
-                "which is not computed; a coefficient has a name of its own"
-            )
+def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
+    """Parse equation texts; the first name of a product is a coefficient unless it is that of a signal elsewhere."""
+    parsed = [EquationParser(line).parse() for line in lines]
+    items = [item for words in parsed for item in (*words.left, *words.right)]
+    signals = {signal for item in items for signal in item.signals}
+    if any(item.name in signals for item in items):
+        parsed = [EquationParser(line, signals).parse() for line in lines]
+    return parsed
 
 
 def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None) -> Offset:
@@ -159,9 +156,10 @@ def _equation_of(words: EquationParser) -> Equation:
 
     That is the highest one on the left-hand side, or the first one if an order there is a named parameter.
     """
-    derivatives = [item for item in words.left if item.order.names or item.order.constant != 0]
+    linear = [item for item in words.left if item.expression is None]
+    derivatives = [item for item in linear if item.order.names or item.order.constant != 0]
     if not derivatives:
-        output = words.left[0].signal if words.left else "y"
+        output = linear[0].signal if linear else "y"
         raise ModelError(
             f"equation {words.text!r}: its left-hand side has no derivative; write it as in 'D^1.5 {output} = …', or "
             "in s, as in 'y = 2/(s^1.5 + 3) u'"
@@ -177,7 +175,7 @@ def _equation_of(words: EquationParser) -> Equation:
     leading, rest = 0.0, []
     for side, items in ((-1.0, words.left), (1.0, words.right)):
         for item in items:
-            if (item.signal, item.order, item.name) == (first.signal, first.order, None):
+            if replace(item, factor=first.factor) == first:
                 leading -= side * item.factor
             else:
                 rest.append((side, item))
@@ -189,10 +187,11 @@ def _equation_of(words: EquationParser) -> Equation:
     terms = []
     for side, item in rest:
         factor = side * item.factor / leading
+        shape = item.expression or UNSET
         if item.name is None:
-            terms.append(Term(item.signal, item.order, factor))
+            terms.append(Term(item.signal, item.order, factor, expression=shape))
         else:
-            terms.append(Term(item.signal, item.order, item.name, factor))
+            terms.append(Term(item.signal, item.order, item.name, factor, expression=shape))
     return Equation(first.signal, first.order, tuple(terms), _friction_of(words, first.signal, leading) or UNSET)
 
 
@@ -219,7 +218,7 @@ def _friction_of(words: EquationParser, output: str, leading: float) -> Friction
 
 def parse_equation(text: str) -> Equation:
     """Parse one equation without offset and input nonlinearities; see :func:`equation`."""
-    words = EquationParser(text)
+    (words,) = _parse_lines([text])
     if words.offset or words.limits:
         what = "an offset" if words.offset else "a limit of an input"
         raise ModelError(f"equation {text!r}: {what} belongs to a structure; use equation(…)")

@@ -201,6 +201,16 @@ class Structure:
         return any(e.friction is not None for e in self.equations)
 
     @property
+    def has_nonlinear_terms(self) -> bool:
+        """Whether an equation has a non-linear term."""
+        return any(e.nonlinear_terms for e in self.equations)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether no equation has friction or a non-linear term."""
+        return not (self.has_friction or self.has_nonlinear_terms)
+
+    @property
     def friction_equations(self) -> tuple[int, ...]:
         """Indices of the equations with friction."""
         return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)
@@ -394,7 +404,7 @@ class Structure:
         def free_order(k: int, term: Term) -> Term:
             if term.order.is_single or not term.order.names:
                 return term
-            if term.signal not in modelled:
+            if not set(term.signals) & set(modelled):
                 return replace(term, order=Order())
             called = str(term.name or term.coefficient)
             name = (self.hints or Hints()).order_names_by_coefficient.get(called, f"nu_{output}_{k + 1}")

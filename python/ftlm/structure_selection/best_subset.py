@@ -144,7 +144,7 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
     drives = [t for t in structure.equations[0].terms if t.signal != structure.equations[0].output]
     if (
         len(structure.equations) > 1
-        or structure.has_friction
+        or not structure.is_linear
         or structure.free_inputs
         or sum(t.coefficient in inside.droppable for t in drives) < MIN_INPUT_TERMS
         or any(f.rows is not None for f in folds.parts)

@@ -324,7 +324,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
     """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
     model = model_of(structure, joint, folds.runs)
     estimation = compare(model, list(folds.runs)).fit_percent
-    grows = not structure.has_friction and model.stability(coupling=structure.coupling).unstable_poles > 0
+    grows = structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
     start = joint.values_by_name
     # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
     near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.step_converged else joint

@@ -55,11 +55,11 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Ta
 
     A structure is excluded if its cost on subsampled records, with the budget of a rung of the multistart, exceeds the
     lowest cost by the factor of the multistart. At least `least` structures remain. Records too short for subsampling
-    and structures with friction are not prescreened.
+    and structures that are not linear are not prescreened.
     """
     every = list(range(len(starts)))
     decimation = max(1, round(min(run.length - 1 for run in runs) / PRESCREEN_SAMPLES))
-    if decimation == 1 or len(starts) <= least or any(s.has_friction for s, _ in starts):
+    if decimation == 1 or len(starts) <= least or not all(s.is_linear for s, _ in starts):
         return every
 
     def level(start: Start) -> float:

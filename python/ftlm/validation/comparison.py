@@ -251,6 +251,7 @@ class Comparison:
 #: Reasons for a missing equation error.
 FRICTION_REASON = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
 MISSING_SAMPLES_REASON = "some of its samples are missing, and interpolated samples are not measurements"
+UNDEFINED_TERM_REASON = "a non-linear term of the measured signals has no value in some of the rows"
 #: Note on an offset that the initial history makes unidentifiable.
 HIDDEN_OFFSET_NOTE = "not separately identifiable from the initial conditions; begin the run at rest to identify it"
 
@@ -423,12 +424,14 @@ def _run_errors(
 
     An output with missing samples has no equation error: it would be that of the interpolated samples.
     """
-    core, inputs, powers = full.core(), list(full.inputs), full.start
+    (step, means, sensor), inputs, powers = full.core(), list(full.inputs), full.start
+    core = step, np.nan_to_num(means) if model.structure.has_nonlinear_terms else means, sensor
     missed = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
         for e in model.equations
         # Nor has one with friction: the sign of a measured velocity is that of its noise, most of all at rest.
-        if e.output not in gaps and e.friction is None
+        # Nor has one with a non-linear term that has no value.
+        if e.output not in gaps and e.friction is None and all(np.isfinite(full.of(t.column)).all() for t in e.terms)
     }
     return _RunErrors(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
 
@@ -440,8 +443,9 @@ def _pooled_comparison(
     equation_error, output_error = _pooled_errors(parts)
     # The runs' own figures may be known where those of all of them are not.
     rubbed = {e.output for e in model.equations if e.friction is not None}
+    gaps = {name for run in runs for name in run.missing_samples}
     unequated = {
-        o: FRICTION_REASON if o in rubbed else MISSING_SAMPLES_REASON
+        o: FRICTION_REASON if o in rubbed else MISSING_SAMPLES_REASON if o in gaps else UNDEFINED_TERM_REASON
         for o, f in equation_error.items()
         if f is UNKNOWN_METRICS
     }
@@ -496,7 +500,7 @@ def near_identity_findings(
         close = [
             t.order.constant
             for t in item.terms
-            if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
+            if t.column == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
         ]
         # Negated so that a figure that is not a number counts as bad; an equation error that is not known says nothing.
         unknown = math.isnan(equation.nr) and math.isfinite(output.nr)

@@ -351,11 +351,11 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
     """Compare the number of spectral lines of the inputs with the free parameters of each equation.
 
     In steady state one spectral line identifies two parameters of each output it excites, and a constant level one.
-    Equations with friction are skipped: their response contains harmonics of the input lines.
+    Equations with friction or non-linear terms are skipped: their response contains harmonics of the input lines.
     """
     run = run.with_interpolated_gaps()
     for item in structure.equations:
-        if item.friction is not None:
+        if item.friction is not None or item.nonlinear_terms:
             continue
         inputs = [s for s in item.signals if s in run.inputs]
         # With measured coupling the other measured outputs are inputs of this equation.

@@ -357,7 +357,7 @@ def run_residual_tests(model: Model, runs: Runs, free: Sequence[OutputSamples], 
         measured = [compared_values(run, model.structure, name) for run in runs]
         deviation = math.sqrt(float(np.mean([np.nanvar(y) for y in measured])))
         gaps = [np.isnan(y[1:-1]) for y in measured]
-        direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
+        direct = {s for t in item.terms for s in t.signals if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
         outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())

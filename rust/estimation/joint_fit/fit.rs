@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use super::initial_guesses::OrderGrids;
 use super::multistart::{
-    leading_part, run_friction_multistart, run_multistart, select_survivors, InitialGuessSource, MultistartContext,
+    leading_part, run_friction_multistart, run_multistart, run_nonlinear_multistart, select_survivors,
+    InitialGuessSource, MultistartContext,
 };
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::ParameterSet;
@@ -174,7 +175,11 @@ impl<'a> FitProblem<'a> {
             |done, of| shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, done, of);
         let Self { source, starts, stop, .. } = *self;
         let course = MultistartContext { source, starts, stop, weights: &weights, floor, threads, told: Some(&told) };
-        let run = if self.free.has_friction() { run_friction_multistart } else { run_multistart };
+        let run = match &self.free.problem {
+            problem if !problem.derived.is_empty() => run_nonlinear_multistart,
+            problem if !problem.frictions.is_empty() => run_friction_multistart,
+            _ => run_multistart,
+        };
         run(self.free, course)
     }
 

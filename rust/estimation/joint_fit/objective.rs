@@ -173,7 +173,7 @@ impl<'a> Objective<'a> {
         let whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
         let runs = self.source.runs().iter().zip(self.source.spans());
         self.sampling.decimation == 1
-            && self.problem.frictions.is_empty()
+            && self.problem.is_linear()
             && runs
                 .flat_map(|(run, (step, _))| run.channels().iter().map(move |c| (c.delay, step)))
                 .all(|(delay, step)| delay.is_none_or(|delay| whole(delay, step)))

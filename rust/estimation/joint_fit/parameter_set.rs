@@ -96,7 +96,7 @@ impl ParameterSet {
             initial: structure.initial.clone(),
         };
         let outputs = structure.equations.iter().map(|e| structure.signals[e.output].clone()).collect();
-        let problem = Problem::new(outputs, model, frictions.collect())?;
+        let problem = Problem::new(outputs, model, frictions.collect())?.with_derived(structure.derived.clone())?;
         Ok(Self { orders, coefficients, products, problem, structure })
     }
 
@@ -120,12 +120,13 @@ impl ParameterSet {
 
     /// Problem with coordinates for an optimization from `start`.
     ///
-    /// Nonzero coefficients use logarithms unless `plain`. The parameters with the indices `held` are fixed at their
-    /// values.
+    /// Nonzero coefficients use logarithms unless `plain` or there are non-linear terms, whose initial guesses may have
+    /// wrong signs. The parameters with the indices `held` are fixed at their values.
     #[must_use]
     pub fn problem_at(&self, start: &Iterate, plain: bool, held: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
         let named = self.structure.coefficient_names();
+        let plain = plain || !problem.derived.is_empty();
         for (j, (name, &value)) in self.coefficients.iter().zip(&start.point.coefficients).enumerate() {
             let is_speed = problem.frictions.iter().any(|(_, law)| law.speed.powers.iter().any(|&(i, _)| i == j));
             let ratio = !named.contains(name) && self.ratio_lower_bound(name) == 1.0;

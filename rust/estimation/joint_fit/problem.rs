@@ -1,12 +1,14 @@
-//! Problem of a joint fit with and without friction: iterates, optimization, candidates and feasible steps.
+//! Problem of a joint fit, with friction or non-linear terms or without: iterates, optimization, candidates and feasible steps.
 
 use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{
     fit_until, Coordinate, Experiment, FreeModel, Monomial, Point, Settings, Status,
 };
+use crate::expression::DerivedSignal;
 use crate::friction::{self, FreeFrictionLaw, FrictionModel, Start};
 use crate::linalg::dense;
+use crate::nonlinear::{self, NonlinearModel};
 use crate::parallel::Stop;
 use crate::signal::statistics::inner;
 
@@ -19,6 +21,8 @@ pub struct Problem {
     pub model: FreeModel,
     /// Friction laws by index of their equation.
     pub frictions: Vec<(usize, FreeFrictionLaw)>,
+    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
+    pub derived: Vec<DerivedSignal>,
 }
 
 impl Problem {
@@ -54,7 +58,24 @@ impl Problem {
         for (_, law) in &frictions {
             law.speed.powers.iter().for_each(|&(j, _)| model.coordinates[j] = Coordinate::Logarithm);
         }
-        Ok(Self { outputs, model, frictions })
+        Ok(Self { outputs, model, frictions, derived: Vec::new() })
+    }
+
+    /// Problem with derived signals, numbered after the recorded ones.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] beside friction.
+    pub fn with_derived(self, derived: Vec<DerivedSignal>) -> Result<Self> {
+        if !derived.is_empty() && !self.frictions.is_empty() {
+            return Err(nonlinear::refuse_beside("dry friction", "leave one of them out"));
+        }
+        Ok(Self { derived, ..self })
+    }
+
+    /// True if the simulation is linear in coefficients of inputs and in initial terms.
+    #[must_use]
+    pub fn is_linear(&self) -> bool {
+        self.frictions.is_empty() && self.derived.is_empty()
     }
 
     /// Number of free orders, coefficients and input parameters.
@@ -93,13 +114,13 @@ impl Problem {
     /// True if an equation is unstable at a point and free initial terms may compensate the growth.
     #[must_use]
     pub fn is_unstable(&self, point: &Point) -> bool {
-        self.frictions.is_empty() && !self.model.initial.is_at_rest() && self.model.is_unstable(point)
+        self.is_linear() && !self.model.initial.is_at_rest() && self.model.is_unstable(point)
     }
 
     /// Minimize the cost by Levenberg–Marquardt; if `steady`, a stable iterate does not become unstable.
     ///
     /// # Errors
-    /// As [`fit_until`] and, with friction, [`friction::fit_until`].
+    /// As [`fit_until`], with friction [`friction::fit_until`], and with non-linear terms [`nonlinear::fit`].
     pub fn minimize(
         &self,
         experiments: &[Experiment],
@@ -108,7 +129,7 @@ impl Problem {
         steady: bool,
         stop: &Stop,
     ) -> Result<OptimizationResult> {
-        if self.frictions.is_empty() {
+        if self.is_linear() {
             let found = fit_until(&self.model, experiments, &start.point, settings, steady, stop)?;
             return Ok(OptimizationResult {
                 iterate: Iterate { point: found.point, states: Vec::new() },
@@ -120,18 +141,24 @@ impl Problem {
                 status: found.status,
             });
         }
-        let model = FrictionModel {
-            equations: self.model.equations.clone(),
-            frictions: self.frictions.clone(),
-            inputs: self.model.inputs.clone(),
-            order_bounds: self.model.order_bounds.clone(),
-            coordinates: self.model.coordinates.clone(),
-            initial: self.model.initial.clone(),
-            filtered: friction::filtered_outputs(experiments),
-        };
+        let filtered = friction::filtered_outputs(experiments);
         let Iterate { point: Point { orders, coefficients, inputs }, states } = start.clone();
         let start = Start { orders, coefficients, inputs, states };
-        let found = friction::fit_until(&model, experiments, &start, settings, stop)?;
+        let found = if self.derived.is_empty() {
+            let model = FrictionModel {
+                equations: self.model.equations.clone(),
+                frictions: self.frictions.clone(),
+                inputs: self.model.inputs.clone(),
+                order_bounds: self.model.order_bounds.clone(),
+                coordinates: self.model.coordinates.clone(),
+                initial: self.model.initial.clone(),
+                filtered,
+            };
+            friction::fit_until(&model, experiments, &start, settings, stop)?
+        } else {
+            let model = NonlinearModel { model: self.model.clone(), derived: self.derived.clone(), filtered };
+            nonlinear::fit(&model, experiments, &start, settings, stop)?
+        };
         let point = Point { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };
         Ok(OptimizationResult {
             initial: found.states.iter().map(|states| vec![states.clone()]).collect(),
@@ -150,7 +177,7 @@ impl Problem {
 pub struct Iterate {
     /// Free orders, coefficients and input parameters.
     pub point: Point,
-    /// Initial states of each run with friction; empty if unknown.
+    /// Initial states of each run with friction or non-linear terms; empty if unknown.
     pub states: Vec<Vec<f64>>,
 }
 
@@ -280,6 +307,12 @@ impl Problem {
         Ok(at.iter().zip(&step).map(|(a, s)| a + share * s).collect())
     }
 
+    /// Highest order of a derivative of a signal in the expressions of non-linear terms.
+    fn highest_derivative(&self, signal: usize) -> f64 {
+        let channels = self.derived.iter().flat_map(|derived| &derived.channels);
+        channels.filter(|channel| channel.0 == signal).fold(0.0, |highest, channel| channel.1.max(highest))
+    }
+
     fn constraints(&self) -> Vec<Constraint> {
         let size = self.size();
         let wide = |weights: &dyn Fn(usize) -> f64| (0..size).map(weights).collect::<Vec<_>>();
@@ -295,11 +328,14 @@ impl Problem {
             }
         }
         for equation in &self.model.equations {
+            let derivative = self.highest_derivative(equation.output);
             for (signal, order, _) in &equation.terms {
                 let own = *signal == equation.output;
+                // Derivatives of an output in expressions are integrals of everything but the output's own terms.
+                let above = if own { 0.0 } else { derivative };
                 found.push(Constraint {
                     normal: wide(&|k| of(&equation.order, k) - of(order, k)),
-                    offset: equation.order.constant - order.constant,
+                    offset: equation.order.constant - order.constant - above,
                     margin: if own { MIN_INTEGRATION_ORDER } else { ORDER_ROUNDING_TOLERANCE },
                 });
                 if own {

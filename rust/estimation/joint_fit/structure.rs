@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::equation::{alpha_fits, missing_signal_error, tidy, AffineOrder, Initial};
 use crate::error::{Error, Result};
 use crate::estimation::output_error::FreeInput;
+use crate::expression::DerivedSignal;
 use crate::fractional::kernels::{MAX_EXCESS, MIN_INPUT_ORDER};
 
 /// Difference below which two orders are equal.
@@ -189,8 +190,10 @@ pub struct Hints {
 /// Structure of a joint fit: equations, bounds, initial terms, input nonlinearities and laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
-    /// Names of the signals, for messages.
+    /// Names of the signals, for messages: recorded ones, then derived ones.
     pub signals: Vec<String>,
+    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
+    pub derived: Vec<DerivedSignal>,
     /// One equation per output.
     pub equations: Vec<Equation>,
     /// Lower and upper bound of free orders, if given.
@@ -217,6 +220,7 @@ impl Structure {
     pub fn new(signals: Vec<String>, equations: Vec<Equation>, initial: Initial) -> Self {
         Self {
             signals,
+            derived: Vec::new(),
             equations,
             bounds: BTreeMap::new(),
             coupled: false,
@@ -227,6 +231,12 @@ impl Structure {
             laws: Vec::new(),
             hints: Hints::default(),
         }
+    }
+
+    /// Number of recorded signals.
+    #[must_use]
+    pub fn recorded_count(&self) -> usize {
+        self.signals.len() - self.derived.len().min(self.signals.len())
     }
 
     /// Names of the free orders: single ones in order of appearance, then those that occur only in a law.
@@ -270,6 +280,11 @@ impl Structure {
         let highest = self.equations.iter().filter_map(of_equation).chain(inputs).max();
         if let Some(signal) = highest.filter(|&signal| signal >= self.signals.len()) {
             return Err(missing_signal_error(signal, self.signals.len()));
+        }
+        let channels = self.derived.iter().flat_map(|derived| &derived.channels).map(|channel| channel.0);
+        let outputs = self.equations.iter().map(|e| e.output);
+        if let Some(signal) = channels.chain(outputs).find(|&signal| signal >= self.recorded_count()) {
+            return Err(missing_signal_error(signal, self.recorded_count()));
         }
         self.equations.iter().try_for_each(Equation::check)
     }

@@ -227,7 +227,8 @@ impl<P: Problem> Search<'_, P> {
         });
         match made {
             Ok(there) if there.cost.is_finite() && (there.trusted || !from.trusted) => Ok(Some(there)),
-            Ok(_) | Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => Ok(None),
+            Ok(_) => Ok(None),
+            Err(error) if error.ends_simulation() => Ok(None),
             Err(error) => Err(error),
         }
     }
@@ -341,7 +342,7 @@ impl<P: Problem> Search<'_, P> {
                     return Ok(Some(Advance::Moved(steps, self.gain)));
                 }
                 Ok(None) => self.hit = false,
-                Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => self.hit = true,
+                Err(error) if error.ends_simulation() => self.hit = true,
                 Err(error) => return Err(error),
             }
             at.damping *= DAMPING_FACTOR;

@@ -35,7 +35,7 @@ pub struct JointMultistart {
 /// Runs as source of a fit.
 pub(super) fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
     let outputs: Vec<usize> = free.structure.equations.iter().map(|e| e.output).collect();
-    recordings(runs, free.structure.signals.len(), &outputs, free.structure.inputs.len())
+    recordings(runs, free.structure.recorded_count(), &outputs, free.structure.inputs.len())
 }
 
 /// Multistart of a problem.

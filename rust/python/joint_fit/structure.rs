@@ -7,7 +7,7 @@ use crate::estimation::joint_fit::structure::{
     Coefficient, Equation, FrictionParameters, Hints, Input, Law, Order, Structure, Term,
 };
 use crate::estimation::output_error::FreeInput;
-use crate::python::convert::{initial, InitialArg, List};
+use crate::python::convert::{derived_signals, initial, DerivedArg, InitialArg, List};
 use crate::python::recording::input_law;
 
 /// Order: (constant, weight of each free order by name).
@@ -40,6 +40,7 @@ impl From<CoefficientArg> for Coefficient {
 #[pyo3(from_item_all)]
 pub struct StructureArg {
     signals: List<String>,
+    derived: List<DerivedArg>,
     equations: List<EquationArg>,
     bounds: List<(String, (f64, f64))>,
     coupled: bool,
@@ -93,6 +94,7 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<Structure> {
     let law = |(name, sign, factors): (String, f64, List<String>)| Law { name, sign, factors: factors.into() };
     let found = Structure {
         signals: argument.signals.into(),
+        derived: derived_signals(argument.derived)?,
         equations: argument.equations.into_iter().map(equation).collect(),
         bounds: argument.bounds.into_iter().collect(),
         coupled: argument.coupled,

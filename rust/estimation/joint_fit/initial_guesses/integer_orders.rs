@@ -94,7 +94,7 @@ pub fn integer_order_optima(
 ) -> Result<Option<Vec<Candidate>>> {
     let model = &free.problem.model;
     let plain = free.products.is_empty()
-        && !free.has_friction()
+        && free.problem.is_linear()
         && free.orders.is_empty()
         && (model.equations.len() == 1 || (!model.coupled && model.inputs.is_empty()))
         && model.inputs.iter().all(|input| input.law == InputLaw::Delay);

@@ -523,6 +523,7 @@ mod tests {
         let equations = vec![Equation { output: 0, order: Order::free("alpha"), terms, friction: None }];
         let structure = Structure {
             signals: vec!["y".into(), "u".into()],
+            derived: Vec::new(),
             equations,
             bounds: [("beta".into(), (0.5, 0.5))].into(),
             coupled: false,

@@ -43,7 +43,7 @@ const MIN_MOTION_NOISE_RATIO: f64 = 10.0;
 const SIGN_PREFIX: &str = "coulomb_";
 
 /// Values by name: orders, coefficients and input parameters.
-type Values = BTreeMap<String, f64>;
+pub(super) type Values = BTreeMap<String, f64>;
 
 /// Run the multistart of a problem with friction; return the candidates best first.
 ///
@@ -148,14 +148,14 @@ fn without_stribeck(friction: &FrictionParameters) -> FrictionParameters {
 }
 
 /// Values of all parameters of a candidate, with the coefficients that a law determines.
-fn values_of(free: &ParameterSet, runner: &Candidate) -> Values {
+pub(super) fn values_of(free: &ParameterSet, runner: &Candidate) -> Values {
     let mut values: Values = free.names().cloned().zip(runner.result.values()).collect();
     values.extend(free.coefficients_by_name(&runner.result.iterate.point.coefficients));
     values
 }
 
 /// Initial guess at values by name. A parameter without a value is in the middle of its bounds.
-fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> Result<Candidate> {
+pub(super) fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> Result<Candidate> {
     let of = |(name, (low, high)): (&String, (f64, f64))| {
         let middle = 0.5 * (low + high);
         values.get(name).copied().unwrap_or(if middle.is_finite() { middle } else { 0.0 })

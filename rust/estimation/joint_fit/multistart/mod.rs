@@ -3,12 +3,14 @@
 //! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
 //! samples. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
 //! term less ([`ReducedProblem`]), a lower order ([`LowerOrderProblem`]), one fixed order ([`FixedOrderProblem`]) or
-//! integer orders ([`IntegerOrderProblem`]). Bodies with friction start from linear fits ([`run_friction_multistart`]).
+//! integer orders ([`IntegerOrderProblem`]). Bodies with friction start from linear fits ([`run_friction_multistart`]),
+//! non-linear terms from fits with the measured values of their expressions ([`run_nonlinear_multistart`]).
 
 mod coarse_grid;
 mod friction;
 mod halving;
 mod nested_models;
+mod nonlinear;
 mod search;
 mod sliding_body;
 
@@ -19,4 +21,5 @@ pub use nested_models::{
     distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
     FixedOrderProblem, IntegerOrderProblem, LowerOrderProblem, ReducedProblem,
 };
+pub use nonlinear::run_nonlinear_multistart;
 pub use search::{run_multistart, InitialGuessSource, MultistartContext};

@@ -22,7 +22,7 @@ use crate::recording::{Recordings, Sampling};
 
 /// Ratio of the best cost to the noise floor above which candidates behind the best are promoted, too. Candidates up to
 /// [`MAX_PROMOTION_COST_RATIO`] are promoted if they improve in a few evaluations.
-const NOISE_FLOOR_FACTOR: f64 = 2.0;
+pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
 const MAX_PROMOTION_COST_RATIO: f64 = 100.0;
 
 /// Source of initial guesses.
@@ -95,7 +95,7 @@ pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Res
 
 /// Optima of a problem of integer orders on all samples, best first; None for other problems.
 fn integer_order_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Option<Vec<Candidate>>> {
-    if !free.orders.is_empty() || free.has_friction() {
+    if !free.orders.is_empty() || !free.problem.is_linear() {
         return Ok(None);
     }
     let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
@@ -107,7 +107,7 @@ fn integer_order_multistart(free: &ParameterSet, course: MultistartContext<'_>) 
 }
 
 /// Convert the error of an invalid model to None.
-fn none_if_invalid_model<T>(found: Result<T>) -> Result<Option<T>> {
+pub(super) fn none_if_invalid_model<T>(found: Result<T>) -> Result<Option<T>> {
     match found {
         Err(error) if error.kind() == Kind::Model => Ok(None),
         found => found.map(Some),

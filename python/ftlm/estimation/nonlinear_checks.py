@@ -1,0 +1,132 @@
+"""Findings on non-linear terms: where they were seen, how much they act, and runs that forget their parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
+from ftlm.data.run import Run
+from ftlm.errors import FtlmError
+from ftlm.findings import Finding, make_finding
+from ftlm.kernels import integrate
+from ftlm.model.model import Model
+from ftlm.simulation.discretization import apply_input_nonlinearity
+from ftlm.simulation.nonlinear_columns import differentiate
+from ftlm.simulation.output_samples import OutputSamples, simulate_samples
+from ftlm.structure.equation import Equation, Term, derivative
+from ftlm.structure.expression import Channel, channel
+from ftlm.utils.validation import Floats
+
+#: Growth of a sensitivity from the first half of a run to the second one from which on it is exponential, if the output
+#: grows less than `MAX_OUTPUT_GROWTH`: no power of t of a stable model comes near.
+EXPONENTIAL_GROWTH, MAX_OUTPUT_GROWTH = 64.0, 4.0
+#: Relative change of a parameter for its sensitivity; the free run is smooth in it to rounding.
+RELATIVE_CHANGE = 1e-7
+
+
+def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
+    """Return findings on the non-linear terms of a model on its runs; empty for a linear model."""
+    finite = all(np.isfinite(samples.outputs).all() for samples in free)
+    if not model.structure.has_nonlinear_terms or not finite or any(run.sample_times is not None for run in runs):
+        return []
+    values = [_signal_values(model, run, samples) for run, samples in zip(runs, free, strict=True)]
+    found = [f for item in model.equations for f in _term_findings(item, runs, values)]
+    return [*found, *_forgetting_findings(model, runs, free)]
+
+
+def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
+    """Return the samples of inputs as they act, and of the simulated outputs."""
+    limited = apply_input_nonlinearity(run.with_interpolated_gaps(), model.structure)
+    simulated = dict(zip(model.outputs, samples.outputs, strict=True))
+    return {name: simulated[name] if name in simulated else limited[name] for name in model.structure.signals}
+
+
+def _derive(values: Floats, order: float, step: float) -> Floats:
+    """Return the derivative or integral of samples that are constant before them."""
+    if order == 0:
+        return values
+    if order < 0:
+        return integrate(values, -order, step=step)
+    return differentiate(values - values[0], order, step, smooth=False)
+
+
+def _channel_values(values: dict[str, Floats], one: Channel, step: float) -> Floats:
+    return _derive(values[one[0]], one[1], step)
+
+
+def _term_values(term: Term, values: dict[str, Floats], step: float) -> Floats:
+    """Return the values of a term."""
+    shape = term.nonlinear
+    if shape is None:
+        inner = values[term.signal]
+    else:
+        inner = np.asarray(shape.evaluate({c: _channel_values(values, c, step) for c in shape.channels}))
+        inner = np.broadcast_to(inner, values[term.signal].shape)
+    return (term.fixed or 0.0) * _derive(inner, term.order.constant, step)
+
+
+def _term_findings(item: Equation, runs: Sequence[Run], values: Sequence[dict[str, Floats]]) -> Iterator[Finding]:
+    """Yield a fact on each non-linear term: its share of the highest derivative, and the range of its signals."""
+    pairs = list(zip(values, (run.step for run in runs), strict=True))
+    whole = [sum((_term_values(t, v, h) for t in item.terms), np.zeros(1)) for v, h in pairs]
+    size = _rms(whole)
+    for term in item.nonlinear_terms:
+        shape = term.nonlinear
+        share = _rms([_term_values(term, v, h) for v, h in pairs]) / size if size > 0 else math.nan
+        if shape is None or not math.isfinite(share):
+            continue
+        ranges = []
+        for one in shape.channels:
+            seen = np.concatenate([_channel_values(v, one, h) for v, h in pairs])
+            ranges.append(f"{channel(*one)} from {seen.min():.3g} to {seen.max():.3g}")
+        yield make_finding(
+            "nonlinear_range",
+            output=item.output,
+            term=term.operand_as_text({}),
+            share=100 * share,
+            whole=derivative(replace(item.order, constant=round(item.order.constant, 4)), item.output),
+            ranges=", ".join(ranges),
+        )
+
+
+def _rms(parts: Sequence[Floats]) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return math.sqrt(float(np.mean(np.concatenate(parts) ** 2)))
+
+
+def _forgetting_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
+    """Return a finding if the sensitivity of a free run grows exponentially while its output does not.
+
+    Then the end of the run depends on its parameters more than any noise, as for chaotic motion, and nothing that is
+    fitted to all of it has a meaning.
+    """
+    numbers = parameter_vector(model)
+    worst: tuple[float, float, str] | None = None
+    for run, samples in zip(runs, free, strict=True):
+        half = run.length // 2
+        for k in np.flatnonzero(numbers):
+            moved = numbers.copy()
+            moved[k] *= 1.0 + RELATIVE_CHANGE
+            try:
+                found = [
+                    simulate_samples(m, run, 1, samples.initial)[0]
+                    for m in (model, with_parameter_vector(model, moved))
+                ]
+            except FtlmError:
+                continue
+            y, change = found[0], np.abs(found[1] - found[0])
+            early, late = change[:, :half].max(), change[:, half:].max()
+            grown = np.abs(y[:, half:]).max() > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max()
+            if grown or not early > 0 or not late > EXPONENTIAL_GROWTH * early or not math.isfinite(late):
+                continue
+            if worst is None or late / early > worst[0]:
+                first = float(change[:, : max(half // 4, 1)].max())
+                at = int(np.argmax(change.max(axis=0) > EXPONENTIAL_GROWTH * first))
+                worst = late / early, at * run.step, run.name
+    if worst is None:
+        return []
+    return [make_finding("run_forgets", run=worst[2], growth=worst[0], seconds=worst[1])]

@@ -1,0 +1,287 @@
+"""Expressions of signals in non-linear terms: normal form, text, values, derivatives and instructions of the core."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from ftlm.errors import ModelError
+from ftlm.structure.order import format_shortest
+from ftlm.utils.arguments import check_arguments
+from ftlm.utils.validation import Floats
+
+Function: TypeAlias = Literal["sin", "cos", "exp", "tanh", "abs", "sqrt"]
+Operation: TypeAlias = Literal["constant", "channel", "add", "multiply", "power"] | Function
+#: Signal and order of its derivative.
+Channel: TypeAlias = tuple[str, float]
+#: Functions of an expression: values and derivative.
+EXPRESSION_FUNCTIONS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "sin": (np.sin, np.cos),
+    "cos": (np.cos, lambda x: -np.sin(x)),
+    "exp": (np.exp, np.exp),
+    "tanh": (np.tanh, lambda x: 1.0 / np.cosh(x) ** 2),
+    "abs": (np.abs, np.sign),
+    "sqrt": (np.sqrt, lambda x: 0.5 / np.sqrt(x)),
+}
+#: Limit of whole powers; larger ones overflow for any signal that is not scaled.
+MAX_POWER = 100
+#: Limit of the instructions of an expression, against texts that are nested for ever.
+MAX_INSTRUCTIONS = 1000
+
+
+@check_arguments
+@dataclass(frozen=True)
+class Expression:
+    """Expression of signals and their derivatives without free parameters, such as ``abs(D y)*D y``.
+
+    Made by :func:`constant`, :func:`channel`, :func:`add`, :func:`multiply`, :func:`power` and :func:`apply`, which
+    keep it in normal form: the grammar reads ``str`` of an expression as an equal one.
+
+    Parameters
+    ----------
+    operation
+        Kind of the expression, or the name of a function.
+    arguments
+        Expressions that the operation combines.
+    value
+        Value of a constant, order of the derivative of a channel, or exponent of a power.
+    signal
+        Signal of a channel.
+    """
+
+    operation: Operation
+    arguments: tuple[Expression, ...] = ()
+    value: float = 0.0
+    signal: str = ""
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Signals with the orders of their derivatives, in order of first use."""
+        if self.operation == "channel":
+            return ((self.signal, self.value),)
+        return tuple(dict.fromkeys(c for argument in self.arguments for c in argument.channels))
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the expression is a sum of channels and constants with constant factors."""
+        if self.operation == "multiply":
+            return len(self.arguments) == 2 and not self.arguments[0].channels and self.arguments[1].is_linear
+        return self.operation in ("constant", "channel") or (
+            self.operation == "add" and all(argument.is_linear for argument in self.arguments)
+        )
+
+    @check_arguments
+    def program(self, channel_index: Mapping[Channel, int]) -> list[tuple[str, float]]:
+        """Return postfix instructions of the core; ``channel_index`` numbers the channels.
+
+        Instructions are ("constant", value), ("channel", index), ("add", 0), ("multiply", 0), ("negate", 0),
+        ("power", exponent), and (name of a function, 0).
+        """
+        if self.operation == "constant":
+            return [("constant", self.value)]
+        if self.operation == "channel":
+            return [("channel", float(channel_index[self.signal, self.value]))]
+        first, *others = self.arguments
+        if self.operation == "multiply" and first == constant(-1.0):
+            return [*multiply(*others).program(channel_index), ("negate", 0.0)]
+        out = first.program(channel_index)
+        for other in others:
+            out += [*other.program(channel_index), (self.operation, 0.0)]
+        if not others:
+            out.append((self.operation, self.value if self.operation == "power" else 0.0))
+        return out
+
+    @check_arguments
+    def evaluate(self, values: Mapping[Channel, Floats | float]) -> Any:
+        """Return the values for numbers or arrays of the channels; not finite where it is undefined or overflows."""
+        with np.errstate(all="ignore"):
+            return self._evaluate({c: np.asarray(v, dtype=np.float64) for c, v in values.items()})
+
+    def _evaluate(self, values: Mapping[Channel, Any]) -> Any:
+        match self.operation:
+            case "constant":
+                return self.value
+            case "channel":
+                return values[self.signal, self.value]
+            case "power":
+                return self.arguments[0]._evaluate(values) ** self._exponent
+        found = [argument._evaluate(values) for argument in self.arguments]
+        if self.operation in EXPRESSION_FUNCTIONS:
+            return EXPRESSION_FUNCTIONS[self.operation][0](found[0])
+        out = found[0]
+        for value in found[1:]:
+            out = out + value if self.operation == "add" else out * value
+        return out
+
+    @property
+    def _exponent(self) -> float | int:
+        return int(self.value) if self.value.is_integer() else self.value
+
+    @check_arguments
+    def gradient(self, values: Mapping[Channel, Floats | float]) -> dict[Channel, Any]:
+        """Return the partial derivatives with respect to the channels, by channel; that of abs at 0 is 0."""
+        known = {c: np.asarray(v, dtype=np.float64) for c, v in values.items()}
+        with np.errstate(all="ignore"):
+            return {c: self._derivative(c, known) for c in self.channels}
+
+    def _derivative(self, channel: Channel, values: Mapping[Channel, Any]) -> Any:
+        """Return the partial derivative with respect to one channel by the chain rule."""
+        if self.operation == "channel":
+            return float((self.signal, self.value) == channel)
+        inner = [argument._derivative(channel, values) for argument in self.arguments]
+        if self.operation in ("constant", "add"):
+            return sum(inner)
+        found = [argument._evaluate(values) for argument in self.arguments]
+        if self.operation == "power":
+            n = self._exponent
+            return n * found[0] ** (n - 1) * inner[0]
+        if self.operation in EXPRESSION_FUNCTIONS:
+            return EXPRESSION_FUNCTIONS[self.operation][1](found[0]) * inner[0]
+        total: Any = 0.0
+        for i, slope in enumerate(inner):
+            product = slope
+            for j, value in enumerate(found):
+                product = product if i == j else product * value
+            total = total + product
+        return total
+
+    def split_factor(self) -> tuple[float, Expression]:
+        """Return the constant factor of the expression, 1 if it has none, and the expression without it."""
+        if self.operation == "constant":
+            return self.value, constant(1.0)
+        if self.operation == "multiply" and self.arguments[0].operation == "constant":
+            return self.arguments[0].value, multiply(*self.arguments[1:])
+        return 1.0, self
+
+    @check_arguments
+    def as_text(self, signals: Mapping[str, str] | None = None) -> str:
+        """Format the expression; ``signals`` maps an input to its text after delay and nonlinearity."""
+        texts = signals or {}
+        match self.operation:
+            case "constant":
+                return format_shortest(self.value)
+            case "channel":
+                return _derivative_text(self.value, texts.get(self.signal, self.signal))
+            case "add":
+                text = " + ".join(argument.as_text(texts) for argument in self.arguments)
+                return text.replace("+ -", "- ")
+            case "multiply":
+                first, *others = self.arguments
+                if first == constant(-1.0):
+                    return "-" + multiply(*others)._as_factor(texts)
+                return "*".join([first._as_factor(texts), *(other._as_factor(texts) for other in others)])
+            case "power":
+                base = self.arguments[0]
+                text = base.as_text(texts)
+                bare = base.operation in EXPRESSION_FUNCTIONS or (base.operation == "channel" and base.value == 0)
+                return f"{text if bare else f'({text})'}^{format_shortest(self.value)}"
+        return f"{self.operation}({self.arguments[0].as_text(texts)})"
+
+    def _as_factor(self, texts: Mapping[str, str]) -> str:
+        """Format the expression as a factor of a product."""
+        text = self.as_text(texts)
+        return f"({text})" if self.operation == "add" else text
+
+    def __str__(self) -> str:
+        return self.as_text()
+
+
+def _derivative_text(order: float, text: str) -> str:
+    """Format the derivative of a channel, such as ``D^0.5 y``."""
+    return text if order == 0 else f"D {text}" if order == 1 else f"D^{format_shortest(order)} {text}"
+
+
+def constant(value: float) -> Expression:
+    """Return a constant.
+
+    Raises
+    ------
+    ModelError
+        A value that is not finite.
+    """
+    if not math.isfinite(value):
+        raise ModelError(f"a constant of an expression is {value}, which is not finite; give a number")
+    return Expression("constant", value=float(value) + 0.0)
+
+
+def channel(signal: str, order: float = 0.0) -> Expression:
+    """Return a signal or its derivative of a given order.
+
+    Raises
+    ------
+    ModelError
+        A negative order.
+    """
+    if not 0 <= order < math.inf:
+        raise ModelError(f"order {order:g} of {signal} inside a non-linear term is negative; use derivatives, from 0")
+    return Expression("channel", value=float(order), signal=signal)
+
+
+def add(*terms: Expression) -> Expression:
+    """Return a sum in normal form: flat, with one constant at the end."""
+    parts = [part for term in terms for part in (term.arguments if term.operation == "add" else (term,))]
+    known = sum(part.value for part in parts if part.operation == "constant")
+    parts = [part for part in parts if part.operation != "constant"]
+    if known or not parts:
+        parts.append(constant(known))
+    return parts[0] if len(parts) == 1 else Expression("add", tuple(parts))
+
+
+def multiply(*factors: Expression) -> Expression:
+    """Return a product in normal form: flat, with one constant factor at the head."""
+    parts = [part for factor in factors for part in (factor.arguments if factor.operation == "multiply" else (factor,))]
+    known = math.prod(part.value for part in parts if part.operation == "constant")
+    parts = [part for part in parts if part.operation != "constant"]
+    if known == 0.0 or not parts:
+        return constant(known)
+    if known != 1.0:
+        parts.insert(0, constant(known))
+    return parts[0] if len(parts) == 1 else Expression("multiply", tuple(parts))
+
+
+def power(base: Expression, exponent: float) -> Expression:
+    """Return a power: a whole one from 1 to 100, or any positive one of an absolute value.
+
+    Raises
+    ------
+    ModelError
+        Another exponent.
+    """
+    if base.operation == "abs":
+        if not 0 < exponent <= MAX_POWER:
+            raise ModelError(f"the power {exponent:g} of {base} is not in (0, {MAX_POWER}]; choose another")
+    elif not 1 <= exponent <= MAX_POWER:
+        raise ModelError(
+            f"the power {exponent:g} of {base} is not in [1, {MAX_POWER}]; a quotient of signals is a signal of the run"
+        )
+    elif not float(exponent).is_integer():
+        raise ModelError(f"the power {exponent:g} of {base} is no whole number; write abs({base})^{exponent:g}")
+    if base.operation == "constant":
+        try:
+            return constant(base.value ** int(exponent))
+        except OverflowError:
+            raise ModelError(f"the power {exponent:g} of {base} overflows; give a smaller one") from None
+    return base if exponent == 1 else Expression("power", (base,), float(exponent))
+
+
+def apply(function: str, argument: Expression) -> Expression:
+    """Return a function of an expression.
+
+    Raises
+    ------
+    ModelError
+        An unknown function.
+    """
+    if function not in EXPRESSION_FUNCTIONS:
+        raise ModelError(f"{function}(…) is not computed; use {', '.join(EXPRESSION_FUNCTIONS)}")
+    if argument.operation == "constant":
+        with np.errstate(all="ignore"):
+            value = float(EXPRESSION_FUNCTIONS[function][0](argument.value))
+        if not math.isfinite(value):
+            raise ModelError(f"{function}({argument}) is {value}, which is not finite; give another argument")
+        return constant(value)
+    return Expression(function, (argument,))  # type: ignore[arg-type]

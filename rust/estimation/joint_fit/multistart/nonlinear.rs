@@ -1,0 +1,216 @@
+//! Multistart for equations with non-linear terms: linear fits with the measured values of the expressions.
+//!
+//! With measured values a derived signal is one more input, and the order grids of linear equations give initial
+//! guesses, ranked by free runs of the non-linear equations. Derivatives of measured signals are taken of raw and of
+//! smoothed samples. If no guess reaches the noise, output-error fits of these linear equations and of those without
+//! the non-linear terms add guesses.
+
+use super::coarse_grid::coarse_sampling;
+use super::friction::{guess_at, values_of};
+use super::halving::{
+    is_same_iterate, is_same_optimum, merge_duplicates, sort_by_cost, RungExecutor, FIRST_BUDGET_EVALUATIONS,
+    MAX_FINAL_SURVIVORS, MIN_SURVIVORS, SECOND_BUDGET_EVALUATIONS,
+};
+use super::search::{none_if_invalid_model, run_multistart, MultistartContext, NOISE_FLOOR_FACTOR};
+use crate::error::Result;
+use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
+use crate::estimation::joint_fit::parameter_set::ParameterSet;
+use crate::estimation::joint_fit::problem::Candidate;
+use crate::estimation::joint_fit::structure::{Equation, Structure};
+use crate::expression::{DerivedSignal, Values};
+use crate::fractional::kernels::grunwald_letnikov_weights;
+use crate::nonlinear::refuse_beside;
+use crate::recording::{Channel, Recording, Recordings, Role};
+use crate::series;
+use crate::signal::block_pulse::{delay_samples, Intersample};
+use crate::signal::nonuniform::interpolate_gaps;
+
+/// Half the width of the smoothing window of measured signals whose derivatives enter expressions, in samples.
+const SMOOTHING_HALF_WIDTH: usize = 15;
+
+/// Finest grid of the initial guesses, in block pulses per sampling interval.
+const MAX_START_PULSES_PER_SAMPLE: usize = 4;
+
+/// Run the multistart of a problem with non-linear terms; return the candidates best first.
+///
+/// # Errors
+/// As [`run_multistart`]; [`crate::error::Error::Interrupted`].
+pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    let structure = &free.structure;
+    let linear = ParameterSet::from_structure(Structure { derived: Vec::new(), ..structure.clone() })?;
+    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
+    let sampling = coarse_sampling(free, course.source)?;
+    let mut grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
+    let differentiates = structure.derived.iter().flat_map(|derived| &derived.channels).any(|channel| channel.1 > 0.0);
+    let widths = if differentiates { vec![0, SMOOTHING_HALF_WIDTH] } else { vec![0] };
+    let sources = widths.into_iter().map(|width| with_derived_signals(structure, course.source, width));
+    let sources = sources.collect::<Result<Vec<_>>>()?;
+    let mut starts = Vec::new();
+    for source in &sources {
+        let guesses = course.starts.for_recordings(source).initial_guesses(&linear);
+        starts.extend(none_if_invalid_model(guesses)?.unwrap_or_default());
+    }
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
+    let mut ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
+    while ranked.is_empty() && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+        grid = grid.finer()?;
+        ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
+    }
+    let laps = RungExecutor { told: None, ..laps };
+    let is_at_noise = |reached: &[Candidate]| {
+        reached.first().is_some_and(|best| best.cost_per_residual() <= NOISE_FLOOR_FACTOR * course.floor)
+    };
+    let mut reached = Vec::new();
+    for going in ranked.chunks(MAX_FINAL_SURVIVORS).take(MIN_SURVIVORS.div_ceil(MAX_FINAL_SURVIVORS)) {
+        reached.extend(laps.run(free, &grid, going, FIRST_BUDGET_EVALUATIONS)?);
+        reached = sort_by_cost(reached);
+        if is_at_noise(&reached) {
+            break;
+        }
+    }
+    // Fast responses need shorter pulses before a residual says anything of a guess.
+    while let Some(best) = reached.first().filter(|_| !is_at_noise(&reached))
+        && grid.sampling.pulses_per_sample < MAX_START_PULSES_PER_SAMPLE
+        && grid.is_refinement_significant(&best.result.iterate, &grid.finer()?)?
+    {
+        grid = grid.finer()?;
+        reached = laps.run(free, &grid, &reached, FIRST_BUDGET_EVALUATIONS)?;
+    }
+    if !is_at_noise(&reached) {
+        let mut more = Vec::new();
+        for source in &sources {
+            let starts = course.starts.for_recordings(source);
+            let own = MultistartContext { source, starts: starts.as_ref(), told: None, ..course };
+            more.extend(embed(
+                free,
+                &linear,
+                &none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default(),
+            )?);
+        }
+        if let Some(less) = without_nonlinear_terms(structure) {
+            let own = MultistartContext { told: None, ..course };
+            let found = none_if_invalid_model(run_multistart(&less, own))?.unwrap_or_default();
+            more.extend(embed(free, &less, &found)?);
+        }
+        reached.extend(laps.run(free, &grid, &more, FIRST_BUDGET_EVALUATIONS)?);
+        reached = sort_by_cost(reached);
+    }
+    let going = merge_duplicates(&reached, is_same_optimum);
+    let (first, rest) = going.split_at(MAX_FINAL_SURVIVORS.min(going.len()));
+    let mut ended = laps.run(free, &grid, first, SECOND_BUDGET_EVALUATIONS)?;
+    ended.extend(rest.iter().cloned());
+    Ok(ended)
+}
+
+/// Best candidates of a problem with some of the parameters as guesses of the full one.
+fn embed(free: &ParameterSet, less: &ParameterSet, found: &[Candidate]) -> Result<Vec<Candidate>> {
+    let of = |runner: &Candidate| {
+        let mut values = values_of(less, runner);
+        for name in &free.coefficients {
+            values.entry(name.clone()).or_insert(0.0);
+        }
+        guess_at(free, &values, format!("{}, from a linear fit", runner.origin))
+    };
+    found.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
+}
+
+/// Problem without the non-linear terms; None if an equation has no others.
+fn without_nonlinear_terms(structure: &Structure) -> Option<ParameterSet> {
+    let recorded = structure.recorded_count();
+    let of = |item: &Equation| {
+        let terms = item.terms.iter().filter(|term| term.signal < recorded).cloned().collect();
+        Equation { terms, ..item.clone() }
+    };
+    let less = Structure {
+        signals: structure.signals[..recorded].to_vec(),
+        derived: Vec::new(),
+        equations: structure.equations.iter().map(of).collect(),
+        ..structure.clone()
+    };
+    let names = less.order_names();
+    let bounds = less.bounds.iter().filter(|(name, _)| names.contains(name)).map(|(n, b)| (n.clone(), *b)).collect();
+    ParameterSet::from_structure(Structure { bounds, ..less }).ok()
+}
+
+/// Recordings with the derived signals as measured ones, after smoothing of what is differentiated.
+fn with_derived_signals(structure: &Structure, source: &Recordings, half_width: usize) -> Result<Recordings> {
+    let of = |run: &Recording| {
+        if run.has_nonuniform_samples() {
+            return Err(refuse_beside("samples at times of their own", "resample the runs"));
+        }
+        let mut channels = run.channels().to_vec();
+        for (derived, name) in structure.derived.iter().zip(&structure.signals[structure.recorded_count()..]) {
+            channels.push(derived_channel(run, derived, name, half_width)?);
+        }
+        let mut with = run.with_channels(channels, run.outputs().to_vec())?;
+        with.free_inputs.clone_from(&run.free_inputs);
+        Ok(with)
+    };
+    Recordings::new(source.runs().iter().map(of).collect::<Result<Vec<_>>>()?)
+}
+
+fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_width: usize) -> Result<Channel> {
+    let mut rows = Vec::new();
+    let (mut is_held, mut is_filtered) = (true, false);
+    for &(signal, order) in &derived.channels {
+        let channel = run.channel(signal)?;
+        is_held &= channel.is_held_input() && order == 0.0;
+        is_filtered |= channel.is_filtered;
+        let mut samples = interpolate_gaps(&run.acting_samples(signal)).into_owned();
+        if channel.lag() != 0.0 {
+            samples = delay_samples(&samples, channel.lag() / run.step(), run.value_before(&samples))?;
+        }
+        rows.push(if order > 0.0 { differentiate(samples, order, run, half_width) } else { samples });
+    }
+    let mut values = Values::default();
+    let mut at = vec![0.0; rows.len()];
+    let of = |k: usize| {
+        at.iter_mut().zip(&rows).for_each(|(v, row)| *v = row[k]);
+        let value = derived.expression.evaluate(&at, &mut values);
+        // Noise may leave the domain of a function.
+        if value.is_finite() {
+            value
+        } else {
+            0.0
+        }
+    };
+    let samples = (0..run.len()).map(of).collect();
+    let role = if is_held { Role::Input(Intersample::Hold) } else { Role::Output };
+    Ok(Channel { is_filtered, ..Channel::new(name, samples, role) })
+}
+
+/// Derivative of smoothed samples by Grünwald–Letnikov.
+fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usize) -> Vec<f64> {
+    let first = if run.is_at_rest { 0.0 } else { samples[0] };
+    let moved: Vec<f64> = smooth(&samples, half_width).iter().map(|v| v - first).collect();
+    let weights = grunwald_letnikov_weights(order, moved.len());
+    let scale = libm::pow(run.step(), -order);
+    series::multiply(&weights, &moved, moved.len()).into_iter().map(|v| scale * v).collect()
+}
+
+/// Samples smoothed by local cubics (Savitzky–Golay), over shorter windows near the ends.
+#[allow(clippy::cast_precision_loss)]
+fn smooth(samples: &[f64], half_width: usize) -> Vec<f64> {
+    let of = |k: usize| {
+        let n = half_width.min(k).min(samples.len() - 1 - k);
+        if n < 2 {
+            return samples[k];
+        }
+        let size = n as f64;
+        let scale = 3.0 / ((2.0 * size + 3.0) * (2.0 * size + 1.0) * (2.0 * size - 1.0));
+        let weight = |j: f64| scale * (3.0 * size * size + 3.0 * size - 1.0 - 5.0 * j * j);
+        (samples[k - n..=k + n].iter().enumerate()).map(|(i, v)| weight(i as f64 - size) * v).sum()
+    };
+    (0..samples.len()).map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::smooth;
+
+    #[test]
+    fn smoothing_keeps_cubics() {
+        let cubic: Vec<f64> = (0..60).map(|k| (f64::from(k) - 20.0).powi(3)).collect();
+        assert!(smooth(&cubic, 15).iter().zip(&cubic).all(|(a, b)| (a - b).abs() < 1e-8));
+    }
+}

@@ -1,0 +1,394 @@
+//! Output-error fit of simulations that are not linear in their initial states, by Levenberg–Marquardt.
+//!
+//! Orders, coefficients, free parameters of inputs, and the initial states of each run are optimized together.
+
+use super::output_error::{Coordinate, Experiment, FreeInput};
+use crate::error::{check_finite, check_length, Error, Result};
+use crate::estimation::optimization::damped_step::Problem;
+use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
+use crate::linalg::orthogonal::extend_orthonormal;
+use crate::parallel::Stop;
+
+/// Values of all free parameters.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Point {
+    pub(crate) orders: Vec<f64>,
+    pub(crate) coefficients: Vec<f64>,
+    /// Free parameters of inputs.
+    pub(crate) inputs: Vec<f64>,
+    /// Initial states of each run.
+    pub(crate) states: Vec<Vec<f64>>,
+}
+
+/// Residuals at a point, with intermediate results `P` of each experiment for their derivatives.
+pub(crate) struct Evaluation<P> {
+    pub(crate) residuals: Vec<f64>,
+    pub(crate) size: f64,
+    pub(crate) parts: Vec<P>,
+}
+
+impl<P> Evaluation<P> {
+    /// Evaluation before any experiment.
+    pub(crate) fn empty() -> Self {
+        Self { residuals: Vec::new(), size: 0.0, parts: Vec::new() }
+    }
+}
+
+/// Parameter of a derivative.
+pub(crate) enum Parameter {
+    /// Free order, free coefficient, or state of one run.
+    Order(usize),
+    Coefficient(usize),
+    State(usize, usize),
+    /// Free parameter of an input.
+    Input(usize),
+}
+
+impl Parameter {
+    /// Parameters at a point: orders, coefficients and inputs if `numbers`, then the states of run after run.
+    pub(crate) fn all(point: &Point, numbers: bool) -> Vec<Self> {
+        let mut all = Vec::new();
+        if numbers {
+            all.extend((0..point.orders.len()).map(Self::Order));
+            all.extend((0..point.coefficients.len()).map(Self::Coefficient));
+            all.extend((0..point.inputs.len()).map(Self::Input));
+        }
+        let states = point.states.iter().enumerate();
+        all.extend(states.flat_map(|(run, states)| (0..states.len()).map(move |state| Self::State(run, state))));
+        all
+    }
+}
+
+/// Model whose simulation is not linear in its initial states.
+pub(crate) trait StateModel {
+    /// Intermediate results of an experiment.
+    type Part;
+
+    /// Bounds of each free order.
+    fn order_bounds(&self) -> &[(f64, f64)];
+
+    /// Coordinate of each free coefficient.
+    fn coordinates(&self) -> &[Coordinate];
+
+    /// Free parameters of inputs.
+    fn inputs(&self) -> &[FreeInput];
+
+    /// Whether a coefficient must not be negative.
+    fn is_nonnegative(&self, _coefficient: usize) -> bool {
+        false
+    }
+
+    /// Whether the cost has kinks, so that its gradient need not vanish at a minimum.
+    fn has_kinks(&self) -> bool {
+        false
+    }
+
+    /// Return an error for an inconsistent model, or for experiments that do not fit it.
+    fn check(&self, experiments: &[Experiment]) -> Result<()>;
+
+    /// Return an error for invalid free orders.
+    fn check_orders(&self, orders: &[f64]) -> Result<()>;
+
+    /// Initial guesses of the states of a run from its first samples; the first has the length of all.
+    fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>>;
+
+    /// Number of states of each run.
+    fn state_count(&self, orders: &[f64]) -> usize;
+
+    /// Initial terms of a run's states by equation: (exponent, coefficient).
+    fn powers(&self, orders: &[f64], coefficients: &[f64], states: &[f64]) -> Vec<Vec<(f64, f64)>>;
+
+    /// Residuals at a point.
+    fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation<Self::Part>>;
+
+    /// Derivatives of the residuals with respect to [`Parameter::all`].
+    fn jacobian(
+        &self,
+        experiments: &[Experiment],
+        point: &Point,
+        at: &Evaluation<Self::Part>,
+        numbers: bool,
+        stop: &Stop,
+    ) -> Result<Vec<Vec<f64>>>;
+}
+
+/// Initial guess of a fit.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Start {
+    /// Free orders.
+    pub orders: Vec<f64>,
+    /// Free coefficients.
+    pub coefficients: Vec<f64>,
+    /// Free parameters of inputs.
+    pub inputs: Vec<f64>,
+    /// Initial states of each run. If empty, they are estimated at the initial guess.
+    pub states: Vec<Vec<f64>>,
+}
+
+/// Optimum of a fit and its diagnostics.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    /// Free orders.
+    pub orders: Vec<f64>,
+    /// Free coefficients.
+    pub coefficients: Vec<f64>,
+    /// Free parameters of inputs.
+    pub inputs: Vec<f64>,
+    /// Initial states of each run.
+    pub states: Vec<Vec<f64>>,
+    /// Initial terms of the states, (exponent, coefficient), by run and equation.
+    pub initial: Vec<Vec<Vec<(f64, f64)>>>,
+    /// Half the weighted sum of squared residuals.
+    pub cost: f64,
+    /// Residuals with weights, run after run.
+    pub residuals: Vec<f64>,
+    /// Derivatives with respect to orders, coefficients and inputs, after projecting out the states.
+    pub jacobian: Vec<Vec<f64>>,
+    /// Number of residual evaluations.
+    pub evaluations: usize,
+    /// Termination status.
+    pub status: Status,
+}
+
+struct OutputError<'a, M> {
+    model: &'a M,
+    experiments: &'a [Experiment],
+    stop: &'a Stop,
+}
+
+impl<M: StateModel> Problem for OutputError<'_, M> {
+    type Point = Point;
+    type Evaluation = Evaluation<M::Part>;
+
+    fn evaluate(&self, point: &Point) -> Result<Evaluation<M::Part>> {
+        self.model.evaluate(self.experiments, point, self.stop)
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Evaluation<M::Part>) -> &'a [f64] {
+        &evaluation.residuals
+    }
+
+    fn jacobian(&self, point: &Point, evaluation: &Evaluation<M::Part>) -> Result<Vec<Vec<f64>>> {
+        self.model.jacobian(self.experiments, point, evaluation, true, self.stop)
+    }
+
+    fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+        let mut next = point.clone();
+        let mut moved: f64 = 0.0;
+        let (orders, rest) = steps.split_at(point.orders.len());
+        let (coefficients, rest) = rest.split_at(point.coefficients.len());
+        let (inputs, mut states) = rest.split_at(point.inputs.len());
+        for ((order, &(low, high)), step) in next.orders.iter_mut().zip(self.model.order_bounds()).zip(orders) {
+            let before = *order;
+            *order = (before + step).clamp(low, high);
+            moved = moved.max((*order - before).abs());
+        }
+        let share = |before: f64, after: f64| (after - before).abs() / before.abs().max(f64::MIN_POSITIVE);
+        for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
+            let before = *value;
+            *value = self.model.coordinates()[j].shift(before, *step);
+            if self.model.is_nonnegative(j) {
+                *value = value.max(0.0);
+            }
+            moved = moved.max(share(before, *value));
+        }
+        for ((value, input), step) in next.inputs.iter_mut().zip(self.model.inputs()).zip(inputs) {
+            let (before, (low, high)) = (*value, input.bounds);
+            *value = (before + step).clamp(low, high);
+            moved = moved.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+        }
+        for run in &mut next.states {
+            let (own, others) = states.split_at(run.len());
+            states = others;
+            for (value, step) in run.iter_mut().zip(own) {
+                moved = moved.max(share(*value, *value + step));
+                *value += step;
+            }
+        }
+        (next, moved)
+    }
+
+    fn coordinate_derivative(&self, point: &Point, parameter: usize) -> f64 {
+        parameter
+            .checked_sub(point.orders.len())
+            .filter(|j| *j < point.coefficients.len())
+            .map_or(1.0, |j| self.model.coordinates()[j].derivative(point.coefficients[j]))
+    }
+
+    /// Orders, input parameters and forces of friction have bounds.
+    fn distance_to_bounds(&self, point: &Point, parameter: usize) -> (f64, f64) {
+        if let Some(order) = point.orders.get(parameter) {
+            let (low, high) = self.model.order_bounds()[parameter];
+            return (order - low, high - order);
+        }
+        let j = parameter - point.orders.len();
+        let input = j.checked_sub(point.coefficients.len());
+        if let Some((value, free)) = input.and_then(|i| point.inputs.get(i).zip(self.model.inputs().get(i))) {
+            return (value - free.bounds.0, free.bounds.1 - value);
+        }
+        let plain = self.model.coordinates().get(j).is_some_and(|c| c.derivative(2.0) == 1.0);
+        if plain && self.model.is_nonnegative(j) {
+            return (point.coefficients[j], f64::INFINITY);
+        }
+        (f64::INFINITY, f64::INFINITY)
+    }
+
+    fn has_kinks(&self, _point: &Point, _parameter: usize) -> bool {
+        self.model.has_kinks()
+    }
+
+    fn signal_norm(&self, evaluation: &Evaluation<M::Part>) -> f64 {
+        evaluation.size
+    }
+}
+
+/// Estimation of the initial state of one run with all other parameters fixed.
+struct InitialStateProblem<'a, M> {
+    model: &'a M,
+    experiment: &'a Experiment,
+    orders: &'a [f64],
+    coefficients: &'a [f64],
+    inputs: &'a [f64],
+    stop: &'a Stop,
+}
+
+impl<M> InitialStateProblem<'_, M> {
+    fn at(&self, states: &[f64]) -> Point {
+        Point {
+            orders: self.orders.to_vec(),
+            coefficients: self.coefficients.to_vec(),
+            inputs: self.inputs.to_vec(),
+            states: vec![states.to_vec()],
+        }
+    }
+}
+
+impl<M: StateModel> Problem for InitialStateProblem<'_, M> {
+    type Point = Vec<f64>;
+    type Evaluation = Evaluation<M::Part>;
+
+    fn evaluate(&self, states: &Vec<f64>) -> Result<Evaluation<M::Part>> {
+        self.model.evaluate(std::slice::from_ref(self.experiment), &self.at(states), self.stop)
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Evaluation<M::Part>) -> &'a [f64] {
+        &evaluation.residuals
+    }
+
+    fn jacobian(&self, states: &Vec<f64>, evaluation: &Evaluation<M::Part>) -> Result<Vec<Vec<f64>>> {
+        self.model.jacobian(std::slice::from_ref(self.experiment), &self.at(states), evaluation, false, self.stop)
+    }
+
+    fn apply_step(&self, states: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
+        let next: Vec<f64> = states.iter().zip(steps).map(|(x, step)| x + step).collect();
+        let share = |(x, step): (&f64, &f64)| step.abs() / x.abs().max(f64::MIN_POSITIVE);
+        (next, states.iter().zip(steps).map(share).fold(0.0, f64::max))
+    }
+
+    fn has_kinks(&self, _states: &Vec<f64>, _parameter: usize) -> bool {
+        self.model.has_kinks()
+    }
+
+    fn signal_norm(&self, evaluation: &Evaluation<M::Part>) -> f64 {
+        evaluation.size
+    }
+}
+
+/// Evaluations and tolerance of the estimate of an initial state.
+const INITIAL_STATE_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
+
+/// Initial state of a run at fixed parameters: best result of local optimizations from its first samples.
+fn estimate_initial_state<M: StateModel>(
+    model: &M,
+    (orders, coefficients, inputs): (&[f64], &[f64], &[f64]),
+    experiment: &Experiment,
+    stop: &Stop,
+) -> Result<Vec<f64>> {
+    let problem = InitialStateProblem { model, experiment, orders, coefficients, inputs, stop };
+    let guesses = model.state_guesses(orders, coefficients, experiment);
+    let mut best = (f64::INFINITY, guesses.first().cloned().unwrap_or_default());
+    if best.1.is_empty() {
+        return Ok(best.1);
+    }
+    for guess in guesses {
+        match minimize(&problem, guess, INITIAL_STATE_SETTINGS) {
+            Ok(found) if found.cost < best.0 => best = (found.cost, found.point),
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            // A start with a simulation that overflows is skipped.
+            _ => {}
+        }
+    }
+    Ok(best.1)
+}
+
+/// Least-squares fit with weights of the output error from an initial guess.
+///
+/// # Errors
+/// An initial guess whose simulation overflows, an inconsistent model or experiments that do not fit it;
+/// [`Error::Interrupted`].
+pub(crate) fn fit<M: StateModel>(
+    model: &M,
+    experiments: &[Experiment],
+    start: &Start,
+    settings: Settings,
+    stop: &Stop,
+) -> Result<Fit> {
+    model.check(experiments)?;
+    check_length("orders", model.order_bounds().len(), start.orders.len())?;
+    check_length("coefficients", model.coordinates().len(), start.coefficients.len())?;
+    check_finite("orders of the start", &start.orders)?;
+    check_finite("coefficients of the start", &start.coefficients)?;
+    check_length("inputs", model.inputs().len(), start.inputs.len())?;
+    check_finite("inputs of the start", &start.inputs)?;
+    let orders: Vec<f64> =
+        start.orders.iter().zip(model.order_bounds()).map(|(o, &(low, high))| o.clamp(low, high)).collect();
+    model.check_orders(&orders)?;
+    let mut coefficients = start.coefficients.clone();
+    for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.is_nonnegative(*j)) {
+        *value = value.max(0.0);
+    }
+    let inputs: Vec<f64> =
+        start.inputs.iter().zip(model.inputs()).map(|(v, i)| v.clamp(i.bounds.0, i.bounds.1)).collect();
+    let count = model.state_count(&orders);
+    let mut states = start.states.clone();
+    if states.len() != experiments.len() || states.iter().any(|s| s.len() != count) {
+        states = experiments
+            .iter()
+            .map(|e| estimate_initial_state(model, (&orders, &coefficients, &inputs), e, stop))
+            .collect::<Result<_>>()?;
+    }
+    for values in &states {
+        check_finite("states of the start", values)?;
+    }
+    let problem = OutputError { model, experiments, stop };
+    let found = minimize(&problem, Point { orders, coefficients, inputs, states }, settings)?;
+    let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
+    let mut basis = Vec::new();
+    for column in found.jacobian.iter().skip(numbers) {
+        extend_orthonormal(&mut basis, column.clone(), DEPENDENCE_TOLERANCE);
+    }
+    let mut jacobian = found.jacobian;
+    jacobian.truncate(numbers);
+    for column in &mut jacobian {
+        for direction in &basis {
+            let along: f64 = direction.iter().zip(column.iter()).map(|(q, v)| q * v).sum();
+            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+        }
+    }
+    let Point { orders, coefficients, inputs, states } = found.point;
+    Ok(Fit {
+        initial: states.iter().map(|values| model.powers(&orders, &coefficients, values)).collect(),
+        orders,
+        coefficients,
+        inputs,
+        states,
+        cost: found.cost,
+        residuals: found.evaluation.residuals,
+        jacobian,
+        evaluations: found.evaluations,
+        status: found.status,
+    })
+}
+
+/// Relative distance from the span of other responses below which a state is linearly dependent.
+const DEPENDENCE_TOLERANCE: f64 = 1e-12;

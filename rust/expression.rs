@@ -1,0 +1,335 @@
+//! Expressions of non-linear terms: checked programs in postfix notation, with derivatives in one pass.
+//!
+//! A channel is a signal or a derivative of it. A [`DerivedSignal`] is an expression over channels, such as y³ or
+//! |Dy|·Dy. A non-linear term of an equation is a linear term of a derived signal.
+
+use crate::error::{Error, Result};
+use crate::fractional::kernels::MAX_ORDER;
+
+/// Function of one argument.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Function {
+    /// sin.
+    Sin,
+    /// cos.
+    Cos,
+    /// Exponential function.
+    Exp,
+    /// tanh.
+    Tanh,
+    /// Absolute value.
+    Abs,
+    /// Square root.
+    Sqrt,
+    /// Sign, 0 at 0.
+    Sign,
+}
+
+impl Function {
+    const ALL: [Self; 7] = [Self::Sin, Self::Cos, Self::Exp, Self::Tanh, Self::Abs, Self::Sqrt, Self::Sign];
+
+    /// Name.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Sin => "sin",
+            Self::Cos => "cos",
+            Self::Exp => "exp",
+            Self::Tanh => "tanh",
+            Self::Abs => "abs",
+            Self::Sqrt => "sqrt",
+            Self::Sign => "sign",
+        }
+    }
+
+    /// Value and derivative. The infinite slope of a root at 0 is 0.
+    fn apply(self, x: f64) -> (f64, f64) {
+        match self {
+            Self::Sin => (libm::sin(x), libm::cos(x)),
+            Self::Cos => (libm::cos(x), -libm::sin(x)),
+            Self::Exp => (libm::exp(x), libm::exp(x)),
+            Self::Tanh => {
+                let value = libm::tanh(x);
+                (value, 1.0 - value * value)
+            }
+            Self::Abs => (x.abs(), sign(x)),
+            Self::Sqrt => (libm::sqrt(x), if x > 0.0 { 0.5 / libm::sqrt(x) } else { 0.0 }),
+            Self::Sign => (sign(x), 0.0),
+        }
+    }
+}
+
+fn sign(x: f64) -> f64 {
+    if x == 0.0 {
+        0.0
+    } else {
+        x.signum()
+    }
+}
+
+/// Value and derivative of x^n. The infinite slope of a power below 1 at 0 is 0.
+#[allow(clippy::cast_possible_truncation)]
+fn power(x: f64, n: f64) -> (f64, f64) {
+    if n == 0.0 {
+        return (1.0, 0.0);
+    }
+    if n.fract() == 0.0 && n.abs() < f64::from(i16::MAX) {
+        let before = x.powi(n as i32 - 1);
+        return (if n > 0.0 { before * x } else { x.powi(n as i32) }, n * before);
+    }
+    (libm::pow(x, n), if x == 0.0 && n < 1.0 { 0.0 } else { n * libm::pow(x, n - 1.0) })
+}
+
+/// Instruction of a program in postfix notation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Instruction {
+    /// Push a constant.
+    Constant(f64),
+    /// Push the value of a channel.
+    Channel(usize),
+    /// Add the two topmost values.
+    Add,
+    /// Multiply the two topmost values.
+    Multiply,
+    /// Negate the topmost value.
+    Negate,
+    /// Raise the topmost value to a power.
+    Power(f64),
+    /// Apply a function to the topmost value.
+    Apply(Function),
+}
+
+impl Instruction {
+    /// Instruction from a name and a number: `constant` (value), `channel` (index), `add`, `multiply`, `negate`,
+    /// `power` (exponent), or a function.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] for another name, or an index that is not whole.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn parse(name: &str, value: f64) -> Result<Self> {
+        Ok(match name {
+            "constant" => Self::Constant(value),
+            "channel" if value >= 0.0 && value.fract() == 0.0 && value < 1e6 => Self::Channel(value as usize),
+            "add" => Self::Add,
+            "multiply" => Self::Multiply,
+            "negate" => Self::Negate,
+            "power" => Self::Power(value),
+            _ => match Function::ALL.into_iter().find(|function| function.name() == name) {
+                Some(function) => Self::Apply(function),
+                None => return refuse(format!("instruction '{name}' ({value})"), "use those of an expression"),
+            },
+        })
+    }
+}
+
+fn refuse<T>(what: String, remedy: &str) -> Result<T> {
+    Err(Error::Structure { what: format!("{what} in a non-linear term"), remedy: remedy.into() })
+}
+
+/// Expression over numbered channels.
+///
+/// ```
+/// use ftlm::expression::{Expression, Function, Instruction, Values};
+/// // |x₀| x₀: 4 at −2 with the opposite sign, slope 2 |x₀|.
+/// use Instruction::{Apply, Channel, Multiply};
+/// let drag = Expression::new(vec![Channel(0), Apply(Function::Abs), Channel(0), Multiply], 1)?;
+/// let mut values = Values::default();
+/// assert_eq!(drag.evaluate(&[-2.0], &mut values), -4.0);
+/// assert_eq!(values.slopes(), [4.0]);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub struct Expression {
+    program: Vec<Instruction>,
+    channels: usize,
+}
+
+impl Expression {
+    /// Expression of a program over so many channels.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] for a program that lacks a value or leaves several, a channel that does not exist, or a
+    /// number that is not finite.
+    pub fn new(program: Vec<Instruction>, channels: usize) -> Result<Self> {
+        let mut depth = 0_usize;
+        for instruction in &program {
+            let needed = match instruction {
+                Instruction::Constant(_) | Instruction::Channel(_) => 0,
+                Instruction::Add | Instruction::Multiply => 2,
+                Instruction::Negate | Instruction::Power(_) | Instruction::Apply(_) => 1,
+            };
+            match instruction {
+                Instruction::Constant(value) | Instruction::Power(value) if !value.is_finite() => {
+                    return refuse(format!("the number {value}"), "give finite numbers");
+                }
+                Instruction::Channel(channel) if *channel >= channels => {
+                    return refuse(format!("channel {channel} of {channels}"), "number them from 0");
+                }
+                _ if depth < needed => return refuse(format!("{instruction:?} without a value"), "give its arguments"),
+                _ => depth = depth + 1 - needed,
+            }
+        }
+        if depth != 1 {
+            return refuse(format!("{depth} values"), "give a program that leaves one");
+        }
+        Ok(Self { program, channels })
+    }
+
+    /// Number of channels.
+    #[must_use]
+    pub fn channels(&self) -> usize {
+        self.channels
+    }
+
+    /// Value at these values of the channels. Its derivatives are [`Values::slopes`], a function that has no value here
+    /// is [`Values::fault`]; the value is then not finite.
+    pub fn evaluate(&self, channels: &[f64], values: &mut Values) -> f64 {
+        let n = self.channels;
+        values.stack.clear();
+        values.slopes.clear();
+        values.fault = None;
+        for instruction in &self.program {
+            match *instruction {
+                Instruction::Constant(value) => {
+                    values.stack.push(value);
+                    values.slopes.extend(std::iter::repeat_n(0.0, n));
+                }
+                Instruction::Channel(channel) => {
+                    values.stack.push(channels[channel]);
+                    let one = |i| if i == channel { 1.0 } else { 0.0 };
+                    values.slopes.extend((0..n).map(one));
+                }
+                Instruction::Add => values.combine(n, |a, b| (a + b, 1.0, 1.0)),
+                Instruction::Multiply => values.combine(n, |a, b| (a * b, b, a)),
+                Instruction::Negate => values.chain(n, "negation", |x| (-x, -1.0)),
+                Instruction::Power(exponent) => values.chain(n, "power", |x| power(x, exponent)),
+                Instruction::Apply(function) => values.chain(n, function.name(), |x| function.apply(x)),
+            }
+        }
+        values.stack.last().copied().unwrap_or(f64::NAN)
+    }
+}
+
+/// Reusable intermediate values of an evaluation.
+#[derive(Debug, Clone, Default)]
+pub struct Values {
+    stack: Vec<f64>,
+    slopes: Vec<f64>,
+    fault: Option<(&'static str, f64)>,
+}
+
+impl Values {
+    /// Derivatives of the last evaluation with respect to the channels.
+    #[must_use]
+    pub fn slopes(&self) -> &[f64] {
+        &self.slopes
+    }
+
+    /// Function that had no finite value in the last evaluation, and its finite argument.
+    #[must_use]
+    pub fn fault(&self) -> Option<(&'static str, f64)> {
+        self.fault
+    }
+
+    fn chain(&mut self, n: usize, name: &'static str, function: impl Fn(f64) -> (f64, f64)) {
+        let (Some(top), first) = (self.stack.last_mut(), self.slopes.len() - n) else { return };
+        let (value, slope) = function(*top);
+        if !value.is_finite() && top.is_finite() && self.fault.is_none() {
+            self.fault = Some((name, *top));
+        }
+        *top = value;
+        self.slopes[first..].iter_mut().for_each(|s| *s *= slope);
+    }
+
+    fn combine(&mut self, n: usize, function: impl Fn(f64, f64) -> (f64, f64, f64)) {
+        let (Some(b), Some(a)) = (self.stack.pop(), self.stack.last_mut()) else { return };
+        let (value, by_a, by_b) = function(*a, b);
+        *a = value;
+        let split = self.slopes.len() - n;
+        let (head, tail) = self.slopes.split_at_mut(split);
+        head[split - n..].iter_mut().zip(tail.iter()).for_each(|(a, b)| *a = by_a * *a + by_b * b);
+        self.slopes.truncate(split);
+    }
+}
+
+/// Signal that is an expression over channels: signals and derivatives of them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DerivedSignal {
+    /// The expression over the channels.
+    pub expression: Expression,
+    /// Signal and order of the derivative of each channel.
+    pub channels: Vec<(usize, f64)>,
+}
+
+impl DerivedSignal {
+    /// Signal that is an expression over these channels.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] for other channels than the expression has, or an order that is negative or above 10.
+    pub fn new(expression: Expression, channels: Vec<(usize, f64)>) -> Result<Self> {
+        if expression.channels() != channels.len() {
+            return refuse(format!("{} channels for {}", channels.len(), expression.channels()), "give all of them");
+        }
+        if let Some((_, order)) = channels.iter().find(|(_, order)| !(0.0..=MAX_ORDER).contains(order)) {
+            return refuse(format!("a derivative of order {order}"), "give an order from 0 to 10");
+        }
+        Ok(Self { expression, channels })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Instruction::{Add, Apply, Channel, Constant, Multiply, Negate, Power};
+    use super::*;
+
+    #[test]
+    fn values_and_derivatives_are_those_of_differences() -> Result<()> {
+        let product = vec![Channel(0), Power(3.0), Channel(1), Multiply, Constant(2.0), Add];
+        let nested =
+            [Channel(0), Apply(Function::Sin), Channel(1), Apply(Function::Exp), Multiply, Apply(Function::Tanh)];
+        let roots = [Channel(0), Apply(Function::Abs), Power(1.5), Negate, Channel(1), Apply(Function::Sqrt), Add];
+        let cosine = [Channel(0), Apply(Function::Cos), Channel(0), Apply(Function::Abs), Multiply, Power(-2.0)];
+        let mut values = Values::default();
+        for program in [product, nested.to_vec(), roots.to_vec(), cosine.to_vec()] {
+            let expression = Expression::new(program, 2)?;
+            for at in [[0.7, 0.4], [-1.3, 2.0]] {
+                let value = expression.evaluate(&at, &mut values);
+                let slopes = values.slopes().to_vec();
+                assert!(value.is_finite() && slopes.len() == 2 && values.fault().is_none());
+                for (i, slope) in slopes.iter().enumerate() {
+                    let mut side = |by: f64| {
+                        let mut near = at;
+                        near[i] += by;
+                        expression.evaluate(&near, &mut Values::default())
+                    };
+                    let difference = (side(1e-6) - side(-1e-6)) / 2e-6;
+                    assert!((slope - difference).abs() < 1e-8 * (1.0 + slope.abs()), "{slope} {difference}");
+                }
+            }
+        }
+        Ok(())
+    }
+
+    #[test]
+    fn faults_name_the_function_and_its_argument() -> Result<()> {
+        let mut values = Values::default();
+        let root = Expression::new(vec![Channel(0), Apply(Function::Sqrt)], 1)?;
+        assert!(root.evaluate(&[-0.5], &mut values).is_nan());
+        assert_eq!(values.fault(), Some(("sqrt", -0.5)));
+        let cube = Expression::new(vec![Channel(0), Power(3.0)], 1)?;
+        assert!(cube.evaluate(&[1e200], &mut values).is_infinite());
+        assert_eq!(values.fault(), Some(("power", 1e200)));
+        Ok(())
+    }
+
+    #[test]
+    fn programs_that_are_no_expression_are_refused() {
+        for program in
+            [vec![], vec![Add], vec![Channel(0), Channel(0)], vec![Channel(1)], vec![Constant(f64::NAN)], vec![Negate]]
+        {
+            assert!(Expression::new(program, 1).is_err());
+        }
+        assert!(Instruction::parse("log", 0.0).is_err() && Instruction::parse("channel", 0.5).is_err());
+        assert_eq!(Instruction::parse("tanh", 0.0), Ok(Apply(Function::Tanh)));
+    }
+}

@@ -1,0 +1,735 @@
+//! Free run of equations with non-linear terms, pulse by pulse, and its sensitivities.
+//!
+//! A state channel is D^ρ of an output that enters an expression; the outputs themselves are the first. Its pulse means
+//! are z = L + Σ κ_η ∗ (w x): L from inputs and initial terms, κ_η the kernels of I^η, x the channels in linear terms and
+//! the values of the expressions. The terms of the outputs are not inverted, so that no kernel grows exponentially and
+//! an unstable linear part loses no digits. The mean of a pulse enters its own equation; Newton iterations that start
+//! at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
+
+use super::forcing::{channel_powers, Link};
+use crate::equation::{Equation, ORDER_GRAIN};
+use crate::error::{Error, Result};
+use crate::expression::{DerivedSignal, Values};
+use crate::fractional::kernels::{kernel, kernel_and_slope, MAX_EXCESS};
+use crate::friction::convolution::{product, Heads, OnlineConvolution};
+use crate::friction::initial_state::means_of;
+use crate::linalg::small;
+use crate::regressors::Record;
+use crate::series::{Buffers, Kernel};
+
+/// Smallest integration order of a linear term of the equation's own output, and of a term with an input.
+const MIN_INTEGRATION_ORDER: f64 = 1e-3;
+/// Newton iterations of a pulse. Three are usual.
+const MAX_NEWTON_ITERATIONS: usize = 50;
+/// Halvings of a Newton step that does not reduce the residual.
+const MAX_STEP_HALVINGS: usize = 12;
+/// Newton step, relative to the channel, that ends the iteration. Convergence is quadratic, so the next one is below
+/// rounding, and the linearization before it is that of the solution to this relative error.
+const NEWTON_TOLERANCE: f64 = 1e-8;
+
+/// Equations with non-linear terms at known orders and coefficients.
+///
+/// The signals from `recorded` on are derived signals.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NonlinearSystem {
+    /// D^α y = Σ c D^ν s over recorded and derived signals.
+    pub equations: Vec<Equation>,
+    /// Expressions of the derived signals.
+    pub derived: Vec<DerivedSignal>,
+    /// Number of recorded signals.
+    pub recorded: usize,
+    /// Whether outputs enter other equations as simulated, not as measured.
+    pub coupled: bool,
+}
+
+/// Channel of an expression: a state channel, or a known signal or derivative.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Place {
+    State(usize),
+    Known(usize),
+}
+
+/// Non-linear term of an equation.
+struct NonlinearTerm {
+    equation: usize,
+    term: usize,
+    signal: usize,
+    places: Vec<Place>,
+}
+
+/// Contribution of a source to a state channel through a kernel: term k of equation i.
+#[derive(Debug, Clone, Copy)]
+struct Contribution {
+    source: usize,
+    at: (usize, usize),
+    weight: f64,
+}
+
+/// Contributions to one state channel through one kernel: one online convolution.
+struct Lane {
+    state: usize,
+    kernel: usize,
+    contributions: Vec<Contribution>,
+}
+
+/// Contribution of an input to a state channel.
+struct InputLane {
+    state: usize,
+    kernel: usize,
+    at: (usize, usize),
+    signal: usize,
+}
+
+/// Derivatives of a system with respect to one parameter.
+pub(super) struct Moves {
+    /// Derivatives of coefficient and integration order of each term of each equation.
+    pub(super) terms: Vec<Vec<(f64, f64)>>,
+    /// Derivatives of the state channels' forcing by initial terms; empty if zero.
+    pub(super) forcing: Vec<Vec<f64>>,
+    /// Derivatives of recorded signals that are inputs.
+    pub(super) inputs: Vec<(usize, Vec<f64>)>,
+}
+
+/// Operators of a system on a record.
+pub(super) struct Operators {
+    m: usize,
+    step: f64,
+    outputs: usize,
+    /// Equation and order of each state channel.
+    states: Vec<(usize, f64)>,
+    /// Signal and order of each known channel, and its means.
+    known: Vec<((usize, f64), Vec<f64>)>,
+    terms: Vec<NonlinearTerm>,
+    /// Integration order, kernel and heads of each kernel.
+    orders: Vec<f64>,
+    kernels: Vec<Heads>,
+    lanes: Vec<Lane>,
+    inputs: Vec<InputLane>,
+    /// Weight of each source in each state channel within a pulse, row by row.
+    gains: Vec<f64>,
+    /// Whether an expression acts on its own channel without integration.
+    algebraic: bool,
+}
+
+/// Free run with the linearization of every pulse.
+pub(super) struct FreeRun {
+    /// Means of the state channels, then those of the non-linear terms.
+    pub(super) sources: Vec<Vec<f64>>,
+    /// Derivatives of the non-linear terms with respect to state channels, then to known channels, pulse after pulse.
+    slopes: Vec<f64>,
+    /// Inverse of the linearized equations of each pulse.
+    inverses: Vec<f64>,
+}
+
+/// Pulse at which a free run ends, and why.
+pub(super) struct End {
+    pub(super) index: usize,
+    pub(super) why: String,
+    pub(super) is_overflow: bool,
+}
+
+impl End {
+    pub(super) fn error(self, step: f64) -> Error {
+        #[allow(clippy::cast_precision_loss)]
+        let time = (self.index as f64 + 0.5) * step;
+        if self.is_overflow {
+            Error::Diverged { what: format!("free run (at {time:.4} s)"), index: self.index }
+        } else {
+            Error::NoSolution { time, index: self.index, why: self.why }
+        }
+    }
+}
+
+impl NonlinearSystem {
+    /// Index of the simulated output that a signal of equation i is; None for an input.
+    pub(crate) fn output_index(&self, i: usize, signal: usize) -> Option<usize> {
+        if self.coupled {
+            self.equations.iter().position(|e| e.structure.output == signal)
+        } else {
+            (signal == self.equations[i].structure.output).then_some(i)
+        }
+    }
+
+    /// Return an error for signals that do not exist and for coefficients or orders that no equation has.
+    ///
+    /// # Errors
+    /// [`Error::Structure`], [`Error::OutOfRange`]; as [`Equation::check`].
+    pub fn check(&self) -> Result<()> {
+        let signals = self.recorded + self.derived.len();
+        let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+        for equation in &self.equations {
+            equation.check(signals)?;
+            if equation.structure.output >= self.recorded {
+                return refuse("a derived signal as output of an equation".into(), "simulate recorded signals only");
+            }
+        }
+        match self.derived.iter().flat_map(|d| &d.channels).find(|(signal, _)| *signal >= self.recorded) {
+            None => Ok(()),
+            Some((signal, _)) => refuse(format!("signal {signal} of {} in an expression", self.recorded), "record it"),
+        }
+    }
+
+    /// Terms of each equation with a simulated output as signal.
+    pub(super) fn links(&self) -> Vec<Vec<Link>> {
+        let of = |(i, Equation { structure, coefficients }): (usize, &Equation)| {
+            (structure.terms.iter().zip(coefficients))
+                .filter_map(|(term, &coefficient)| {
+                    let (order, integration) = (term.order, structure.order - term.order);
+                    self.output_index(i, term.signal).map(|output| Link { output, order, integration, coefficient })
+                })
+                .collect()
+        };
+        self.equations.iter().enumerate().map(of).collect()
+    }
+
+    /// State channels: the outputs, then the derivatives that expressions and coupled terms need.
+    fn state_channels(&self) -> Vec<(usize, f64)> {
+        let mut states: Vec<(usize, f64)> = (0..self.equations.len()).map(|i| (i, 0.0)).collect();
+        let add = |states: &mut Vec<(usize, f64)>, equation: usize, order: f64| {
+            if !states.iter().any(|s| s.0 == equation && (s.1 - order).abs() < ORDER_GRAIN) {
+                states.push((equation, order));
+            }
+        };
+        for (i, equation) in self.equations.iter().enumerate() {
+            for term in equation.structure.terms.iter().filter(|term| term.signal >= self.recorded) {
+                for &(signal, order) in &self.derived[term.signal - self.recorded].channels {
+                    if let Some(j) = self.output_index(i, signal) {
+                        add(&mut states, j, order);
+                    }
+                }
+            }
+        }
+        // A derivative of an output has terms with the same derivative of the outputs coupled to it.
+        let mut done = 0;
+        while done < states.len() {
+            let (j, order) = states[done];
+            for term in &self.equations[j].structure.terms {
+                if let Some(l) = self.output_index(j, term.signal) {
+                    add(&mut states, l, order);
+                }
+            }
+            done += 1;
+        }
+        states
+    }
+}
+
+/// Error for non-linear terms beside something else.
+pub(crate) fn refuse_beside(what: &str, remedy: &str) -> Error {
+    Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
+}
+
+/// Index of an order in a list, which it joins if it is new.
+fn kernel_index(orders: &mut Vec<f64>, eta: f64) -> usize {
+    orders.iter().position(|known| (known - eta).abs() < ORDER_GRAIN).unwrap_or_else(|| {
+        orders.push(eta);
+        orders.len() - 1
+    })
+}
+
+impl Operators {
+    pub(super) fn new(system: &NonlinearSystem, record: &Record) -> Result<Self> {
+        let (m, step, states) = (record.m(), record.step(), system.state_channels());
+        let find = |equation: usize, order: f64| {
+            states.iter().position(|s| s.0 == equation && (s.1 - order).abs() < ORDER_GRAIN)
+        };
+        let mut known: Vec<((usize, f64), Vec<f64>)> = Vec::new();
+        let mut terms: Vec<NonlinearTerm> = Vec::new();
+        for (i, equation) in system.equations.iter().enumerate() {
+            for (k, term) in equation.structure.terms.iter().enumerate().filter(|(_, t)| t.signal >= system.recorded) {
+                let signal = term.signal - system.recorded;
+                let mut places = Vec::new();
+                for &(signal, order) in &system.derived[signal].channels {
+                    let state = system.output_index(i, signal).and_then(|j| find(j, order));
+                    places.push(match state {
+                        Some(state) => Place::State(state),
+                        None => Place::Known(known_index(&mut known, (signal, order), record)?),
+                    });
+                }
+                terms.push(NonlinearTerm { equation: i, term: k, signal, places });
+            }
+        }
+        // Same error as for a step that is too long, so that an optimizer shortens it.
+        let beyond = || Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 };
+        let (mut orders, mut lanes, mut inputs) = (Vec::new(), Vec::<Lane>::new(), Vec::new());
+        let mut algebraic = false;
+        for (state, &(j, rho)) in states.iter().enumerate() {
+            let Equation { structure, coefficients } = &system.equations[j];
+            for (k, (term, &weight)) in structure.terms.iter().zip(coefficients).enumerate() {
+                let eta = structure.order - term.order;
+                let (source, eta) = if let Some(l) = system.output_index(j, term.signal) {
+                    if eta < if l == j { MIN_INTEGRATION_ORDER } else { MIN_INTEGRATION_ORDER - MAX_EXCESS } {
+                        return Err(beyond());
+                    }
+                    (find(l, rho), eta)
+                } else if let Some(q) = terms.iter().position(|t| (t.equation, t.term) == (j, k)) {
+                    let driven = terms[q].places.iter().any(|place| matches!(place, Place::Known(_)));
+                    let left = eta - rho;
+                    if left < -ORDER_GRAIN || (driven && eta < MIN_INTEGRATION_ORDER) {
+                        return Err(beyond());
+                    }
+                    algebraic |=
+                        left < MIN_INTEGRATION_ORDER && !terms[q].places.iter().all(|p| matches!(p, Place::Known(_)));
+                    (Some(states.len() + q), left.max(0.0))
+                } else {
+                    let left = eta - rho;
+                    if left < -ORDER_GRAIN || eta < MIN_INTEGRATION_ORDER {
+                        return Err(beyond());
+                    }
+                    let kernel = kernel_index(&mut orders, left.max(0.0));
+                    inputs.push(InputLane { state, kernel, at: (j, k), signal: term.signal });
+                    continue;
+                };
+                let Some(source) = source else { continue };
+                let kernel = kernel_index(&mut orders, eta);
+                let contribution = Contribution { source, at: (j, k), weight };
+                match lanes.iter_mut().find(|lane| lane.state == state && lane.kernel == kernel) {
+                    Some(lane) => lane.contributions.push(contribution),
+                    None => lanes.push(Lane { state, kernel, contributions: vec![contribution] }),
+                }
+            }
+        }
+        let kernels: Vec<Heads> = orders.iter().map(|&eta| Heads::new(&kernel(eta, m, step))).collect();
+        let count = states.len() + terms.len();
+        let mut gains = vec![0.0; states.len() * count];
+        for lane in &lanes {
+            let first = kernels[lane.kernel].kernel().first().copied().unwrap_or(0.0);
+            for part in &lane.contributions {
+                gains[lane.state * count + part.source] += first * part.weight;
+            }
+        }
+        let outputs = system.equations.len();
+        Ok(Self { m, step, outputs, states, known, terms, orders, kernels, lanes, inputs, gains, algebraic })
+    }
+
+    fn sources(&self) -> usize {
+        self.states.len() + self.terms.len()
+    }
+
+    /// Forcing of the state channels by initial terms, (exponent, coefficient) by equation.
+    pub(super) fn initial_forcing(&self, links: &[Vec<Link>], powers: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
+        let mut out = vec![vec![0.0; self.m]; self.states.len()];
+        for (row, &(equation, order)) in out.iter_mut().zip(&self.states) {
+            for (exponent, value) in channel_powers(equation, order, links, powers)? {
+                let means = means_of(exponent, self.m, self.step);
+                row.iter_mut().zip(means).for_each(|(sum, v)| *sum += value * v);
+            }
+        }
+        Ok(out)
+    }
+
+    /// Add the inputs to the forcing of the state channels.
+    pub(super) fn add_inputs(&self, system: &NonlinearSystem, record: &Record, forcing: &mut [Vec<f64>]) {
+        for (signal, lanes) in self.inputs_by_signal() {
+            let spectrum = Kernel::new(record.signal(signal));
+            for lane in lanes {
+                let weight = system.equations[lane.at.0].coefficients[lane.at.1];
+                let part = product(&spectrum, self.kernels[lane.kernel].kernel());
+                forcing[lane.state].iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
+            }
+        }
+    }
+
+    fn inputs_by_signal(&self) -> Vec<(usize, Vec<&InputLane>)> {
+        let mut out: Vec<(usize, Vec<&InputLane>)> = Vec::new();
+        for lane in &self.inputs {
+            match out.iter_mut().find(|(signal, _)| *signal == lane.signal) {
+                Some((_, lanes)) => lanes.push(lane),
+                None => out.push((lane.signal, vec![lane])),
+            }
+        }
+        out
+    }
+
+    /// Free run under a forcing of the state channels, or where and why it ends.
+    ///
+    /// Of a run that ends, the outputs so far are returned, too.
+    pub(super) fn run(&self, system: &NonlinearSystem, forcing: &[Vec<f64>]) -> (FreeRun, Option<End>) {
+        let (states, count) = (self.states.len(), self.sources());
+        let width = states + self.known.len();
+        let mut run = FreeRun {
+            sources: vec![Vec::with_capacity(self.m); count],
+            slopes: Vec::with_capacity(self.m * self.terms.len() * width),
+            inverses: Vec::with_capacity(self.m * states * states),
+        };
+        let mut lanes: Vec<OnlineConvolution<'_>> =
+            self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
+        let mut pulse = Pulse::new(self, system);
+        let mut sign = None;
+        for k in 0..self.m {
+            pulse.free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
+            for (lane, convolution) in self.lanes.iter().zip(&lanes) {
+                pulse.free[lane.state] += convolution.past();
+            }
+            pulse.predict(&run.sources);
+            pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
+            if let Err(failure) = pulse.solve() {
+                let (why, is_overflow) = match failure {
+                    Failure::Overflow => (String::new(), true),
+                    Failure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
+                    // Integrals of short pulses are small, so that only growth within a pulse has no solution.
+                    Failure::Newton(why) => (why.into(), !self.algebraic),
+                };
+                return (run, Some(End { index: k, why, is_overflow }));
+            }
+            let positive = pulse.determinant > 0.0;
+            if *sign.get_or_insert(positive) != positive {
+                let why = "its solutions meet and vanish".into();
+                return (run, Some(End { index: k, why, is_overflow: !self.algebraic }));
+            }
+            let values = pulse.z.iter().chain(&pulse.values);
+            run.sources.iter_mut().zip(values).for_each(|(row, v)| row.push(*v));
+            run.slopes.extend_from_slice(&pulse.slopes);
+            run.inverses.extend_from_slice(&pulse.inverse);
+            for (lane, convolution) in self.lanes.iter().zip(&mut lanes) {
+                let of = |part: &Contribution| part.weight * pulse.source(part.source);
+                convolution.push(lane.contributions.iter().map(of).sum());
+            }
+        }
+        (run, None)
+    }
+}
+
+/// Index of a known channel, which is computed if it is new.
+fn known_index(known: &mut Vec<((usize, f64), Vec<f64>)>, channel: (usize, f64), record: &Record) -> Result<usize> {
+    if let Some(at) = known.iter().position(|(of, _)| *of == channel) {
+        return Ok(at);
+    }
+    known.push((channel, derivative(record.signal(channel.0), channel.1, record.step())?));
+    Ok(known.len() - 1)
+}
+
+/// Means of a derivative of known means.
+fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
+    if order < ORDER_GRAIN {
+        return Ok(means.to_vec());
+    }
+    if order > MAX_EXCESS {
+        return Err(Error::OutOfRange {
+            name: "order of a derivative of an input in a non-linear term".into(),
+            value: order,
+            range: format!("[0, {MAX_EXCESS}]"),
+            remedy: "record the derivative".into(),
+        });
+    }
+    Ok(product(&Kernel::new(means), &kernel(-order, means.len(), step)))
+}
+
+/// Newton iterations of one pulse.
+struct Pulse<'a> {
+    operators: &'a Operators,
+    system: &'a NonlinearSystem,
+    free: Vec<f64>,
+    known: Vec<f64>,
+    z: Vec<f64>,
+    /// Non-linear terms at z and their derivatives with respect to state channels, then to known channels.
+    values: Vec<f64>,
+    slopes: Vec<f64>,
+    inverse: Vec<f64>,
+    determinant: f64,
+    residual: Vec<f64>,
+    matrix: Vec<f64>,
+    step: Vec<f64>,
+    before: Vec<f64>,
+    fault: Option<(&'static str, f64)>,
+    arguments: Vec<f64>,
+    work: Values,
+}
+
+impl<'a> Pulse<'a> {
+    fn new(operators: &'a Operators, system: &'a NonlinearSystem) -> Self {
+        let (states, terms, known) = (operators.states.len(), operators.terms.len(), operators.known.len());
+        Self {
+            operators,
+            system,
+            free: vec![0.0; states],
+            known: vec![0.0; known],
+            z: vec![0.0; states],
+            values: vec![0.0; terms],
+            slopes: vec![0.0; terms * (states + known)],
+            inverse: vec![0.0; states * states],
+            determinant: 1.0,
+            residual: vec![0.0; states],
+            matrix: vec![0.0; states * states],
+            step: vec![0.0; states],
+            before: vec![0.0; states],
+            fault: None,
+            arguments: Vec::new(),
+            work: Values::default(),
+        }
+    }
+
+    fn source(&self, index: usize) -> f64 {
+        self.z.get(index).copied().unwrap_or_else(|| self.values[index - self.z.len()])
+    }
+
+    /// Evaluate terms, derivatives and residual at z; return the norm of the residual.
+    fn evaluate(&mut self) -> f64 {
+        let (states, width) = (self.z.len(), self.z.len() + self.known.len());
+        self.slopes.fill(0.0);
+        self.fault = None;
+        for (q, term) in self.operators.terms.iter().enumerate() {
+            self.arguments.clear();
+            let value = |place: &Place| match *place {
+                Place::State(state) => self.z[state],
+                Place::Known(known) => self.known[known],
+            };
+            self.arguments.extend(term.places.iter().map(value));
+            self.values[q] = self.system.derived[term.signal].expression.evaluate(&self.arguments, &mut self.work);
+            self.fault = self.fault.or(self.work.fault());
+            for (place, slope) in term.places.iter().zip(self.work.slopes()) {
+                let at = match *place {
+                    Place::State(state) => state,
+                    Place::Known(known) => states + known,
+                };
+                self.slopes[q * width + at] += slope;
+            }
+        }
+        let count = self.operators.sources();
+        let mut norm: f64 = 0.0;
+        for a in 0..states {
+            let gains = &self.operators.gains[a * count..(a + 1) * count];
+            let own: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
+            self.residual[a] = self.z[a] - self.free[a] - own;
+            norm = norm.hypot(self.residual[a]);
+        }
+        norm
+    }
+
+    /// Set z to where the last two pulses lead.
+    fn predict(&mut self, sources: &[Vec<f64>]) {
+        for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
+            *z = match row.as_slice() {
+                [.., before, last] => 2.0 * last - before,
+                [last] => *last,
+                [] => *free,
+            };
+        }
+    }
+
+    /// Invert the linearized equations; false if they are singular or not finite.
+    fn linearize(&mut self) -> bool {
+        let (states, count, width) = (self.z.len(), self.operators.sources(), self.z.len() + self.known.len());
+        for a in 0..states {
+            let gains = &self.operators.gains[a * count..(a + 1) * count];
+            for b in 0..states {
+                let through: f64 =
+                    gains[states..].iter().enumerate().map(|(q, g)| g * self.slopes[q * width + b]).sum();
+                self.matrix[a * states + b] = f64::from(u8::from(a == b)) - gains[b] - through;
+            }
+        }
+        if let [a] = self.matrix[..] {
+            (self.determinant, self.inverse[0]) = (a, 1.0 / a);
+            return a != 0.0 && self.inverse[0].is_finite();
+        }
+        let Some((inverse, determinant)) = small::inverse_with_determinant(&self.matrix, states) else { return false };
+        (self.inverse, self.determinant) = (inverse, determinant);
+        true
+    }
+
+    /// Solve the pulse from the current z.
+    fn solve(&mut self) -> std::result::Result<(), Failure> {
+        let states = self.z.len();
+        let mut norm = self.evaluate();
+        if !norm.is_finite() && self.free.iter().all(|v| v.is_finite()) {
+            // The last pulses may lead beyond what the expressions allow with the present inputs.
+            self.z.clone_from(&self.free);
+            norm = self.evaluate();
+        }
+        for _ in 0..MAX_NEWTON_ITERATIONS {
+            if !norm.is_finite() {
+                return Err(self.describe_fault());
+            }
+            if !self.linearize() {
+                return Err(Failure::Newton("its linearization is singular"));
+            }
+            let mut is_small = true;
+            for a in 0..states {
+                let row = &self.inverse[a * states..(a + 1) * states];
+                self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
+                is_small &= self.step[a].abs() <= NEWTON_TOLERANCE * (self.z[a].abs() + self.free[a].abs());
+            }
+            self.before.clone_from(&self.z);
+            let (mut share, mut left) = (1.0, MAX_STEP_HALVINGS);
+            loop {
+                let steps = self.before.iter().zip(&self.step);
+                self.z.iter_mut().zip(steps).for_each(|(z, (from, d))| *z = from - share * d);
+                let there = self.evaluate();
+                if there.is_finite() && (there <= norm || is_small) {
+                    norm = there;
+                    break;
+                }
+                if left == 0 {
+                    return Err(if there.is_finite() { NO_DESCENT } else { self.describe_fault() });
+                }
+                (share, left) = (0.5 * share, left - 1);
+            }
+            if is_small {
+                return Ok(());
+            }
+        }
+        Err(NO_DESCENT)
+    }
+
+    fn describe_fault(&self) -> Failure {
+        match self.fault {
+            Some((name, argument)) if argument.abs() < OVERFLOW_SIZE => Failure::Domain(name, argument),
+            _ => Failure::Overflow,
+        }
+    }
+}
+
+/// Why a pulse has no solution.
+enum Failure {
+    /// A value left the range of numbers.
+    Overflow,
+    /// A function has no value for this argument.
+    Domain(&'static str, f64),
+    /// No Newton iteration converges.
+    Newton(&'static str),
+}
+
+/// Size beyond which a value without a result is an overflow, not outside of a function's domain.
+const OVERFLOW_SIZE: f64 = 1e60;
+const NO_DESCENT: Failure = Failure::Newton("no Newton step reduces its residual");
+
+/// Products of sources with kernels and with their derivatives, computed when first needed.
+pub(super) struct FrozenProducts<'a> {
+    operators: &'a Operators,
+    run: &'a FreeRun,
+    spectra: Vec<Option<Kernel>>,
+    slopes: Vec<Option<Vec<f64>>>,
+    found: std::collections::BTreeMap<(usize, usize, bool), Vec<f64>>,
+}
+
+impl<'a> FrozenProducts<'a> {
+    pub(super) fn new(operators: &'a Operators, run: &'a FreeRun) -> Self {
+        let spectra = (0..operators.sources()).map(|_| None).collect();
+        let slopes = vec![None; operators.orders.len()];
+        Self { operators, run, spectra, slopes, found: std::collections::BTreeMap::new() }
+    }
+
+    /// Derivative of a kernel with respect to its order.
+    fn kernel_slope(&mut self, kernel: usize) -> &[f64] {
+        let Operators { m, step, ref orders, .. } = *self.operators;
+        self.slopes[kernel].get_or_insert_with(|| kernel_and_slope(orders[kernel], m, step).1)
+    }
+
+    fn of(&mut self, kernel: usize, source: usize, is_slope: bool) -> &[f64] {
+        let key = (kernel, source, is_slope);
+        if !self.found.contains_key(&key) {
+            if self.spectra[source].is_none() {
+                self.spectra[source] = Some(Kernel::new(&self.run.sources[source]));
+            }
+            if is_slope {
+                self.kernel_slope(kernel);
+            }
+            let series = match &self.slopes[kernel] {
+                Some(slope) if is_slope => slope.as_slice(),
+                _ => self.operators.kernels[kernel].kernel(),
+            };
+            let mut out = vec![0.0; self.operators.m];
+            if let Some(spectrum) = &self.spectra[source] {
+                spectrum.apply(series, &mut out, &mut Buffers::default());
+            }
+            self.found.insert(key, out);
+        }
+        &self.found[&key]
+    }
+}
+
+impl Operators {
+    /// Derivatives of the outputs' means with respect to one parameter.
+    pub(super) fn sensitivity(
+        &self,
+        system: &NonlinearSystem,
+        record: &Record,
+        run: &FreeRun,
+        frozen: &mut FrozenProducts<'_>,
+        moves: &Moves,
+    ) -> Result<Vec<Vec<f64>>> {
+        let states = self.states.len();
+        let mut forcing = moves.forcing.clone();
+        forcing.resize(states, vec![0.0; self.m]);
+        let add = |row: &mut Vec<f64>, weight: f64, part: &[f64]| {
+            row.iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
+        };
+        for lane in &self.lanes {
+            for part in &lane.contributions {
+                let (coefficient, order) = moves.terms[part.at.0][part.at.1];
+                if coefficient != 0.0 {
+                    add(&mut forcing[lane.state], coefficient, frozen.of(lane.kernel, part.source, false));
+                }
+                if order != 0.0 && part.weight != 0.0 {
+                    add(&mut forcing[lane.state], order * part.weight, frozen.of(lane.kernel, part.source, true));
+                }
+            }
+        }
+        for (signal, lanes) in self.inputs_by_signal() {
+            let moved = moves.inputs.iter().find(|(of, _)| *of == signal).map(|(_, slope)| Kernel::new(slope));
+            let mut spectrum = None;
+            for lane in lanes {
+                let (coefficient, order) = moves.terms[lane.at.0][lane.at.1];
+                let weight = system.equations[lane.at.0].coefficients[lane.at.1];
+                if coefficient != 0.0 || order != 0.0 {
+                    let spectrum = spectrum.get_or_insert_with(|| Kernel::new(record.signal(signal)));
+                    if coefficient != 0.0 {
+                        let part = product(spectrum, self.kernels[lane.kernel].kernel());
+                        add(&mut forcing[lane.state], coefficient, &part);
+                    }
+                    if order != 0.0 {
+                        let part = product(spectrum, frozen.kernel_slope(lane.kernel));
+                        add(&mut forcing[lane.state], order * weight, &part);
+                    }
+                }
+                if let Some(moved) = &moved {
+                    add(&mut forcing[lane.state], weight, &product(moved, self.kernels[lane.kernel].kernel()));
+                }
+            }
+        }
+        let mut known = Vec::new();
+        for (at, ((signal, order), _)) in self.known.iter().enumerate() {
+            if let Some((_, slope)) = moves.inputs.iter().find(|(of, _)| of == signal) {
+                known.push((at, derivative(slope, *order, self.step)?));
+            }
+        }
+        Ok(self.linear_run(run, &forcing, &known))
+    }
+
+    /// Run of the linearized equations under a forcing, with these changes of known channels.
+    fn linear_run(&self, run: &FreeRun, forcing: &[Vec<f64>], known: &[(usize, Vec<f64>)]) -> Vec<Vec<f64>> {
+        let (states, terms, count) = (self.states.len(), self.terms.len(), self.sources());
+        let width = states + self.known.len();
+        let mut out = vec![Vec::with_capacity(self.m); self.outputs];
+        let mut lanes: Vec<OnlineConvolution<'_>> =
+            self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
+        let (mut free, mut x) = (vec![0.0; states], vec![0.0; count]);
+        for k in 0..self.m {
+            free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
+            for (lane, convolution) in self.lanes.iter().zip(&lanes) {
+                free[lane.state] += convolution.past();
+            }
+            let slopes = &run.slopes[k * terms * width..(k + 1) * terms * width];
+            let inverse = &run.inverses[k * states * states..(k + 1) * states * states];
+            for q in 0..terms {
+                x[states + q] = known.iter().map(|(at, means)| slopes[q * width + states + at] * means[k]).sum();
+            }
+            if !known.is_empty() {
+                for (free, gains) in free.iter_mut().zip(self.gains.chunks(count)) {
+                    *free += gains[states..].iter().zip(&x[states..]).map(|(g, v)| g * v).sum::<f64>();
+                }
+            }
+            for a in 0..states {
+                x[a] = (0..states).map(|b| inverse[a * states + b] * free[b]).sum();
+            }
+            for q in 0..terms {
+                x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();
+            }
+            out.iter_mut().zip(&x).for_each(|(row, v)| row.push(*v));
+            for (lane, convolution) in self.lanes.iter().zip(&mut lanes) {
+                convolution.push(lane.contributions.iter().map(|part| part.weight * x[part.source]).sum());
+            }
+        }
+        out
+    }
+}
