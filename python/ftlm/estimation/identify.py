@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -40,6 +40,7 @@ from ftlm.estimation.nuisance_parameters import (
     fit_score,
     fit_without_history,
     offset_test,
+    output_sensitivities,
     unrequested_offset_findings,
 )
 from ftlm.estimation.output_error import parameter_set
@@ -57,7 +58,7 @@ from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import run_in_worker
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
-from ftlm.utils.validation import check_threads
+from ftlm.utils.validation import Floats, check_threads
 from ftlm.validation.comparison import (
     MAX_NORMALIZED_RESIDUAL,
     Comparison,
@@ -323,7 +324,7 @@ def assess_fit(fit: Fit) -> Identification:
     )
     tests, criteria = None, None
     try:
-        tests = run_residual_tests(model, runs, free, lags=DEFAULT_LAGS)
+        tests = run_residual_tests(model, runs, free, lags=DEFAULT_LAGS, sensitivities=_sensitivities(fit))
         criteria = information_criteria(tests, fit.parameters)
     except DataError:
         # A run that is too short for correlations; everything else can be told.
@@ -362,6 +363,15 @@ def assess_fit(fit: Fit) -> Identification:
     if not against:
         return result
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
+
+
+def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
+    """Return what computes the sensitivities of a joint fit of a linear structure, or None."""
+    joint, structure = fit.joint, fit.task.structure
+    if joint is None or structure.has_friction:
+        return None
+    asked = replace(structure, initial=joint.initial)
+    return lambda: output_sensitivities(fit.task.runs, asked, joint.values_by_name, max(joint.refinement, 1))
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:

@@ -181,6 +181,21 @@ def offset_test(
     return OffsetTest(statistic, count, float(along @ along) / total, size)
 
 
+def output_sensitivities(
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
+) -> dict[str, list[Floats]]:
+    """Return the sensitivities of each output's residuals, per run with shape (parameters, samples); {} if not finite.
+
+    Initial terms are projected out of them.
+    """
+    try:
+        grid, here = evaluate_at_point(runs, structure, values, every)
+    except FtlmError:
+        return {}
+    rows, blocks = np.asarray(here.outcome["jacobian"]), _residual_blocks(grid)
+    return {name: [rows[:, slice(*own[k])] for own in blocks] for k, name in enumerate(grid.problem.structure.outputs)}
+
+
 def without_offset_equivalents(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
     """Return Caputo's initial terms without powers of t that act like an offset; others unchanged."""
     if initial != "caputo":

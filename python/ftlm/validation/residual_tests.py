@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any
@@ -23,7 +23,7 @@ from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, symbol_html
-from ftlm.utils.linalg import dot
+from ftlm.utils.linalg import dot, minimum_norm_solution
 from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
     NORMAL_99,
@@ -42,6 +42,8 @@ from ftlm.validation.feedback import FeedbackTest, feedback_test
 ORDER_TOLERANCE = 1e-9
 #: Ratio of residual RMS to the output's standard deviation below which discretization or quantization explains it.
 NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
+#: Singular values of sensitivities, relative to the largest, below which they are rounding.
+DIRECTION_RANK = 1e-10
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,11 @@ class OutputResiduals:
     def feedback(self) -> tuple[str, ...]:
         """Inputs with feedback from this output: the runs were recorded in a closed loop."""
         return tuple(name for name, test in self.feedback_tests.items() if test.has_feedback)
+
+    @property
+    def fails_colored(self) -> bool:
+        """Whether finite residuals follow an input and are not white."""
+        return math.isfinite(self.rms) and not self.whiteness.passed and any(t.failed for t in self.inputs.values())
 
     @property
     def is_noise(self) -> bool:
@@ -336,8 +343,19 @@ def check_run_lengths(runs: Runs, lags: int) -> None:
             )
 
 
-def run_residual_tests(model: Model, runs: Runs, free: Sequence[OutputSamples], *, lags: int) -> Residuals:
-    """Run both tests on the residuals of simulations at the inner samples of these runs."""
+def run_residual_tests(
+    model: Model,
+    runs: Runs,
+    free: Sequence[OutputSamples],
+    *,
+    lags: int,
+    sensitivities: Callable[[], Mapping[str, list[Floats]]] | None = None,
+) -> Residuals:
+    """Run both tests on the residuals of simulations at the inner samples of these runs.
+
+    ``sensitivities`` returns those of each output to the fitted parameters, per run with shape (parameters, samples).
+    It is called where colored residuals follow an input.
+    """
     check_run_lengths(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
     for run, sampled in zip(runs, free, strict=True):
@@ -360,6 +378,9 @@ def run_residual_tests(model: Model, runs: Runs, free: Sequence[OutputSamples], 
         direct = {s for t in item.terms for s in t.signals if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
         outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
+        if sensitivities is not None and outputs[name].fails_colored:
+            moves = sensitivities().get(name, [])
+            outputs[name] = _test_beyond_parameters(outputs[name], moves, signals, lags, runs[0].inputs)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
@@ -401,6 +422,28 @@ def _test_output(
             later = _independence(series, values, noise, lags, first=1)
             inputs[name] = later if later.passed else inputs[name]
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
+
+
+def _test_beyond_parameters(
+    output: OutputResiduals,
+    sensitivities: Sequence[Floats],
+    signals: Mapping[str, list[Floats]],
+    lags: int,
+    run_inputs: Sequence[str],
+) -> OutputResiduals:
+    """Return the tests with those of inputs that fail by no more than errors of the parameters as passed.
+
+    Least squares do not know the color of the noise, and leave residuals that follow an input as far as the parameters
+    are uncertain. A step of generalized least squares takes that part away.
+    """
+    moving = [signals[n] for n in run_inputs if not is_constant(signals[n])]
+    noise = NoiseModel.fit(output.residuals, moving, lags)
+    beyond = noise.subtract(output.residuals, sensitivities)
+    inputs = dict(output.inputs)
+    for name, test in output.inputs.items():
+        again = _independence(beyond, signals[name], noise, lags, first=test.first) if test.failed else test
+        inputs[name] = again if again.passed else test
+    return replace(output, inputs=inputs)
 
 
 def _failed_test(lags: NDArray[np.int64]) -> CorrelationTest:
@@ -451,6 +494,20 @@ class NoiseModel:
         """Return series after the whitening filter, from the first row of the innovations on."""
         lead = self.start - (self.filter.size - 1)
         return [np.ascontiguousarray(row[lead:]) for row in whiten_series(series, self.filter)]
+
+    def subtract(self, series: list[Floats], directions: Sequence[Floats]) -> list[Floats]:
+        """Return series without their projection onto directions, by generalized least squares.
+
+        ``directions`` has one array for each series, shape (directions, samples); others change nothing.
+        """
+        if [rows.shape[1] for rows in directions] != [e.size for e in series]:
+            return series
+        there = [np.where(np.isnan(e), np.nan, rows) for e, rows in zip(series, directions, strict=True)]
+        columns = [np.concatenate(self.whiten(list(rows))) for rows in zip(*there, strict=True)]
+        if not columns:
+            return series
+        amounts = minimum_norm_solution(np.stack(columns, axis=1), np.concatenate(self.whiten(series)), DIRECTION_RANK)
+        return [e - amounts @ rows for e, rows in zip(series, directions, strict=True)]
 
 
 def _independence(
