@@ -105,7 +105,7 @@ def floors(project):
 
 #: Writes a run of a small model in every format whose library has a floor.
 RUNS = """
-import distributed, h5py, numpy as np, scipy.io, uvicorn, ftlm, ftlm.sklearn
+import distributed, h5py, numpy as np, scipy.io, starlette, uvicorn, ftlm, ftlm.sklearn
 u = np.where(np.arange(401) % 160 < 90, 1.0, -0.6)
 model = ftlm.Model(ftlm.equation("D^1.6 y = -3 D^0.6 y - 8 y + 5 u"))
 run = model.simulate(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u}))

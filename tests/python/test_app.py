@@ -25,9 +25,9 @@ from ftlm.app import server as serve
 from ftlm.app import session as desks
 from ftlm.app import views as view
 from ftlm.app.forms import NAMED_STRUCTURES, FitRequest, RunSource, parse_fields, parse_structures, split_time
-from ftlm.app.server import CLIENT_TIMEOUT_S, WebApplication, make_connection_class
 from ftlm.app.session import Session, safe_name
 from ftlm.app.subprocess_task import Task, TaskError
+from ftlm.app.web_application import CLIENT_TIMEOUT_S, TimedConnection, WebApplication
 from ftlm.cli.main import app
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.utils.resources import python_child
@@ -1033,7 +1033,7 @@ def wired():
     def make():
         config = uvicorn.Config(nobody, lifespan="off", ws="none", timeout_keep_alive=15, log_config=None)
         wire = Wire()
-        connection = make_connection_class()(config, ServerState(), {}, wire)
+        connection = TimedConnection(config, ServerState(), {}, wire)
         connection.connection_made(wire)
         return wire, connection, CLIENT_TIMEOUT_S
 

@@ -1,0 +1,340 @@
+"""Web application of the page on starlette: checks of each request, routes, responses, timeouts of connections."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h11
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.routing import Route, Router
+from starlette.types import Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from ftlm.app import views as view
+from ftlm.app.forms import parse_fields
+from ftlm.app.session import STATE_MADE, File, Model, Session
+from ftlm.errors import FtlmError
+
+Kept = TypeVar("Kept", File, Model)
+Endpoint = Callable[[Request], Awaitable[Response]]
+
+#: Longest body of a request that uploads no file.
+MAX_BODY_BYTES = 64 << 10
+#: Allows only the page's own script, style and server, and no embedding in frames.
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
+)
+#: Reports are sandboxed: their scripts cannot access the application.
+REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'none'"
+SECURITY_HEADERS = {
+    "content-security-policy": CONTENT_SECURITY_POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+    "x-frame-options": "DENY",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+MAX_QUERY_FIELDS = 10
+#: Name and media type of each file of a model; the page is a report that is shown.
+MODEL_FILES = {
+    "report": ("report.html", "text/html"),
+    "page": ("report.html", "text/html"),
+    "model": ("model.json", "application/json"),
+    "script": ("script.py", "text/plain"),
+}
+
+
+def html_response(text: str) -> Response:
+    """Return a page, or a part of it."""
+    return Response(text.encode("utf-8", "replace"), media_type="text/html")
+
+
+def json_response(content: object, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+    """Return an object as JSON."""
+    return Response(json.dumps(content), status, headers, "application/json")
+
+
+async def read_json(request: Request) -> dict[str, Any]:
+    """Return the body of a request as a JSON object."""
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > MAX_BODY_BYTES:
+            raise HTTPException(413, f"the request is longer than {MAX_BODY_BYTES >> 10} kB")
+    try:
+        said = json.loads(body)
+    except (ValueError, RecursionError):
+        raise HTTPException(400, "the request is no JSON") from None
+    if not isinstance(said, dict):
+        raise HTTPException(400, "the request is no JSON object")
+    return said
+
+
+class WebApplication:
+    """ASGI application of the page.
+
+    Parameters
+    ----------
+    desk
+        Session to serve.
+    token
+        Secret part of the address.
+    hosts
+        Accepted host names with ports.
+    key
+        Secret of the one-time address that redirects to the permanent one.
+    """
+
+    def __init__(self, desk: Session, token: str, hosts: tuple[str, ...], key: str = "") -> None:
+        self._desk = desk
+        self._token = token
+        self._hosts = hosts
+        self._key = key
+        self._router = Router(
+            [
+                Route("/", _view(lambda: view.page(desk), "text/html")),
+                Route("/app.js", _view(view.script, "text/javascript")),
+                Route("/app.css", _view(view.style, "text/css")),
+                Route("/state", _view(lambda: json.dumps(view.state(desk)), "application/json")),
+                Route("/comparison", _view(lambda: view.comparison(desk), "text/html")),
+                Route("/check", self._check, methods=["POST"]),
+                Route("/files", self._upload, methods=["POST"]),
+                Route("/files/{key}", self._file, methods=["GET", "POST", "DELETE"]),
+                Route("/models", self._start, methods=["POST"]),
+                Route("/models/{key}", self._model, methods=["GET", "DELETE"]),
+                Route("/models/{key}/stop", self._stop, methods=["POST"]),
+                Route("/models/{key}/resume", self._resume, methods=["POST"]),
+                *(Route(f"/models/{{key}}/{kind}", self._download) for kind in MODEL_FILES),
+            ],
+            redirect_slashes=False,
+        )
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            return
+
+        async def send_secured(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURITY_HEADERS.items():
+                    headers.setdefault(name, value)
+                if message["status"] in (403, 404, 413, 415):
+                    # What is left of a refused body is not waited for.
+                    headers["connection"] = "close"
+            elif scope["method"] == "HEAD":
+                message["body"] = b""
+            await send(message)
+
+        try:
+            path = self._check_head(scope)
+            # The router raises what it refuses if there is an application.
+            await self._router({**scope, "path": path, "app": self}, receive, send_secured)
+            return
+        except HTTPException as refused:
+            answer = json_response({"error": refused.detail}, refused.status_code, refused.headers)
+        except ClientDisconnect:
+            answer = json_response({"error": "the upload was cut off; try again"}, 400)
+        except FtlmError as error:
+            answer = json_response({"error": self._words(error)}, 400)
+        except Exception as error:
+            # The page must be told; a traceback would name folders of this machine.
+            answer = json_response({"error": f"a fault in ftlm itself ({type(error).__name__})"}, 500)
+        await answer(scope, receive, send_secured)
+
+    def _words(self, error: FtlmError) -> str:
+        return view.page_words(self._desk.without_paths(str(error)))
+
+    def _check_head(self, scope: Scope) -> str:
+        """Check the head of a request, and return its path without the token."""
+        headers = Headers(scope=scope)
+        for name in ("host", "origin", "content-length"):
+            if len(headers.getlist(name)) > 1:
+                raise HTTPException(400, f"the header {name} is given twice")
+        if headers.get("host", "").lower() not in self._hosts:
+            raise HTTPException(403, "this page answers to its own address alone")
+        method, origin = scope["method"], headers.get("origin")
+        if origin is not None and origin not in {f"http://{host}" for host in self._hosts}:
+            raise HTTPException(403, "another page asks; this one answers to itself alone")
+        if method not in ("GET", "HEAD") and (
+            origin is None or headers.get("sec-fetch-site", "same-origin") != "same-origin"
+        ):
+            raise HTTPException(403, "only the page itself may change what is on it")
+        first, slash, rest = scope["path"].removeprefix("/").partition("/")
+        if method == "GET" and first == "open" and slash and "/" not in rest:
+            self._redeem_key(rest)
+        if not secrets.compare_digest(first.encode("utf-8", "replace"), self._token.encode()):
+            raise HTTPException(404, "there is nothing here; use the address that ftlm app printed")
+        if scope["query_string"].count(b"&") >= MAX_QUERY_FIELDS:
+            raise HTTPException(400, "the address has too many fields")
+        if not slash and method in ("GET", "HEAD"):
+            raise self._redirection()
+        return f"{slash}{rest}"
+
+    def _redirection(self) -> HTTPException:
+        """Return the redirection to the permanent address."""
+        return HTTPException(303, headers={"location": f"/{self._token}/"})
+
+    def _redeem_key(self, key: str) -> None:
+        """Redirect the first visitor with the one-time key. The key is visible in the command line of the browser."""
+        good = bool(self._key) and secrets.compare_digest(key.encode("utf-8", "replace"), self._key.encode())
+        if not good:
+            raise HTTPException(404, "this address was good once; the one that lasts is in the terminal of ftlm app")
+        self._key = ""
+        raise self._redirection()
+
+    async def _check(self, request: Request) -> Response:
+        """Return the error message of a fit request, or "" if it is valid."""
+        wanted = await read_json(request)
+        try:
+            self._desk.parse_request(wanted)
+        except FtlmError as error:
+            return json_response({"error": self._words(error)})
+        return json_response({"error": ""})
+
+    async def _upload(self, request: Request) -> Response:
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
+            raise HTTPException(415, "a file is sent as it is (application/octet-stream), not as a form")
+        said = request.headers.get("content-length")
+        # Of more digits than Python reads none is a size; what comes is counted whatever is said.
+        size = int(said) if said is not None and said.isascii() and said.isdigit() and len(said) < 20 else None
+        name = request.query_params.get("name", "")
+        try:
+            self._desk.check_room(name, size)
+            file = await self._desk.take(name, size, request.stream())
+        except FtlmError as error:
+            raise HTTPException(413, self._desk.without_paths(str(error))) from None
+        return html_response(view.file(file))
+
+    async def _file(self, request: Request) -> Response:
+        file = _find(self._desk.files, request, "file")
+        if request.method == "DELETE":
+            self._desk.remove_file(file.key)
+            return json_response({})
+        if request.method == "POST":
+            file.user_options = parse_fields(await read_json(request))
+            await self._desk.open(file)
+        return html_response(view.file(file))
+
+    async def _start(self, request: Request) -> Response:
+        return html_response(view.model(self._desk.start(self._desk.parse_request(await read_json(request)))))
+
+    async def _model(self, request: Request) -> Response:
+        model = _find(self._desk.models, request, "model")
+        if request.method == "DELETE":
+            self._desk.remove_model(model.key)
+            return json_response({})
+        return html_response(view.model(model))
+
+    async def _stop(self, request: Request) -> Response:
+        model = _find(self._desk.models, request, "model")
+        self._desk.stop(model.key)
+        return html_response(view.model(model))
+
+    async def _resume(self, request: Request) -> Response:
+        model = _find(self._desk.models, request, "model")
+        return html_response(view.model(self._desk.resume(model.key)))
+
+    async def _download(self, request: Request) -> Response:
+        """Return a file of a model. Its path never comes from the request."""
+        model = _find(self._desk.models, request, "model")
+        if model.state != STATE_MADE or model.description is None:
+            raise HTTPException(404, "this model is not made yet")
+        what = request.url.path.rpartition("/")[2]
+        ending, media_type = MODEL_FILES[what]
+        if what == "script":
+            content = str(model.description["script"]).encode("utf-8", "replace")
+        else:
+            suffix = "json" if what == "model" else "html"
+            try:
+                content = (self._desk.folder / f"{model.key}.{suffix}").read_bytes()
+            except OSError:
+                raise HTTPException(404, "its file is no longer there") from None
+        headers = {"content-security-policy": REPORT_POLICY}
+        if what != "page":
+            stem = Path(model.recipe.estimation.file).stem
+            plain = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in stem)[:80] or "ftlm"
+            headers["content-disposition"] = f'attachment; filename="{plain}-{model.number}-{ending}"'
+        return Response(content, headers=headers, media_type=media_type)
+
+
+def _view(make: Callable[[], str], media_type: str) -> Endpoint:
+    """Return the endpoint of a text that is made for each request."""
+
+    async def endpoint(_: Request) -> Response:
+        return Response(make().encode("utf-8", "replace"), media_type=media_type)
+
+    return endpoint
+
+
+def _find(kept: Mapping[str, Kept], request: Request, kind: str) -> Kept:
+    """Return the file or model whose key is in the path."""
+    found = kept.get(request.path_params["key"])
+    if found is None:
+        raise HTTPException(404, f"this {kind} is no longer on the page")
+    return found
+
+
+#: Time that a client may take for a request head, between two parts of a body, and to read a part of an answer.
+CLIENT_TIMEOUT_S = 20.0
+
+
+class TimedConnection(H11Protocol):
+    """HTTP connection that checks its client twice per :data:`CLIENT_TIMEOUT_S`, and closes itself after a timeout.
+
+    The keep-alive limit of uvicorn only covers connections that are idle after an answer.
+    """
+
+    _since = 0.0
+    _unread = 0
+    _next: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Start the timeout."""
+        super().connection_made(transport)
+        self._since = self.loop.time()
+        self._schedule_check()
+
+    def data_received(self, data: bytes) -> None:
+        """Restart the timeout at each part of a body, and at the end of a head."""
+        before = self.conn.their_state
+        super().data_received(data)
+        if self.conn.their_state is not before or before is h11.SEND_BODY:
+            self._since = self.loop.time()
+
+    def on_response_complete(self) -> None:
+        """Restart the timeout for the next request head."""
+        super().on_response_complete()
+        self._since = self.loop.time()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Cancel the timeout."""
+        if self._next is not None:
+            self._next.cancel()
+        super().connection_lost(exc)
+
+    def _schedule_check(self) -> None:
+        self._next = self.loop.call_later(CLIENT_TIMEOUT_S / 2, self._check_timeout)
+
+    def _check_timeout(self) -> None:
+        """Abort the connection if the client sends nothing or does not read its answer."""
+        unread, before = self.transport.get_write_buffer_size(), self._unread
+        self._unread = unread
+        if unread < before or (unread and not before):
+            self._since = self.loop.time()
+        owes = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+        if owes and self.loop.time() - self._since >= CLIENT_TIMEOUT_S:
+            # Not closed: that would wait for what was sent to be read.
+            self.transport.abort()
+        else:
+            self._schedule_check()
