@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ftlm.errors import DataError
+from ftlm.io.isolated_reader import describe_crash
 from ftlm.utils.resources import python_child
 
 _WORKER_PATH = Path(__file__).with_name("worker.py")
@@ -123,8 +124,4 @@ def _describe_exit(code: int) -> str:
     """Describe the exit of a process that gave no answer."""
     if code >= 0:
         return f"the process that worked on it ended with code {code}, without an answer; try a smaller file"
-    try:
-        how = f"signal {-code}, {signal.Signals(-code).name}"
-    except ValueError:
-        how = f"signal {-code}"
-    return f"the process that worked on it crashed ({how}); the page and all models are still here"
+    return f"the process that worked on it crashed ({describe_crash(code)}); the page and all models are still here"

@@ -8,7 +8,6 @@ absolute paths: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "mod
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import sys
@@ -20,6 +19,7 @@ from typing import Any, TextIO
 from ftlm.app.forms import FitRequest, suggest_structures
 from ftlm.app.views import model_summary, run_figures
 from ftlm.errors import FtlmError
+from ftlm.io.binary_reader import limit_resources
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.progress import Progress
 
@@ -66,7 +66,7 @@ def main() -> None:
     reports = Reports(stream)
     task = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _limit_memory()
+    limit_resources(MEMORY_LIMIT)
     try:
         answer = describe_file(task) if task["do"] == "open" else make_model(task, reports)
     except FtlmError as error:
@@ -83,20 +83,6 @@ def _end_with_parent() -> None:
     """Exit when the parent process ends."""
     sys.stdin.read()
     os._exit(1)
-
-
-def _limit_memory() -> None:
-    """Set the memory limit of this process if the system supports it."""
-    try:
-        resource: Any = importlib.import_module("resource")
-    except ImportError:
-        return
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    try:
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, hard))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    except (OSError, ValueError):
-        return
 
 
 def describe_file(task: Mapping[str, Any]) -> dict[str, Any]:

@@ -48,17 +48,16 @@ class UnreadableError(Exception):
         self.way_out = way_out
 
 
-def limit_resources() -> None:
-    """Limit memory and CPU time of this process, if the system supports it."""
+def limit_resources(memory: int, seconds: int | None = None) -> None:
+    """Limit memory [bytes] and CPU time of this process, and let it leave no core file, if the system supports it."""
     try:
         resource: Any = importlib.import_module("resource")
     except ImportError:
         return
-    for kind, most in (
-        (resource.RLIMIT_AS, MEMORY_LIMIT),
-        (resource.RLIMIT_CPU, SECONDS_LIMIT),
-        (resource.RLIMIT_CORE, 0),
-    ):
+    limits = {resource.RLIMIT_AS: memory, resource.RLIMIT_CORE: 0}
+    if seconds is not None:
+        limits[resource.RLIMIT_CPU] = seconds
+    for kind, most in limits.items():
         _, hard = resource.getrlimit(kind)
         allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
         try:
@@ -168,7 +167,7 @@ def timestamp_array(nanoseconds: Any, gone: Any) -> tuple[dict[str, Any], Any]:
     since = int(nanoseconds[there[0]]) if there.size else 0
     values = (nanoseconds - since).astype(numpy.float64)
     values[gone] = numpy.nan
-    return {"type": "moments", "since": str(since)}, values
+    return {"type": "moments", "since": since}, values
 
 
 def read_feather(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
@@ -496,7 +495,7 @@ def main(arguments: list[str]) -> None:
     # One thread and no memory pool: both would reserve memory that counts against the limit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"
-    limit_resources()
+    limit_resources(MEMORY_LIMIT, SECONDS_LIMIT)
     kind, told, *paths = arguments
     options = json.loads(told)
     budget = SIZE_LIMIT

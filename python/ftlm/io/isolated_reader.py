@@ -9,10 +9,10 @@ import signal
 import subprocess
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Annotated
 
+import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from ftlm.data.export import Header
 from ftlm.errors import DataError
@@ -22,7 +22,7 @@ from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.table import Column, FileTable
 from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
 from ftlm.utils.resources import python_child
-from ftlm.utils.validation import bad_rows
+from ftlm.utils.validation import Floats, bad_rows
 
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
 _READER_TIMEOUT_S = 60.0
@@ -134,18 +134,54 @@ def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list
     return tables
 
 
+def describe_crash(code: int) -> str:
+    """Describe the signal that ended a process."""
+    try:
+        return f"signal {-code}, {signal.Signals(-code).name}"
+    except ValueError:
+        return f"signal {-code}"
+
+
 def _describe_exit(code: int) -> str:
     """Describe the exit of the reader process."""
     if code >= 0:
         return "ended too early" if code == 0 else f"ended with code {code}"
-    try:
-        return f"crashed (signal {-code}, {signal.Signals(-code).name})"
-    except ValueError:
-        return f"crashed (signal {-code})"
+    return f"crashed ({describe_crash(code)})"
 
 
 def _damaged_file_error(path: Path, how: str, kind: BinaryFormat) -> DataError:
     return DataError(f"{str(path)!r}: damaged file: the reader {how}; get an intact copy or {kind.repair_hint}")
+
+
+Size = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class _Array(msgspec.Struct):
+    """Array of a file: numbers in columns, or nanoseconds since a reference time."""
+
+    name: str
+    rows: Size
+    columns: Size
+    type: str
+    unit: str = ""
+    since: int | None = None
+
+
+class _Answer(msgspec.Struct):
+    """Answer for one file, ahead of its numbers and cells; see :mod:`ftlm.io.binary_reader`."""
+
+    arrays: list[_Array] = []
+    skipped: dict[str, str] = {}
+    text: bool = False
+    own: str | None = msgspec.field(default=None, name="ftlm-run")
+    sheet: str | None = None
+    others: list[str] = []
+    bytes: Size = 0
+    error: str | None = None
+    way_out: str = ""
+
+
+ANSWER_DECODER = msgspec.json.Decoder(_Answer)
 
 
 class _ReaderOutput:
@@ -162,94 +198,63 @@ class _ReaderOutput:
             count += 1
         return count
 
-    def _next(self) -> tuple[dict[str, object], list[_Array], bytes] | None:
+    def _next(self) -> tuple[_Answer, list[Floats], bytes] | None:
         end = self._content.find(b"\n", self._at)
-        if end < 0:
-            return None
+        matrices = []
         try:
-            header = json.loads(self._content[self._at : end])
-        except (ValueError, RecursionError):
+            answer = ANSWER_DECODER.decode(self._content[self._at : max(end, self._at)])
+            at = end + 1
+            for array in answer.arrays:
+                count = array.rows * array.columns
+                flat = np.frombuffer(self._content, dtype="<f8", count=count, offset=at)
+                matrices.append(flat.reshape((array.rows, array.columns), order="F").astype(np.float64, copy=False))
+                at += 8 * count
+        except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError):
             return None
-        if not isinstance(header, dict):
-            return None
-        at = end + 1
-        arrays = []
-        try:
-            for entry in header.get("arrays", []):
-                rows, columns = int(entry["rows"]), int(entry["columns"])
-                if rows < 0 or columns < 0:
-                    return None
-                flat = np.frombuffer(self._content, dtype="<f8", count=rows * columns, offset=at)
-                matrix = flat.reshape((rows, columns), order="F").astype(np.float64, copy=False)
-                since = int(entry["since"]) if "since" in entry else None
-                arrays.append(_Array(str(entry["name"]), str(entry["type"]), matrix, str(entry.get("unit", "")), since))
-                at += 8 * rows * columns
-            size = int(header.get("bytes", 0))
-            if size < 0 or at + size > len(self._content):
-                return None
-            cells = self._content[at : at + size]
-            at += size
-        except (ValueError, KeyError, TypeError, OverflowError, AttributeError):
-            return None
-        if not isinstance(header.get("skipped", {}), dict) or ("error" in header and "way_out" not in header):
-            return None
-        self._at = at
-        return header, arrays, cells
+        self._at = at + answer.bytes
+        return (answer, matrices, self._content[at : self._at]) if self._at <= len(self._content) else None
 
     def table(self, path: Path, layout: Layout) -> FileTable | None:
         """Return the table of the next file; None if its answer is missing or incomplete."""
         answer = self._next()
         if answer is None:
             return None
-        header, arrays, cells = answer
-        if "error" in header:
-            remedy = str(header["way_out"])
+        header, matrices, cells = answer
+        if header.error is not None:
+            remedy = header.way_out
             if remedy == _SHEET_CHOICE_HINT:
                 remedy += f" with {layout_parameter(sheet=Placeholder('NAME'))}"
-            raise DataError(f"{str(path)!r}: {header['error']}; {remedy}")
-        if "sheet" in header:
-            return _sheet(path, header, cells, layout)
-        skipped = cast("dict[str, str]", header.get("skipped", {}))
-        columns = [column for array in arrays for column in _columns(path, array)]
+            raise DataError(f"{str(path)!r}: {header.error}; {remedy}")
+        if header.sheet is not None:
+            return _sheet(path, header.sheet, header.others, cells, layout)
+        arrays = zip(header.arrays, matrices, strict=True)
+        columns = [column for array, matrix in arrays for column in _columns(path, array, matrix)]
         if not columns:
-            why = ", ".join(f"{name!r} ({reason})" for name, reason in list(skipped.items())[:10]) or "it is empty"
+            skipped = list(header.skipped.items())[:10]
+            why = ", ".join(f"{name!r} ({reason})" for name, reason in skipped) or "it is empty"
             raise DataError(f"{str(path)!r} holds no real numeric matrix: {why}; save the samples as matrices")
-        told = header.get("ftlm-run")
-        own = Header.read(path, "its metadata", told) if isinstance(told, str) else None
-        return FileTable(path, columns, text=header.get("text") is True, header=own, skipped=skipped)
+        own = None if header.own is None else Header.read(path, "its metadata", header.own)
+        return FileTable(path, columns, text=header.text, header=own, skipped=header.skipped)
 
 
-def _sheet(path: Path, header: dict[str, object], cells: bytes, layout: Layout) -> FileTable:
+def _sheet(path: Path, sheet: str, others: list[str], cells: bytes, layout: Layout) -> FileTable:
     """Parse the cells of a sheet, sent as tab-separated text."""
-    sheet = str(header["sheet"])
     table = parse_text(path, io.BytesIO(cells), layout, sheet)
-    others = header.get("others")
-    if layout.sheet is None and isinstance(others, list) and others:
+    if layout.sheet is None and others:
         words = f"sheet {sheet!r}, the only one that is not empty"
         assumed = Assumption("sheet", sheet, words, layout_parameter(sheet=Placeholder("NAME")))
         table = replace(table, assumed=(assumed, *table.assumed))
     return table
 
 
-@dataclass(frozen=True)
-class _Array:
-    """Array of a file: numbers in columns, or nanoseconds since a reference time."""
-
-    name: str
-    kind: str
-    matrix: npt.NDArray[np.float64]
-    unit: str = ""
-    since: int | None = None
-
-
-def _columns(path: Path, array: _Array) -> list[Column]:
+def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
     """Return the columns of an array: a vector under its name, a matrix under its name and column numbers."""
-    name, matrix = array.name, array.matrix
+    name = array.name
     # Keep single precision: the step detection needs the true resolution of the times.
     with np.errstate(over="ignore"):  # what overflows is no single; it is refused as infinite
-        values = matrix.astype(np.float32) if array.kind == "single" else matrix
+        values = matrix.astype(np.float32) if array.type == "single" else matrix
     if array.since is not None:
-        return [_timestamp_column(path, array)]
+        return [_timestamp_column(path, array.name, array.since, matrix)]
     if 1 in matrix.shape:
         return [Column(name, name, path, values.ravel(order="F"), file_unit=array.unit)]
     rows, count = matrix.shape
@@ -262,10 +267,9 @@ def _columns(path: Path, array: _Array) -> list[Column]:
     return [Column(name, f"{name}.{k + 1}", path, values[:, k], matrix=name) for k in range(count)]
 
 
-def _timestamp_column(path: Path, array: _Array) -> Column:
+def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Column:
     """Build the column of an array of dates."""
-    since, name = array.since or 0, array.name
-    values = array.matrix.ravel(order="F")
+    values = matrix.ravel(order="F")
     thing, gone = f"{path.name}: column {name!r}", np.isnan(values)
     if gone.any():
         rows = np.flatnonzero(gone)
