@@ -23,10 +23,11 @@ from ftlm.cli.framework import (
     show_json,
     write_figure,
 )
-from ftlm.cli.options import Noise, SavedModel
+from ftlm.cli.options import NoiseDeviations, SavedModel
 from ftlm.cli.reading_options import Force, Json, Number, ReadingOptions, Text, Texts
 from ftlm.errors import ModelError
 from ftlm.experiment_design import design_input as experiment
+from ftlm.experiment_design.problem import Kind
 from ftlm.model.serialization import load_model
 from ftlm.plot import matplotlib_figures as design_plots
 from ftlm.progress import Progress
@@ -58,7 +59,7 @@ def control(
     process_noise: Annotated[
         Number, Option(help="LQG: drift of the unknown input per second; default max-input/5.")
     ] = None,
-    noise: Noise = None,
+    noise: NoiseDeviations = None,
     measured: Annotated[Texts, Option(metavar="OUTPUT", help="LQG: measured output; default all.")] = None,
     band: Annotated[
         Text, Option(metavar="LOW:HIGH", help="LQG: band in which its poles match the model [rad/s].")
@@ -213,10 +214,8 @@ def design_input(
     parameters: Annotated[
         Texts, Option(metavar="NAME", help="Parameter of interest; default every free order.")
     ] = None,
-    criterion: Annotated[
-        Literal["D", "E"], Option(help="Criterion: D (all intervals together) or E (the widest).")
-    ] = "D",
-    noise: Noise = None,
+    criterion: Annotated[Kind, Option(help="Criterion: D (all intervals together) or E (the widest).")] = "D",
+    noise: NoiseDeviations = None,
     period: Annotated[
         Number, Option(help="Period of the reference square wave [s]; default a fifth of the duration.")
     ] = None,

@@ -19,7 +19,7 @@ from ftlm.cli.options import (
     Delay,
     Fixed,
     GeneticOptions,
-    Loss,
+    LossOption,
     MultiInnovationOptions,
     OrderGridOptions,
     Out,
@@ -58,6 +58,7 @@ from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation import consistency as parts_of_runs
 from ftlm.estimation import identify as estimation
+from ftlm.estimation.frequency_domain import Weights
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
 from ftlm.estimation.methods import OutputError, method_with_options
 from ftlm.estimation.order_ranking import with_verdict
@@ -65,7 +66,7 @@ from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import SearchSettings
+from ftlm.order_search.options import Coefficients, SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, job_of, make_job, resume_job, run_job, search_status
 from ftlm.progress import Progress
@@ -80,7 +81,6 @@ from ftlm.utils.resources import duration_bounds, estimate_duration, output_erro
 from ftlm.utils.validation import check_threads
 
 Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
-Estimator = Literal["instrumental-variables", "multi-innovation", "least-squares"]
 SavedStore = Annotated[str, Argument(metavar="STORE", help="Checkpoint file, written with --store.")]
 
 
@@ -224,7 +224,7 @@ def search(
     files: Files,
     structure: StructureText,
     coefficients: Annotated[
-        Estimator, Option(rich_help_panel=METHOD_PANEL, help="Estimation method of the coefficients.")
+        Coefficients, Option(rich_help_panel=METHOD_PANEL, help="Estimation method of the coefficients.")
     ] = "multi-innovation",
     reading: ReadingOptions,
     shape: StructureOptions,
@@ -459,7 +459,7 @@ def identify_frequency(
         ),
     ],
     weights: Annotated[
-        Literal["auto", "relative", "uniform", "deviation"],
+        Weights,
         Option(rich_help_panel=METHOD_PANEL, help="Weights; auto: deviations if the file has them."),
     ] = "auto",
     reading: ResponseOptions,
@@ -567,7 +567,7 @@ def consistency(
         int | None,
         Option(rich_help_panel=METHOD_PANEL, help="Segments of one run; several runs are segments; default 2."),
     ] = None,
-    loss: Loss = None,
+    loss: LossOption = None,
     threads: Threads = None,
     report: Report = None,
     force: Force = False,

@@ -10,17 +10,19 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from typer import Argument, Option
 
-from ftlm.arm.flexible_link import Law, flexible_link
+from ftlm.arm.flexible_link import Form, InputOrder, Law, flexible_link
 from ftlm.cli.framework import numbers, pairs, ranges
 from ftlm.cli.reading_options import METHOD_PANEL, OUTPUT_PANEL, STRUCTURE_PANEL, Number, Text, Texts
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
+from ftlm.estimation.confidence_intervals import Intervals
 from ftlm.estimation.methods import METHODS_BY_NAME
-from ftlm.order_search.options import Criterion
+from ftlm.estimation.output_error import Loss, Noise
+from ftlm.order_search.options import Criterion, Norm, RowBasis
 from ftlm.structure.order_grid import OrderGrid, order_grid
 from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
-from ftlm.structure.structure import INITIAL_CHOICES, Structure, check_initial
+from ftlm.structure.structure import INITIAL_CHOICES, Offset, Structure, check_initial
 from ftlm.utils.parameters import parameter
 
 SavedModel = Annotated[str, Argument(metavar="MODEL", help="Saved model.")]
@@ -61,11 +63,11 @@ Report = Annotated[
 Verbose = Annotated[
     bool, Option("-v", "--verbose", rich_help_panel=OUTPUT_PANEL, help="Print all details and all warnings.")
 ]
-Loss = Annotated[
-    Literal["squares", "huber"] | None,
+LossOption = Annotated[
+    Loss | None,
     Option(rich_help_panel=METHOD_PANEL, help="Loss of residuals; huber resists outliers; default squares."),
 ]
-Noise = Annotated[
+NoiseDeviations = Annotated[
     Texts, Option(metavar="OUTPUT=A", help="Noise standard deviation of an output; default the fit's residual.")
 ]
 Orders = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix an order.")]
@@ -107,12 +109,10 @@ class StructureOptions:
         Option(help="Order law; velocities: also gamma = mu; default none."),
     ] = None
     form: Annotated[
-        Literal["lagrange", "published"] | None,
+        Form | None,
         Option(help="Equation of the deflection: (15) or (23); default lagrange."),
     ] = None
-    input_order: Annotated[
-        Literal["published", "derived"] | None, Option(help="Order of the current in the published form.")
-    ] = None
+    input_order: Annotated[InputOrder | None, Option(help="Order of the current in the published form.")] = None
     sensor_filter: Annotated[
         Text, Option(metavar="stock|HZ[:DAMPING]", help="Low-pass filter of the sensors; stock: 2 Hz, damping 0.9.")
     ] = None
@@ -130,7 +130,7 @@ class StructureOptions:
     )
     initial: Annotated[str, Option(help="auto, rest, caputo, history, or exponents of t: 0,1.")] = "auto"
     offset: Annotated[
-        Literal["none", "level", "constant", "ramp", "auto"] | None,
+        Offset | None,
         Option(help="Offset of each equation and run; default the equation's."),
     ] = None
 
@@ -301,7 +301,7 @@ class OrderGridOptions:
         Texts, Option(metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha stands for every alpha.")
     ] = None
     increment: Annotated[Number, Option(help="Increment of the order grid; default 0.05.")] = None
-    norm: Annotated[Literal["l1", "l2"] | None, Option(help="Norm of errors: l1 (45) or l2 (46); default l1.")] = None
+    norm: Annotated[Norm | None, Option(help="Norm of errors: l1 (45) or l2 (46); default l1.")] = None
 
     def grid(self) -> OrderGrid | None:
         """Order grid of the search; None without options."""
@@ -334,7 +334,7 @@ class MultiInnovationOptions:
 
     innovation_length: Annotated[int | None, Option(help="Innovation length p; default 7.")] = None
     prior_covariance: Annotated[Number, Option(help="Prior covariance K0 of the coefficients; default weak.")] = None
-    row_basis: Annotated[Literal["haar", "time"] | None, Option(help="Basis of the rows of (44); default haar.")] = None
+    row_basis: Annotated[RowBasis | None, Option(help="Basis of the rows of (44); default haar.")] = None
 
 
 @dataclass(frozen=True)
@@ -344,18 +344,16 @@ class OutputErrorOptions:
     panel: ClassVar[str] = METHOD_PANEL
     methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference", "noise")
 
-    loss: Loss = None
+    loss: LossOption = None
     intervals: Annotated[
-        Literal["auto", "quadratic", "profile"] | None,
+        Intervals | None,
         Option(help="Confidence intervals: Wald, profile likelihood; default auto."),
     ] = None
     start: Annotated[Text, Option(metavar="MODEL", help="Saved model as an additional initial guess.")] = None
     reference: Annotated[
         Text, Option(metavar="SIGNAL", help="Reference signal of a closed loop; also name it with -u.")
     ] = None
-    noise: Annotated[
-        Literal["white", "ar"] | None, Option(help="Noise of the output; ar: an autoregression; default white.")
-    ] = None
+    noise: Annotated[Noise | None, Option(help="Noise of the output; ar: an autoregression; default white.")] = None
 
 
 @dataclass(frozen=True)

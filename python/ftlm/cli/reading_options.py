@@ -11,6 +11,7 @@ from typer import Argument, Option
 
 from ftlm.cli.framework import announce_reading, interval, pairs
 from ftlm.data.run import Run
+from ftlm.data.sampling import MissingPolicy
 from ftlm.errors import DataError, ModelError
 from ftlm.io.dialect import Layout
 from ftlm.io.load import LoadOptions, Signals, load_selection, select_columns
@@ -77,7 +78,7 @@ class ReadingOptions:
     )
     resample: Annotated[Number, Option(metavar="STEP", help="Resample irregular rows to this step [s].")] = None
     missing: Annotated[
-        Literal["refuse", "weight", "hold"] | None,
+        MissingPolicy | None,
         Option(help="Missing outputs get no weight; hold: inputs are held, too."),
     ] = None
     encoding: Annotated[Text, Option(help="Text encoding, such as cp1252; default detected.")] = None
