@@ -82,7 +82,10 @@ def expected(run):
 def whole(run, tmp_path_factory):
     """Bytes of a complete store."""
     path = tmp_path_factory.mktemp("store") / "whole.ftlm"
-    search(run, path)
+    with pytest.MonkeyPatch.context() as patch:
+        # A slow machine would note how far it is.
+        patch.setattr("ftlm.order_search.checkpoint.FLUSH_INTERVAL_S", math.inf)
+        search(run, path)
     return path.read_bytes()
 
 
@@ -312,7 +315,8 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_is_recovered(run, who
     assert bytes_of(search(run, path)) == expected
 
 
-def test_a_search_stopped_after_any_record_goes_on(run, whole, expected, tmp_path):
+def test_a_search_stopped_after_any_record_goes_on(run, whole, expected, tmp_path, monkeypatch):
+    monkeypatch.setattr("ftlm.order_search.checkpoint.FLUSH_INTERVAL_S", math.inf)
     path = tmp_path / "s.ftlm"
     path.write_bytes(whole)
     payloads = records(path)
