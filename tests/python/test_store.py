@@ -82,7 +82,10 @@ def expected(run):
 def whole(run, tmp_path_factory):
     """Bytes of a complete store."""
     path = tmp_path_factory.mktemp("store") / "whole.ftlm"
-    search(run, path)
+    with pytest.MonkeyPatch.context() as patch:
+        # A slow machine would note how far it is.
+        patch.setattr("ftlm.order_search.checkpoint.FLUSH_INTERVAL_S", math.inf)
+        search(run, path)
     return path.read_bytes()
 
 
@@ -312,7 +315,8 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_is_recovered(run, who
     assert bytes_of(search(run, path)) == expected
 
 
-def test_a_search_stopped_after_any_record_goes_on(run, whole, expected, tmp_path):
+def test_a_search_stopped_after_any_record_goes_on(run, whole, expected, tmp_path, monkeypatch):
+    monkeypatch.setattr("ftlm.order_search.checkpoint.FLUSH_INTERVAL_S", math.inf)
     path = tmp_path / "s.ftlm"
     path.write_bytes(whole)
     payloads = records(path)
@@ -998,6 +1002,41 @@ def test_an_append_that_a_kill_cut_short_is_void(run, whole, expected, tmp_path)
         assert read(path) == held
         assert [p.name for p in tmp_path.iterdir()] == ["s.ftlm"]
     assert bytes_of(search(run, path)) == expected
+
+
+def test_a_store_that_was_given_a_log_is_one_file_again(run, whole, expected, tmp_path):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(whole)
+    keep(path, 2)
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        assert file.execute("PRAGMA journal_mode = WAL").fetchone() == ("wal",)
+    with Store(path) as kept:
+        assert kept._file._connection.execute("PRAGMA journal_mode").fetchone() == ("delete",)
+        assert [p.name for p in tmp_path.iterdir()] == ["s.ftlm"]
+    assert bytes_of(search(run, path)) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"means": np.zeros((2, 4, 4))}, "sizes of a record do not fit"),
+        ({"means": np.zeros((2, 0))}, "sizes of a record do not fit"),
+        ({"means": np.zeros((3, 8))}, "sizes of a record do not fit"),
+        ({"sensor": np.ones((2, 2))}, "sizes of a record do not fit"),
+        ({"states": 3}, "3 states of its sensor filter"),
+        ({"initial": "nowhere"}, "holds something else in record 1"),
+    ],
+)
+def test_records_that_fit_no_search_are_refused(run, tmp_path, changes, message):
+    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, pruning=False)
+    request = job.request("y")
+    forged = msgspec.structs.replace(request, records=(replace(request.records[0], **changes),))
+    path = tmp_path / "s.ftlm"
+    with CheckpointFile(path, "search", "create") as file:
+        file.append([RECORD_ENCODER.encode(frames.Requests(frames.ALGORITHM_VERSION, "0", (forged,)))])
+    for call in (ftlm.resume_search, ftlm.search_status):
+        with pytest.raises(ftlm.DataError, match=message):
+            call(path)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")

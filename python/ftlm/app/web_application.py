@@ -46,7 +46,7 @@ SECURITY_HEADERS = {
 }
 MAX_QUERY_FIELDS = 10
 #: Name and media type of each file of a model; the page is a report that is shown.
-DOWNLOADS = {
+MODEL_FILES = {
     "report": ("report.html", "text/html"),
     "page": ("report.html", "text/html"),
     "model": ("model.json", "application/json"),
@@ -114,7 +114,7 @@ class WebApplication:
                 Route("/models/{key}", self._model, methods=["GET", "DELETE"]),
                 Route("/models/{key}/stop", self._stop, methods=["POST"]),
                 Route("/models/{key}/resume", self._resume, methods=["POST"]),
-                *(Route(f"/models/{{key}}/{kind}", self._download) for kind in DOWNLOADS),
+                *(Route(f"/models/{{key}}/{kind}", self._download) for kind in MODEL_FILES),
             ],
             redirect_slashes=False,
         )
@@ -251,7 +251,7 @@ class WebApplication:
         if model.state != STATE_MADE or model.description is None:
             raise HTTPException(404, "this model is not made yet")
         what = request.url.path.rpartition("/")[2]
-        ending, media_type = DOWNLOADS[what]
+        ending, media_type = MODEL_FILES[what]
         if what == "script":
             content = str(model.description["script"]).encode("utf-8", "replace")
         else:

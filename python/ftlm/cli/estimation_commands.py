@@ -67,7 +67,6 @@ from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import Coefficients, SearchSettings
-from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, job_of, make_job, resume_job, run_job, search_status
 from ftlm.progress import Progress
 from ftlm.structure.order_grid import OrderGrid
@@ -265,7 +264,7 @@ def search(
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 found = run_job(replace(job, progress=progress), store=kept, number=number)
             results[name] = with_verdict(found, runs, parts[name], settings, restrict_grid(every, parts[name]), m=m)
-    show_searches(results, as_json=as_json)
+    show_by_output(results, as_json=as_json)
 
 
 @command
@@ -321,10 +320,7 @@ def certify(
                 threads=threads,
                 progress=progress.so_far,
             )
-    if as_json:
-        show_json({name: result.to_dict() for name, result in results.items()})
-    else:
-        print_text("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
+    show_by_output(results, as_json=as_json)
 
 
 def check_order_names(grid: OrderGrid, structure: Structure) -> None:
@@ -340,8 +336,8 @@ def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:
     return replace(grid, orders={n: v for n, v in grid.orders.items() if n == "alpha" or n in part.order_names})
 
 
-def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None:
-    """Print search results by output as text or JSON."""
+def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print results by output as text or JSON."""
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:
@@ -386,7 +382,7 @@ def resume(
         for number, request in enumerate(kept.contents.requests):
             with Progress(f"searching orders of {request.name}", quiet=as_json) as progress:
                 results[request.name] = resume_job(kept, number, threads=threads, progress=progress)
-    show_searches(results, as_json=as_json)
+    show_by_output(results, as_json=as_json)
 
 
 @command

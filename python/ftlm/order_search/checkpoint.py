@@ -67,7 +67,8 @@ MAX_FILTER_STATES = 10
 def check_record(record: Record) -> None:
     """Raise ModelError for a record whose sizes are inconsistent."""
     sizes, sensor = (len(record.signals), len(record.inputs)), record.sensor
-    if record.means.ndim != 2 or sizes != record.means.shape[:1] * 2 or not record.means.size:
+    shaped = record.means.ndim == 2 and (sensor is None or sensor.ndim == 1)
+    if not shaped or sizes != record.means.shape[:1] * 2 or not record.means.size:
         raise ModelError("the sizes of a record do not fit one another")
     if not 0 <= record.states <= (0 if sensor is None else MAX_FILTER_STATES):
         raise ModelError(f"a record with {record.states} states of its sensor filter")

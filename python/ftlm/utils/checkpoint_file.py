@@ -141,6 +141,7 @@ class CheckpointFile:
         """Lock the file against other writers until it is closed; readers are let in between appends."""
         run = self._connection.execute
         run("PRAGMA busy_timeout = 0")
+        run("PRAGMA journal_mode = DELETE")
         run("BEGIN IMMEDIATE")
         # Fails before any work where the file or its folder is read-only.
         run("PRAGMA user_version = 0")
