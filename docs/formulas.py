@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 #: Size of a drawing [points], in whose units it is made; the page scales it to that of its text.
 SIZE_PT = 10.0
 #: Height of a lower-case letter of the formulas over that of the page's text.
-SCALE = 1.15
+SCALE = 1.0
 COMMANDS = {Path.MOVETO: "M", Path.LINETO: "L", Path.CURVE3: "Q", Path.CURVE4: "C", Path.CLOSEPOLY: "Z"}
 
 
 def draw(formula: str) -> str:
     """Return a formula as SVG whose baseline is that of the line."""
-    font = FontProperties(size=SIZE_PT, math_fontfamily="stix")
+    font = FontProperties(size=SIZE_PT, math_fontfamily="dejavuserif")
     text = f"${' '.join(formula.split())}$"
     width, height, depth, *_ = MathTextParser("path").parse(text, dpi=72, prop=font)
     path = TextPath((0, 0), text, size=SIZE_PT, prop=font)
