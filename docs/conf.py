@@ -13,12 +13,13 @@ author = "the ftlm authors"
 copyright = "MIT licence"
 version = release = ftlm.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "formulas"]
 exclude_patterns = ["_build"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 root_doc = "index"
 myst_heading_anchors = 3
-myst_enable_extensions = ["deflist", "colon_fence"]
+myst_enable_extensions = ["deflist", "colon_fence", "dollarmath"]
+html_math_renderer = "drawn"
 # Pages link to files of the repository, which are no pages.
 suppress_warnings = ["myst.xref_missing"]
 
@@ -30,12 +31,15 @@ numpydoc_xref_param_type = False
 html_theme = "pydata_sphinx_theme"
 html_title = f"ftlm {release}"
 html_show_sourcelink = False
-html_sidebars = {"**": []}
+templates_path = ["_templates"]
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
+html_sidebars = {"**": ["contents.html"]}
 html_theme_options = {
     "navigation_with_keys": False,
     "show_prev_next": True,
     "secondary_sidebar_items": ["page-toc"],
-    "header_links_before_dropdown": 4,
+    "navbar_center": [],
 }
 
 

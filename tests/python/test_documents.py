@@ -158,10 +158,25 @@ def test_notebooks_are_kept_without_output() -> None:
 
 def test_every_page_is_in_the_contents() -> None:
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    listed = re.search(r"```\{toctree\}\n:hidden:\n\n(.*?)```", index, re.DOTALL)
-    assert listed is not None
+    listed = re.findall(r"```\{toctree\}\n:hidden:\n:caption: .*?\n\n(.*?)```", index, re.DOTALL)
+    assert len(listed) == 4
     there = {d.relative_to(ROOT / "docs").with_suffix("").as_posix() for d in PAGES}
-    assert set(listed[1].split()) == there - {"index"}
+    assert sorted(" ".join(listed).split()) == sorted(there - {"index"})
+
+
+def test_every_formula_of_the_pages_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    from formulas import draw
+
+    for document in PAGES:
+        text = re.sub(r"^```.*?^```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        found = re.findall(r"\$\$(.+?)\$\$|\$(.+?)\$", re.sub(r"`[^`\n]*`", "", text), flags=re.DOTALL)
+        for formula in map("".join, found):
+            drawn = draw(formula)
+            assert drawn.startswith("<svg"), (document.name, formula)
+            assert "http" not in drawn
+        if document.name == "mathematics.md":
+            assert len(found) > 100
 
 
 def issubclass_of_error(value: object) -> bool:

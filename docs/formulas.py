@@ -1,0 +1,68 @@
+"""Formulas of the pages as SVG by matplotlib's mathtext: no script and no network, in the color of the text."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from docutils.nodes import SkipNode
+from matplotlib.font_manager import FontProperties
+from matplotlib.mathtext import MathTextParser
+from matplotlib.path import Path
+from matplotlib.textpath import TextPath
+
+if TYPE_CHECKING:
+    from docutils import nodes
+    from sphinx.application import Sphinx
+    from sphinx.writers.html5 import HTML5Translator
+
+#: Size of a drawing [points], in whose units it is made; the page scales it to that of its text.
+SIZE_PT = 10.0
+#: Height of a lower-case letter of the formulas over that of the page's text.
+SCALE = 1.0
+COMMANDS = {Path.MOVETO: "M", Path.LINETO: "L", Path.CURVE3: "Q", Path.CURVE4: "C", Path.CLOSEPOLY: "Z"}
+
+
+def draw(formula: str) -> str:
+    """Return a formula as SVG whose baseline is that of the line."""
+    font = FontProperties(size=SIZE_PT, math_fontfamily="dejavuserif")
+    text = f"${' '.join(formula.split())}$"
+    width, height, depth, *_ = MathTextParser("path").parse(text, dpi=72, prop=font)
+    path = TextPath((0, 0), text, size=SIZE_PT, prop=font)
+    drawn = "".join(
+        # SVG counts downwards.
+        COMMANDS[code] + ("" if code == Path.CLOSEPOLY else " ".join(f"{v * (-1) ** k:.2f}" for k, v in enumerate(at)))
+        for at, code in path.iter_segments(curves=True, simplify=False)
+    )
+    unit = SCALE / SIZE_PT
+    whole = height + depth
+    style = f"width:{width * unit:.3f}em;height:{whole * unit:.3f}em;vertical-align:{-depth * unit:.3f}em"
+    return (
+        f'<svg class="formula" role="img" aria-label="{html.escape(formula, quote=True)}" style="{style}" '
+        f'viewBox="0 {depth - whole:.2f} {width:.2f} {whole:.2f}"><path fill="currentColor" d="{drawn}"/></svg>'
+    )
+
+
+def in_line(self: HTML5Translator, node: nodes.math) -> None:
+    """Write a formula in a line of text."""
+    self.body.append(draw(node.astext()))
+
+
+def in_block(self: HTML5Translator, node: nodes.math_block) -> None:
+    """Write a formula by itself, a drawing a line."""
+    lines = "<br/>".join(draw(part) for part in node.astext().replace("\\frac", "\\dfrac").split("\\\\"))
+    self.body.append(f'<div class="formula">{lines}</div>')
+
+
+def setup(app: Sphinx) -> None:
+    """Register the drawings as a way to show formulas."""
+
+    def visit(write: Callable[[HTML5Translator, Any], None]) -> Callable[[HTML5Translator, Any], None]:
+        def write_and_skip(self: HTML5Translator, node: Any) -> None:
+            write(self, node)
+            raise SkipNode
+
+        return write_and_skip
+
+    app.add_html_math_renderer("drawn", (visit(in_line), None), (visit(in_block), None))
