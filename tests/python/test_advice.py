@@ -146,7 +146,7 @@ def test_free_numbers_are_counted_against_lines():
         assert not [f for f in run.advice(plant.structure) if "free parameters" in f.sentence]
     arm = ftlm.flexible_link(form="published", stage=1)
     still = ftlm.Run.from_arrays(step=0.005, inputs={"I1": 0 * t + 1}, outputs={"theta11": t, "theta12": t**0.5})
-    assert len([f for f in still.advice(arm) if "fixes 1 in steady state" in f.sentence]) == 2
+    assert len([f for f in still.advice(arm) if "determines 1 in steady state" in f.sentence]) == 2
 
 
 def test_inputs_that_move_together_are_named():

@@ -19,7 +19,7 @@ HUB = "D^2 theta = -63 D^0.95 theta + 140 I"
 
 
 def left_after(reference, rate, w, z, arrived):
-    """Amplitude of a second-order system's swing about 1 at a sample, by SciPy's exact discretization."""
+    """Amplitude of a second-order system's swing about 1 at a sample, by SciPy's exact discretisation."""
     a, b = np.array([[0.0, 1.0], [-w * w, -2 * z * w]]), np.array([[0.0], [w * w]])
     system = signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), 1.0 / rate)
     _, _, states = signal.dlsim((*system[:4], 1.0 / rate), reference)

@@ -239,7 +239,7 @@ FAULTS = {
     "six wrong samples": ("outliers_dominate", 0.9),
     "a channel that was off": ("channel_off", 0.9),
     "noise three times the signal": ("buried_in_noise", 0.7),
-    "a coarse converter": ("quantized", 0.8),
+    "a coarse converter": ("quantised", 0.8),
     "an unstable plant": ("free_run_grows", 0.9),
 }
 

@@ -178,7 +178,7 @@ def test_a_model_that_leaves_something_out_says_so():
     data = ftlm.FrequencyData.from_arrays(W, noisy(circuits.warburg(W, 0.01, 0.05, 1e-2, 0.8, 0.02), 0.002, 1))
     found = ftlm.identify_frequency(data, ARC)
     assert not found.white
-    assert any("residuals are not white" in w for w in found.warnings)
+    assert "response_not_white" in [f.code for f in found.findings]
     assert found.verdict.level == "with care"
     straight = ftlm.FrequencyData.from_arrays(W, noisy(np.ones(W.size), 0.001, 2))
     assert ftlm.identify_frequency(straight, "D y = b u").verdict.level == "do not use"
@@ -599,7 +599,7 @@ def test_bad_arguments_are_refused_in_words(options, error, words):
 
 
 def test_too_few_frequencies_and_responses_of_size_0_are_refused():
-    with pytest.raises(ftlm.DataError, match=r"2 frequencies give 4 numbers, and 4 are free \(alpha, a, r, b\)"):
+    with pytest.raises(ftlm.DataError, match=r"2 frequencies give 4 values, and 4 parameters are free \(alpha, a, r, b\)"):
         ftlm.identify_frequency(arc().slice(0.06, 0.08), ARC)
     dead = ftlm.FrequencyData.from_arrays(W, np.where(W > 1e3, 0, 1.0))
     with pytest.raises(ftlm.DataError, match=r"the response is 0 at row \d+, \d+ in all, and has no relative weight"):
@@ -611,7 +611,7 @@ def test_too_few_frequencies_and_responses_of_size_0_are_refused():
     [
         (("a", "b", "c"), r"the frequency cannot be recognized .*recognized: none.*the columns are 'a', 'b', 'c'"),
         (("Hz", "b", "c"), r"real and imaginary part, or magnitude and phase cannot be recognized .*frequency 'Hz'"),
-        (("Hz", "dB", "c"), r"known are: frequency 'Hz', magnitude 'dB'"),
+        (("Hz", "dB", "c"), r"recognized: frequency 'Hz', magnitude 'dB'"),
         (
             ("f", "Hz", "dB"),
             r"the columns 'f' and 'Hz' may both be the frequency; name one with columns=\{part",

@@ -61,7 +61,7 @@ def test_an_input_that_no_equation_reads_is_named_with_the_option(seed):
     # A prediction from the model that lacks it says so.
     design = ftlm.design_input(found, duration=20.0)
     assert [f.code for f in design.findings] == ["prediction_in_doubt"]
-    assert "v" in design.findings[0].text
+    assert "correlated with v" in design.findings[0].text
 
 
 def weighed(found):

@@ -427,7 +427,7 @@ def test_every_innovation_length_tends_to_least_squares(record_a):
             for k0 in (1e8, 1e10, 1e12)
         )
         assert far > near > nearest
-        # The residuals of the last p - 1 rows are discretization here, so p > 1 keeps a trace of its weights.
+        # The residuals of the last p - 1 rows are discretisation here, so p > 1 keeps a trace of its weights.
         assert nearest < 1e-6
 
 
@@ -634,7 +634,7 @@ def test_lattice_of_p1_has_313_845_candidates():
     assert len(values["alpha2"]) == len(alphas)
 
 
-def test_equation_error_of_the_truth_is_what_discretization_leaves(record_a, plant):
+def test_equation_error_of_the_truth_is_what_discretisation_leaves(record_a, plant):
     # Outputs are linear between samples 2 ms apart and integrated twice: a tenth of a milliradian after 10 s.
     found, _ = record_a
     for item, left in zip(plant("A").equations, (2.6e-4, 2.76e-3), strict=True):

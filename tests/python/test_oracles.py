@@ -176,7 +176,7 @@ def test_operators_commute():
 
 @pytest.mark.parametrize(("first", "second"), [(0.5, 0.5), (0.3, 1.2), (1.0, 1.0)])
 def test_semigroup_holds_to_second_order(first, second):
-    # F^a F^b and F^(a+b) differ by discretization, a quarter as much on twice as many pulses (smooth signal, t > 1/4).
+    # F^a F^b and F^(a+b) differ by discretisation, a quarter as much on twice as many pulses (smooth signal, t > 1/4).
     duration, errors = 2.0, []
     for m in (64, 128, 256):
         signal = power_means(2.0, m, duration)

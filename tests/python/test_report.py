@@ -458,7 +458,7 @@ def paper_rows(identified):
 def test_paper_table_has_the_papers_columns(identified):
     table = paper_table(paper_rows(identified))
     assert [re.sub("<.*?>", "", c) for c in table.columns[:9]] == ["model", *"γαβμabdg"]
-    assert [text for text, _ in table.groups][3:] == ["equation error", "output error (simulation)"]
+    assert [text for text, _ in table.groups][3:] == ["equation error", "output error (free run)"]
     assert sum(width for _, width in table.groups) == len(table.columns) == 15
     deflection = table.rows[6]
     o, c, comparison = identified.orders, identified.coefficients, identified.comparison

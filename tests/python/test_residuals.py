@@ -340,7 +340,7 @@ def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatc
     assert "undecided" in str(found)
     assert "follow_undecided" in [f.code for f in residual_findings(found)]
     assert "undecided" in found._repr_html_()
-    assert "undecided: the limit is" in residual_charts(found)[1].caption
+    assert "undecided: its limit is" in residual_charts(found)[1].caption
 
 
 def test_an_input_that_does_not_move_decides_nothing(small_model, noisy):

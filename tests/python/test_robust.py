@@ -157,7 +157,7 @@ def test_what_stood_in_a_gap_changes_nothing_and_all_figures_count_what_is_there
     assert found.residuals is not None
     assert found.residuals.passed
     assert np.isnan(found.equation_error["y"].nr)
-    assert "y has no equation error: not every sample of it was read" in str(found.comparison)
+    assert "y has no equation error: some of its samples are missing" in str(found.comparison)
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["equation_error"]["y"]["fit"] is None
     # A gap costs precision, and no more.

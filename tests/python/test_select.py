@@ -74,7 +74,7 @@ def test_the_true_structure_is_chosen_from_a_richer_one(chosen):
         low, high = chosen.best.intervals[name]
         assert low <= value <= high
     assert "each of 2 runs by the others" in str(chosen)
-    assert chosen.reason.startswith("Chosen: D^2 y = d D^1 y + a y + b0 u (3 numbers, ")
+    assert chosen.reason.startswith("Chosen: D^2 y = d D^1 y + a y + b0 u (3 parameters, ")
 
 
 def test_what_is_judged_was_not_fitted(runs, chosen):

@@ -394,7 +394,8 @@ def _check_arguments(
             f"{setting('period')} {period:g} s is not between two steps and twice the run; give another one"
         )
     said = () if solved.estimate is None or solved.estimate.findings is UNSET else solved.estimate.findings
-    doubt = next((f for f in said if f.code in LEFT_OUT_CODES), None)
+    missing = [f for f in said if f.code in LEFT_OUT_CODES]
+    doubt = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
     colour = next((f for f in said if f.code in NOT_WHITE_CODES), None)
     words: tuple[Finding, ...] = ()
     if doubt is not None:
