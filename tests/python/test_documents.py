@@ -37,9 +37,10 @@ def test_the_python_blocks_run_one_after_the_other(document: Path, tmp_path: Pat
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
-    if document == README:
-        (printed,) = blocks(document, "text")
-        assert words_of(printed) == words_of(ran.stdout)
+    if document == README or document.name == "nonlinear.md":
+        printed = "".join(blocks(document, "text"))
+        # Lines break at the width of the terminal.
+        assert words_of(" ".join(printed.split())) == words_of(" ".join(ran.stdout.split()))
     if document.name == "start.md":
         assert len(found) >= 2
         assert "order search (y)" in ran.stdout

@@ -146,7 +146,7 @@ class NestedStructures:
         except ModelError:
             return False
         for item in made.equations:
-            places = [(t.signal, t.order.constant) for t in item.terms if not t.order.names]
+            places = [(t.column, t.order.constant) for t in item.terms if not t.order.names]
             if len(set(places)) < len(places):
                 return False
             own = [order for signal, order in places if signal == item.output]
@@ -176,9 +176,9 @@ class NestedStructures:
             base = self._with_own_terms(top)
             if base is None:
                 continue
-            drives = [
-                t for t in self.structure.equations[0].terms if t.coefficient in self.droppable and not self._owns(t)
-            ]
+            # A non-linear term of the output drives nothing.
+            item = self.structure.equations[0]
+            drives = [t for t in item.terms if t.coefficient in self.droppable and item.output not in t.signals]
             known = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
             if not drives or known:
                 yield Change(self._describe(base), base)
@@ -195,7 +195,7 @@ class NestedStructures:
         return describe_structure(self.build(variant))
 
     def _owns(self, term: Term) -> bool:
-        return any(term in e.terms and term.signal == e.output for e in self.structure.equations)
+        return any(term in e.terms and term.column == e.output for e in self.structure.equations)
 
     def _with_own_terms(self, top: Mapping[str, float]) -> Variant | None:
         """Return the variant of all own terms with distinct integer orders and all mandatory terms."""
@@ -204,11 +204,11 @@ class NestedStructures:
         kept: list[str] = []
         for item in self.structure.equations:
             highest = top.get(item.order.names[0]) if item.order.is_single else item.order.constant
-            taken = {t.order.constant for t in item.terms if t.signal == item.output and not t.order.names}
+            taken = {t.order.constant for t in item.terms if t.column == item.output and not t.order.names}
             for term in item.terms:
                 if term.order.is_single and term.order.names[0] in whole:
                     continue
-                own = term.signal == item.output
+                own = term.column == item.output
                 if not own and term.coefficient in droppable:
                     continue
                 if term.order.is_single:
@@ -222,7 +222,7 @@ class NestedStructures:
                         return None
                     # Of own terms whose orders are sought the last is taken for damping, those before it stand below.
                     later = item.terms[item.terms.index(term) + 1 :]
-                    below = any(t.signal == item.output and t.order.is_single for t in later)
+                    below = any(t.column == item.output and t.order.is_single for t in later)
                     value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
                     whole[name] = value
                     taken |= {value} if own else set()
@@ -302,8 +302,8 @@ class NestedStructures:
         made = self.build(variant)
         for item in made.equations:
             for term in item.terms:
-                own = term.signal == item.output
-                others = [t for t in item.terms if t is not term and (t.signal == item.output) == own]
+                own = term.column == item.output
+                others = [t for t in item.terms if t is not term and (t.column == item.output) == own]
                 if term.coefficient in self.droppable and others:
                     less = replace(variant, coefficients=variant.coefficients - {str(term.coefficient)})
                     if self.is_valid(less):
@@ -333,7 +333,7 @@ def signature(structure: Structure) -> str:
     parts = []
     for item in structure.equations:
         terms = sorted(
-            (t.signal, "free" if t.order.is_single else str(t.order), "free" if t.fixed is None else repr(t.fixed))
+            (t.column, "free" if t.order.is_single else str(t.order), "free" if t.fixed is None else repr(t.fixed))
             for t in item.terms
         )
         parts.append(f"{item.output} {'free' if item.order.is_single else item.order} {terms}")

@@ -1,0 +1,233 @@
+"""Non-linear terms in identifications: equation error, order searches, results from file to page."""
+
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ftlm
+from ftlm.cli.main import app
+from ftlm.estimation.linear import _estimate_coefficients, estimate_coefficients
+from ftlm.estimation.nonlinear_checks import nonlinear_findings
+from ftlm.order_search import free_run_ranking
+from ftlm.order_search.options import SearchSettings
+from ftlm.simulation.nonlinear_columns import differentiate
+from ftlm.simulation.output_samples import OutputSamples, simulate_samples
+from nonlinear_plants import PLANTS
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return {name: plant.run(plant.clean(), 1) for name, plant in PLANTS.items()}
+
+
+def at_true_orders(name):
+    plant = PLANTS[name]
+    return plant.structure.with_orders({n: plant.truth[n] for n in plant.structure.order_names})
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("method", ["least-squares", "multi-innovation"])
+def test_equation_error_at_the_true_orders(runs, name, method):
+    result = ftlm.identify(runs[name], at_true_orders(name), method=method)
+    for parameter, estimate in result.parameters.items():
+        # The bias of noise on the regressors of D^mu y.
+        assert estimate.value == pytest.approx(PLANTS[name].truth[parameter], rel=0.15)
+    assert result.comparison.fit_percent["y"] > 90
+
+
+def test_column_of_a_nonlinear_term_is_that_of_its_signals(runs):
+    structure = ftlm.equation("D^2 y = a D^0.6 y + k y + k3 y^3 + b u", initial="rest")
+    own = estimate_coefficients([runs["duffing"]], structure, SearchSettings(coefficients="least-squares"), 500).values
+    cubed = runs["duffing"]
+    means = ftlm.kernels.pulse_means(cubed["y"], 500) ** 3
+    step = cubed.duration / 500
+    rows = [ftlm.kernels.pulse_means(cubed["y"], 500), means, ftlm.kernels.pulse_means(cubed["u"], 500, hold=True)]
+    columns = [
+        ftlm.kernels.integrate(rows[signal], order, step=step) for signal, order in ((0, 1.4), (0, 2), (1, 2), (2, 2))
+    ]
+    expected = np.linalg.lstsq(np.stack(columns, axis=1), rows[0], rcond=None)[0]
+    np.testing.assert_allclose([own[n] for n in ("a", "k", "k3", "b")], expected, rtol=1e-6)
+
+
+def test_derivatives_of_pulse_means():
+    step, m = 0.01, 400
+    edges = step * np.arange(m + 1)
+    means = np.diff(edges**4) / (4 * step)  # of t^3
+    middles = (edges[1:] + edges[:-1]) / 2
+    for order, exact in ((1.0, 3 * middles**2), (0.5, 6 / 3.3233509704478426 * middles**2.5)):
+        for smooth in (False, True):
+            found = differentiate(means, order, step, smooth=smooth)
+            assert np.abs(found - exact)[2:].max() < 2e-3
+    noisy = means + 0.1 * np.random.default_rng(0).standard_normal(m)
+    raw, smooth = (differentiate(noisy, 1.0, step, smooth=s) - 3 * middles**2 for s in (False, True))
+    assert np.std(smooth) < 0.2 * np.std(raw)
+
+
+def test_of_raw_and_smooth_velocities_the_better_free_run_decides(runs):
+    structure, settings = at_true_orders("drag"), SearchSettings(coefficients="least-squares")
+    chosen = estimate_coefficients([runs["drag"]], structure, settings, None)
+    smooth, raw = (
+        _estimate_coefficients([runs["drag"]], structure, settings, None, smooth=s)[0] for s in (True, False)
+    )
+    assert chosen.values == smooth.values != raw.values
+    coarse = runs["drag"].resample(0.2)
+    chosen = estimate_coefficients([coarse], structure, settings, None)
+    ways = [_estimate_coefficients([coarse], structure, settings, None, smooth=s)[0].values for s in (True, False)]
+    # Windows of 31 points are too wide here.
+    assert chosen.values == ways[1] != ways[0]
+
+
+GRID = ftlm.OrderGrid(orders={"alpha": "1.8:2.2:0.05", "mu": "0.4:0.9:0.05"})
+
+
+def test_order_search_ranks_by_free_runs(runs, tmp_path, monkeypatch):
+    structure = PLANTS["duffing"].structure
+    result = ftlm.search_orders(runs["duffing"], structure, GRID)
+    assert result.orders["alpha"] == 2.0
+    assert result.orders["mu"] == pytest.approx(0.6, abs=0.06)
+    scores = [row.score for row in result.table]
+    assert scores == sorted(scores)
+    assert (result.free_runs, result.candidates) == (99, 99)
+    assert sum(result.exclusion_counts.values()) + len(result.table) == 99
+    assert result.settings["criterion"] == "output-error"
+    monkeypatch.setattr("ftlm.order_search.search.FREE_RUN_CANDIDATES", 30)
+    few = ftlm.search_orders(runs["duffing"], structure, GRID, store=tmp_path / "search.store")
+    assert few.free_runs == 30
+    assert "the best 30 of 99 candidates by equation error were ranked by free runs" in str(few)
+    assert few.table[0].orders == result.table[0].orders
+    again = ftlm.resume_search(tmp_path / "search.store")["y"]
+    assert again.table == few.table
+    assert ftlm.search_orders(runs["duffing"], structure, GRID, criterion="equation-error").free_runs == 0
+
+
+def test_candidates_whose_free_run_diverges_are_left_out(runs):
+    structure = PLANTS["duffing"].structure.with_coefficients({"k3": 40.0})
+    with pytest.raises(ftlm.ModelError, match=r"the free runs of the best \d+ candidates .* all diverge"):
+        ftlm.search_orders(runs["duffing"], structure, GRID)
+
+
+def test_a_record_is_the_run_of_its_pulse_means(runs):
+    structure = at_true_orders("duffing").with_coefficients(
+        {n: v for n, v in PLANTS["duffing"].truth.items() if n not in ("alpha", "mu")}
+    )
+    (rec,) = ftlm.simulation.discretization.prepare([runs["duffing"]], structure, None, power_of_two=False)
+    run = free_run_ranking.record_run(rec, structure)
+    left = free_run_ranking.free_run_errors(ftlm.Model(structure), rec, run)["y"]
+    noise = np.std(runs["duffing"]["y"]) * 0.01
+    assert np.std(left) < 1.2 * noise
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "D y = a sqrt(y) + b u",
+            "sqrt(y) of run 'run' is not finite in 95 pulses, first at 3.15 s, where y = -0.00839674; use",
+        ),
+        ("D y = a y + b D^0.5 (u*D u)", "holds u between its samples: its jumps have no derivative"),
+        ("D y = a y + b exp(1000 y)", "exp(1000*y) of run 'run' is not finite"),
+    ],
+)
+def test_expressions_without_a_value(text, message):
+    y = np.sin(np.arange(200) / 10)
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.sign(y) + 2}, outputs={"y": y}, name="run")
+    with pytest.raises(ftlm.FtlmError) as refused:
+        ftlm.identify(run, ftlm.equation(text, initial="rest"), method="least-squares")
+    assert message in str(refused.value)
+
+
+def test_a_term_without_a_value_has_no_equation_error_but_a_free_run():
+    step = 0.05
+    u = np.repeat(np.random.default_rng(2).uniform(0, 2, 20), 20)
+    truth = ftlm.Model(ftlm.equation("D y = -0.5 sqrt(y + 0.01) + u - y"))
+    blank = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": np.zeros(u.size)})
+    y = truth.simulate(blank)["y"] + 0.01 * np.random.default_rng(3).standard_normal(u.size)
+    y[:6] = -0.05
+    run = blank.with_outputs({"y": y})
+    result = ftlm.identify(run, ftlm.equation("D y = -k sqrt(y + 0.01) + u - y", initial="rest"))
+    assert result.parameters["k"].value == pytest.approx(0.5, abs=0.05)
+    reason = "a non-linear term of the measured signals has no value in some of the rows"
+    assert result.comparison.without_equation_error == {"y": reason}
+
+
+def test_the_linear_model_is_the_derivative_of_the_free_run():
+    step, rows = 0.02, 1500
+    model = ftlm.Model(ftlm.equation("D^1.8 y = -2 y - 0.5 D^0.5 y - 3 y^3 + 0.7 y*u + u - 0.2 abs(D y)*D y"))
+    # The equilibrium of a constant input: 2 y + 3 y^3 - 0.7 y u - u = 0.
+    y = 0.3
+    u = (2 * y + 3 * y**3) / (1 + 0.7 * y)
+    settle = rows - 300
+    change = np.where(np.arange(rows) >= settle, np.sin(0.05 * np.arange(rows)), 0.0)
+
+    def output(model, input):
+        run = ftlm.Run.from_arrays(step=step, inputs={"u": input}, outputs={"y": np.zeros(rows)})
+        return model.simulate(run, tolerance=1e-5)["y"]
+
+    moved, still = (output(model, u + size * change) for size in (1e-3, 0.0))
+    linear = output(model.linearized(at={"y": y, "u": u}), change)
+    difference = (moved - still)[settle:] / 1e-3
+    assert np.abs(difference - linear[settle:]).max() < 0.02 * np.abs(linear).max()
+
+
+def test_findings_say_range_and_share_of_each_term(runs):
+    result = ftlm.identify(runs["drag"], at_true_orders("drag"), method="least-squares")
+    (found,) = (f for f in result.findings if f.code == "nonlinear_range")
+    assert (found.output, found.numbers["term"]) == ("y", "abs(D y)*D y")
+    assert re.search(r"D y from -\d\.\d+ to \d\.\d+", str(found))
+    velocity = np.gradient(runs["drag"]["y"], 0.01)
+    assert 20 < found.numbers["share"] < 100
+    assert f"{velocity.max():.1f}"[:1] in str(found)
+
+
+def test_a_run_that_forgets_its_parameters_is_said():
+    rows, step = 4000, 0.05
+    u = np.cos(1.2 * step * np.arange(rows))
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": np.zeros(rows)})
+
+    def codes(text):
+        model = ftlm.Model(ftlm.equation(text))
+        free = OutputSamples(*simulate_samples(model, run, 1, None), 1, np.zeros(1))
+        return {f.code: f for f in nonlinear_findings(model, [run], [free])}
+
+    chaos = codes("D^2 y = -0.3 D^0.9 y + 1 y - 1 y^3 + 0.6 u")["run_forgets"]
+    assert chaos.level == "do not use"
+    assert 20 < chaos.numbers["seconds"] < 150
+    assert "run_forgets" not in codes("D^2 y = -0.3 D^0.9 y - 1 y - 1 y^3 + 0.6 u")
+    # A linear unstable model grows with its output.
+    assert "run_forgets" not in codes("D y = 0.1 y - 1e-9 y^3 + 0.1 u")
+
+
+def test_from_the_command_line_to_a_page(runs, tmp_path):
+    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    plant = PLANTS["rotor"]
+    runs["rotor"].to_csv(first)
+    plant.run(plant.clean(), 2).to_csv(second)
+    model, page = tmp_path / "model.json", tmp_path / "page.html"
+
+    def call(*arguments):
+        return CliRunner().invoke(app, [*map(str, arguments)])
+
+    found = call("identify", first, "--structure", plant.text, "-o", model, "--report", page, "--validation", second)
+    assert found.exit_code == 0, found.output
+    assert "TRUST" in found.output
+    assert "y^2 in the equation of y is" in " ".join(found.output.split())
+    assert "<msup><mrow><mi>y</mi></mrow><mn>2</mn></msup>" in page.read_text(encoding="utf-8")
+    assert "only its linear model about a point has poles" in page.read_text(encoding="utf-8")
+    compared = call("compare", model, second)
+    assert compared.exit_code == 0
+    assert "99" in compared.output
+    simulated = call("simulate", model, second, "-o", tmp_path / "simulated.csv")
+    assert simulated.exit_code == 0, simulated.output
+    assert call("resid", model, second).exit_code == 0
+    assert call("report", model, "-o", tmp_path / "saved.html", "--force").exit_code == 0
+    refused = call("export", model, "--to", "matlab", "-o", tmp_path / "model.m")
+    assert refused.exit_code == 2
+    assert "Model.linearized in Python" in refused.output
+
+
+def test_selection_finds_the_nonlinear_term(runs):
+    structure = ftlm.equation("D^0.9 y = c u^2 - w y^2 + k y + e y*u", initial="rest")
+    selection = ftlm.select(runs["rotor"].window(0.0, 30.0), structure)
+    assert {"c", "w"} <= {t.name for t in selection.model.equations[0].terms}
