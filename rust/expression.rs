@@ -297,7 +297,7 @@ mod tests {
                 let slopes = values.slopes().to_vec();
                 assert!(value.is_finite() && slopes.len() == 2 && values.fault().is_none());
                 for (i, slope) in slopes.iter().enumerate() {
-                    let mut side = |by: f64| {
+                    let side = |by: f64| {
                         let mut near = at;
                         near[i] += by;
                         expression.evaluate(&near, &mut Values::default())

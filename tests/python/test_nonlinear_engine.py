@@ -5,6 +5,7 @@ from math import gamma
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import lsim
 from scipy.special import ellipj, ellipk
 
 import ftlm
@@ -78,7 +79,7 @@ CLOSED_FORMS = {
         np.square,
         {"u": lambda t: 2 + 0.8 / gamma(2.4) * t**1.4 + t**2 + t**6},
         None,
-        2e-4,
+        5e-4,
     ),
     "drag": (
         "D^2 y = -0.5 D^1.5 y - 1 y - 0.7 abs(D y)*D y + 1 u",
@@ -247,9 +248,37 @@ def test_derivatives_of_residuals_are_those_of_differences(name, initial):
         assert np.max(np.abs(column - difference)) < 2e-5 * max(np.max(np.abs(difference)), 1e-3), problem.names[k]
 
 
+def test_two_runs_with_a_delay_gaps_and_initial_values_are_fitted_together():
+    truth = {"a": -0.8, "k": -9.0, "k3": -40.0, "b": 4.0, "delay_u": 0.07}
+    text = "D^2 y = a D y + k y + k3 y^3 + b u"
+    model = ftlm.Model(ftlm.equation(text, fixed={n: v for n, v in truth.items() if n != "delay_u"}, delay={"u": 0.07}))
+    runs, rng = [], np.random.default_rng(5)
+    for start in (0.0, 0.3):
+        inputs = {"u": np.repeat(rng.uniform(-3, 3, 10), 80)}
+        blank = ftlm.Run.from_arrays(step=0.01, inputs=inputs, outputs={"y": np.zeros(800)})
+        y = model.simulate(blank, initial={"y": {0.0: start, 1.0: 0.8 * start}}, tolerance=1e-6)["y"]
+        y = y + 0.004 * rng.standard_normal(800)
+        y[300:340] = np.nan
+        runs.append(ftlm.Run.from_arrays(step=0.01, inputs=inputs, outputs={"y": y}, missing="weight", name=f"{start}"))
+    structure = ftlm.equation(text, delay={"u": (0.0, 0.2)}, initial="caputo")
+    joint = ftlm.identify(runs, structure, threads=1).fit
+    assert abs(joint.noise["y"] / 0.004 - 1) < 0.1
+    for name, value in joint.values_by_name.items():
+        assert abs(value - truth[name]) < 3.5 * joint.standard_errors[name], name
+
+
+def test_a_sensor_filter_acts_on_the_simulated_output():
+    sensor = ftlm.SensorFilter.low_pass(["y"], frequency=1.0, damping=0.9)
+    run = run_of(0.02, 201, u=1.0)
+    model = ftlm.Model(ftlm.equation("D y = 1 u - 1 y^2", sensor_filter=sensor))
+    omega, times = 2 * np.pi, np.linspace(0.0, 4.0, 4001)
+    _, expected, _ = lsim(([omega**2], [1.0, 1.8 * omega, omega**2]), np.tanh(times), times)
+    assert np.max(np.abs(model.simulate(run, tolerance=1e-6)["y"] - expected[::20])) < 1e-5
+
+
 def identify(plant, clean, seed):
     """Identification result of a noisy run."""
-    return ftlm.identify(plant.run(clean, seed), plant.structure, method="output-error", progress=False)
+    return ftlm.identify(plant.run(clean, seed), plant.structure)
 
 
 def tally(plant, seeds):

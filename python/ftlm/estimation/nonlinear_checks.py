@@ -86,7 +86,7 @@ def _term_findings(item: Equation, runs: Sequence[Run], values: Sequence[dict[st
         yield make_finding(
             "nonlinear_range",
             output=item.output,
-            term=term.operand_as_text({}),
+            term=term.format_operand({}),
             share=100 * share,
             whole=derivative(replace(item.order, constant=round(item.order.constant, 4)), item.output),
             ranges=", ".join(ranges),

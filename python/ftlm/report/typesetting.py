@@ -253,7 +253,7 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
             if term.name is None:
                 continue
             linear = term.nonlinear is None
-            derivative = derivative_html(term.order, term.signal) if linear else term.operand_as_text({})
+            derivative = derivative_html(term.order, term.signal) if linear else term.format_operand({})
             place = Markup("of {} in the equation of {}").format(derivative, symbol_html(item.output))
             stated = reference.get(term.name)
             shown.add(term.name)

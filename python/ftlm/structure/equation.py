@@ -70,17 +70,22 @@ class Term:
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
     @check_arguments
-    def as_text(self, inputs: Mapping[str, str]) -> str:
+    def as_text(self, signal: str) -> str:
+        """Format the term with a given text for its signal."""
+        return self.format({self.signal: signal})
+
+    @check_arguments
+    def format(self, inputs: Mapping[str, str]) -> str:
         """Format the term; ``inputs`` maps an input to its text after delay and nonlinearity."""
         if isinstance(self.coefficient, str):
             factor = "" if self.factor == 1 else "-" if self.factor == -1 else f"{self.factor!r} "
             text = f"{factor}{self.coefficient} "
         else:
             text = f"{self.factor * self.coefficient!r} "
-        return text + self.operand_as_text(inputs)
+        return text + self.format_operand(inputs)
 
     @check_arguments
-    def operand_as_text(self, inputs: Mapping[str, str]) -> str:
+    def format_operand(self, inputs: Mapping[str, str]) -> str:
         """Format the derivative of the signal or expression, without the coefficient."""
         shape = self.nonlinear
         if shape is None:
@@ -100,7 +105,7 @@ class Term:
         return text
 
     def __str__(self) -> str:
-        return self.as_text({})
+        return self.format({})
 
 
 def derivative(order: Order, signal: str) -> str:
@@ -442,7 +447,7 @@ class Equation:
     @check_arguments
     def as_text(self, inputs: Mapping[str, str]) -> str:
         """Format the equation; ``inputs`` maps an input to its text after delay and nonlinearity."""
-        right = " + ".join(t.as_text(inputs) for t in self.terms).replace("+ -", "- ")
+        right = " + ".join(t.format(inputs) for t in self.terms).replace("+ -", "- ")
         friction = "" if self.friction is None else f" {self.friction.as_text(self.output)}"
         return f"{derivative(self.order, self.output)} = {right}{friction}"
 
@@ -453,7 +458,7 @@ class Equation:
 def format_equation(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
     """Format an identified equation with six significant digits; ``inputs`` holds texts such as ``u(t - 0.035 s)``."""
     texts = inputs or {}
-    parts = [f"{t.fixed or 0.0:+.6g} {t.operand_as_text(texts)}" for t in item.terms]
+    parts = [f"{t.fixed or 0.0:+.6g} {t.format_operand(texts)}" for t in item.terms]
     right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
     if item.friction is not None:
         fc, fs, vs = item.friction.law

@@ -49,7 +49,10 @@ def equation(
         equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an offset, an unknown constant;
         write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is Coulomb friction of the
         simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds Stribeck friction, with fs and
-        vs > 0 each a name or a number; the breakaway force is then fc + fs.
+        vs > 0 each a name or a number; the breakaway force is then fc + fs. Non-linear terms are linear in their
+        coefficients: ``k3 y^3``, ``e y*u``, ``- w abs(D y)*D y``, ``k sin(2 y)``, ``k D^mu (y^3)``, with the functions
+        sin, cos, exp, tanh, abs and sqrt. The first name of a product is its coefficient, unless it is that of a signal
+        elsewhere in the equations.
     orders
         Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its grid.
     fixed
