@@ -10,8 +10,7 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import number_covariance
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.nuisance_parameters import refit_from
-from ftlm.estimation.output_error import JointFit
+from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.simulation.initial_conditions import rest_evidence
@@ -45,7 +44,7 @@ def start_not_told_findings(fit: Fit) -> list[Finding]:
         if (initial, offset) == taken:
             continue
         try:
-            other = refit_from(joint, runs, replace(structure, initial=initial, offset=offset))
+            other = fit_output_error(runs, replace(structure, initial=initial, offset=offset), near=joint, refine=False)
         except FtlmError:
             continue
         ratio = max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
