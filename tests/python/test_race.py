@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import pytest
+
 import ftlm
+from ftlm.estimation.output_error import fit_output_error
 from plants import resonant_plant
 
 
@@ -28,3 +33,33 @@ def test_of_two_free_orders_each_is_known_in_a_race_of_its_own_where_noise_would
     assert fits[0] is not None
     assert fits[1] is not None
     assert fits[1].noise["y"] < 1.0005 * fits[0].noise["y"]
+
+
+def test_the_order_of_an_input_is_freed_from_where_orders_are_integers() -> None:
+    run, noise = resonant_plant(4), []
+    for text in ("D^alpha y = d D^mu y + a y + b u", "D^alpha y = d D^mu y + a y + b u + c D^gamma u"):
+        found = ftlm.identify(
+            run, ftlm.equation(text, initial="rest"), method=ftlm.OutputError(intervals="quadratic"), threads=1
+        )
+        assert found.fit is not None
+        noise.append(found.fit.noise["y"])
+    assert noise[1] < 0.99995 * noise[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_structure_is_never_worse_than_one_inside_it(wrong: bool) -> None:
+    chain = (
+        "D^2 y = d D y + a y + b u",
+        "D^alpha y = d D y + a y + b u",
+        "D^alpha y = d D^mu y + a y + b u",
+        "D^alpha y = d D^mu y + a y + b u + c D^gamma u",
+    )
+    worse = []
+    for seed in range(40):
+        run = resonant_plant(seed, wrong=wrong)
+        costs = [
+            fit_output_error([run], ftlm.equation(text, initial="rest"), threads=1).noise["y"] ** 2 for text in chain
+        ]
+        worse += [(seed, richer / simpler) for simpler, richer in pairwise(costs) if richer > 1.001 * simpler]
+    assert worse == []

@@ -149,6 +149,12 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
 
 #[test]
 fn the_correction_of_a_long_record_for_its_step_ends_where_finer_grids_do() {
+    // Of the second record the grid is off by half of the noise.
+    correction_ends_where_finer_grids_do(0.01);
+    correction_ends_where_finer_grids_do(0.003);
+}
+
+fn correction_ends_where_finer_grids_do(size: f64) {
     let (step, decay, rows) = (0.05, (-0.1_f64).exp(), 33_000);
     let mut random = Random::new(3);
     let u = random.steps(rows, 15);
@@ -157,7 +163,7 @@ fn the_correction_of_a_long_record_for_its_step_ends_where_finer_grids_do() {
         .map(|(u, noise)| {
             let here = state;
             state = decay * state + (1.0 - decay) * u;
-            here + 0.01 * noise
+            here + size * noise
         })
         .collect();
     let none = || order(0.0, &[0.0]);
@@ -165,7 +171,7 @@ fn the_correction_of_a_long_record_for_its_step_ends_where_finer_grids_do() {
     let equation = FreeEquation { output: 0, order: order(0.0, &[1.0]), terms };
     let problem = problem(equation, &[(0.05, 3.0)], 2, Initial::Rest);
     let (source, stop) = (sampled(step, &[y], &[u]), Stop::default());
-    let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
+    let grid = Objective::new((&problem, &source, &stop), weighing(1.0 / size), sampling(1, 1), false).unwrap();
     let (best, grid) = fit_reweighted(&place(&[1.1], &[-2.2, 2.2]), grid, Loss::Squares).unwrap();
     let corrected = correct_step(&best, &grid, Loss::Squares).unwrap().unwrap().into_statistics();
     let refined = refine_step(best.clone(), grid, Loss::Squares, &[]).unwrap().into_statistics();
@@ -180,7 +186,7 @@ fn the_correction_of_a_long_record_for_its_step_ends_where_finer_grids_do() {
         assert!((found - truth).abs() < 4.0 * error, "{found} ± {error}");
         assert!((error / refined.covariance[k * 4].sqrt() - 1.0).abs() < 0.02);
     }
-    close("noise", &corrected.noise, &refined.noise, 1e-3);
+    close("noise", &corrected.noise, &refined.noise, 3e-3);
 }
 
 /// y′ = −2 y + 2 u with a little noise, in exact steps, and D y = −a y + b u, whatever the run starts from.

@@ -10,10 +10,6 @@ use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Order, Structure, Term};
 use ftlm::estimation::joint_fit::Candidate;
 use ftlm::estimation::output_error::{FreeInput, InputLaw};
-use ftlm::order_search::batches::search;
-use ftlm::order_search::control::Control;
-use ftlm::order_search::grid::{OrderGrid, TermAxis};
-use ftlm::order_search::options::Options;
 use ftlm::parallel::Stop;
 use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
 use ftlm::regressors::{Record, BANK_LIMIT};
@@ -127,22 +123,6 @@ fn starts_of_a_known_plant_hold_one_near_the_truth_whatever_the_threads() {
     check("distance from the truth", one.iter().map(distance).fold(f64::INFINITY, f64::min), 0.15);
     assert!(one.iter().any(|r| r.origin == "no prefilter") && one.iter().any(|r| r.origin == "scan of resonances"));
     assert!(one[0].origin.starts_with("prefilter ") && one[0].origin.ends_with(" rad/s"));
-}
-
-#[test]
-fn the_best_row_is_followed_to_where_no_neighbour_is_better() {
-    let source = runs();
-    let all = found(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
-    let best = &all.iter().find(|r| r.origin == "no prefilter").unwrap().result.iterate.point.orders;
-    let records = source.records(799.min(source.samples(0).unwrap()[0].len() - 1), &[]).unwrap();
-    let axis = |signal, values| TermAxis { signal, values, interchangeable: false };
-    let around = |v: f64| vec![v - 0.05, v, v + 0.05];
-    let terms = [axis(0, around(best[1])), axis(0, vec![0.0]), axis(1, vec![0.0])];
-    let lattice = OrderGrid::new(0, &around(best[0]), &terms, |s| s == 1).unwrap();
-    let options = Options { top: 1, pruning: false, ..Options::default() };
-    let table = search(&records, &lattice, &[None; 3], &options, &Control::default()).unwrap();
-    let at = lattice.structure(table.rows[0].index);
-    assert!((at.order - best[0]).abs() < 1e-9 && (at.terms[0].order - best[1]).abs() < 1e-9);
 }
 
 #[test]

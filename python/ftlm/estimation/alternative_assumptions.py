@@ -15,8 +15,8 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import number_covariance
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.nuisance_parameters import fit_score, refit_from
-from ftlm.estimation.output_error import JointFit
+from ftlm.estimation.nuisance_parameters import fit_score
+from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
@@ -53,7 +53,7 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
         if (initial, offset) == taken:
             continue
         try:
-            other = refit_from(joint, runs, replace(structure, initial=initial, offset=offset))
+            other = fit_output_error(runs, replace(structure, initial=initial, offset=offset), near=joint, refine=False)
         except FtlmError:
             continue
         ratio = max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
@@ -88,7 +88,7 @@ def intersample_findings(fit: Fit) -> list[Finding]:
         other: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
         changed = tuple(run.with_intersample({name: other}) for run in runs)
         try:
-            refit = refit_from(joint, changed, replace(structure, initial=joint.initial))
+            refit = fit_output_error(changed, replace(structure, initial=joint.initial), near=joint, refine=False)
         except FtlmError:
             continue
         if refit.unstable_optimum is not None:

@@ -315,6 +315,12 @@ def fit_output_error(
     given_near = None
     if near is not None:
         given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
+    automatic = start is None and near is None and not known
+    if automatic and problem.orders and structure.is_linear:
+        # A fit would leave the coefficients undetermined, after a search of all orders.
+        why = describe_collinear_inputs(runs, structure)
+        if why is not None:
+            raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
     found = _core.joint_fit(
         problem.core,
         [recording(run, structure) for run in runs],

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::initial_guesses::OrderGrids;
 use super::multistart::{
     leading_part, run_friction_multistart, run_multistart, run_nonlinear_multistart, select_survivors,
-    InitialGuessSource, MultistartContext,
+    InitialGuessSource, MultistartContext, SELECTION_INTERVALS,
 };
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::ParameterSet;
@@ -33,8 +33,6 @@ const MIN_NOISE_RATIO: f64 = 1e-3;
 const MIN_NOISE_DEVIATION: f64 = 1e-300;
 /// Maximum evaluations of each survivor on all samples, or on the first part of a long record.
 const MAX_FINAL_EVALUATIONS: usize = 60;
-/// Number of intervals of the first part of long records, on which the best survivor is selected.
-const SELECTION_INTERVALS: usize = 6000;
 
 /// Standard deviation of an output, and an initial guess of its noise standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]

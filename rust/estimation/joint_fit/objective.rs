@@ -13,7 +13,7 @@ use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 /// Relative cost decrease predicted for a full step below which an optimization has converged.
 pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
 /// Largest acceptable discretization error, in standard deviations of the noise.
-pub(super) const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
+const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
 /// Finest grid, in block pulses per sampling interval.
 pub const MAX_PULSES_PER_SAMPLE: usize = 16;
 

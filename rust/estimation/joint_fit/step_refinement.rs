@@ -1,7 +1,7 @@
 //! Step refinement: the step is halved until the estimate changes by a small part of its standard error.
 
 use super::covariance::covariance;
-use super::objective::{Objective, Weights, MAX_DISCRETIZATION_NOISE_RATIO, MAX_PULSES_PER_SAMPLE};
+use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::TimeScaling;
 use super::problem::{Iterate, OptimizationResult};
 use super::reweighting::{fit_reweighted, Loss, RobustSummary};
@@ -16,6 +16,8 @@ const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
 /// Fewest block pulses of a grid whose optimum is corrected for its step without optimizations on finer grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
+/// Corrections by one pair of finer grids. Each leaves about the relative error of the grid of the last one.
+const MAX_CORRECTIONS: usize = 4;
 
 /// Optimum on the finest grid, and its extrapolation to zero step.
 #[derive(Clone)]
@@ -118,7 +120,7 @@ pub fn refine_step<'a>(
 ///
 /// The residuals of two finer grids at the optimum, extrapolated to zero step, replace those of the grid: the difference
 /// depends on the parameters only slightly, so that it is added to the samples and the grid is fitted again (Stetter,
-/// doi:10.1007/BF01432879). The finer grids are simulated once each, without derivatives.
+/// doi:10.1007/BF01432879), until the estimate does not move. The finer grids are simulated without derivatives.
 ///
 /// # Errors
 /// As [`covariance`] and the source; [`Error::Interrupted`].
@@ -131,21 +133,29 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
     let (mut place, mut here, mut coarse) = (best.clone(), grid.clone(), grid.clone());
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         let fine = coarse.finer()?;
-        let Some(shifts) = limit_shifts(&place.iterate, grid, &coarse, &fine)? else { return Ok(None) };
-        let corrected = grid.with_weights(here.weights.clone())?.with_residual_shifts(&shifts);
-        let (next, next_grid) = match fit_reweighted(&place.iterate, corrected, loss) {
-            Err(Error::Interrupted) => return Err(Error::Interrupted),
-            Ok(found) if found.0.has_converged() => found,
-            _ => return Ok(None),
-        };
-        let spread = covariance(&next, &next_grid)?;
-        if is_within_errors(&clock, &next.values(), &place.values(), (&next.values(), &spread)) {
-            let estimate = next.values();
-            let attempt = OptimizationResult { iterate: best.iterate.clone(), ..next };
-            let grid = next_grid;
-            return Ok(Some(Optimum { attempt, grid, estimate, step_converged: true, covariance: spread }));
+        for correction in 0..MAX_CORRECTIONS {
+            let Some(shifts) = limit_shifts(&place.iterate, grid, &coarse, &fine)? else { return Ok(None) };
+            let corrected = grid.with_weights(here.weights.clone())?.with_residual_shifts(&shifts);
+            let (next, next_grid) = match fit_reweighted(&place.iterate, corrected, loss) {
+                Err(Error::Interrupted) => return Err(Error::Interrupted),
+                Ok(found) if found.0.has_converged() => found,
+                _ => return Ok(None),
+            };
+            let spread = covariance(&next, &next_grid)?;
+            let is_still = is_within_errors(&clock, &next.values(), &place.values(), (&next.values(), &spread));
+            if is_still && correction == 0 {
+                // The optimum is that of the pair of coarser grids.
+                let estimate = next.values();
+                let attempt = OptimizationResult { iterate: best.iterate.clone(), ..next };
+                let grid = next_grid;
+                return Ok(Some(Optimum { attempt, grid, estimate, step_converged: true, covariance: spread }));
+            }
+            (place, here) = (next, next_grid);
+            if is_still {
+                break;
+            }
         }
-        (place, here, coarse) = (next, next_grid, fine);
+        coarse = fine;
     }
     Ok(None)
 }
@@ -177,7 +187,7 @@ fn limit_shifts(
     for run in &shifts {
         power += run.iter().zip(&grid.weights.outputs).map(|(s, weight)| finite_squares(s, *weight)).sum::<f64>();
     }
-    Ok((power <= MAX_DISCRETIZATION_NOISE_RATIO * MAX_DISCRETIZATION_NOISE_RATIO * noise).then_some(shifts))
+    Ok((power <= noise).then_some(shifts))
 }
 
 /// Sum of the squares of the finite values times a weight.

@@ -18,6 +18,8 @@ use crate::error::{check_length, Error, Result};
 
 /// Damping of the first step: close to Gauss–Newton, but safe for an initial guess that is off by some tens of percent.
 const INITIAL_DAMPING: f64 = 1e-3;
+/// Damping of the first step near an optimum: almost Gauss–Newton, which takes no steps along a valley.
+const INITIAL_DAMPING_NEAR_OPTIMUM: f64 = 1e-6;
 /// Damping above which a step is at rounding level.
 const MAX_DAMPING: f64 = 1e12;
 /// Factor by which an accurately predicted step decreases the damping and a rejected step increases it.
@@ -208,7 +210,9 @@ impl<P: Problem> Search<'_, P> {
         let evaluation = self.problem.evaluate(&start)?;
         let point = self.problem.point_of_evaluation(&evaluation, start);
         let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.is_admissible(&point));
-        let (damping, curvature) = (INITIAL_DAMPING, Curvature::new(0));
+        let is_near = self.problem.allows_extrapolation();
+        let damping = if is_near { INITIAL_DAMPING_NEAR_OPTIMUM } else { INITIAL_DAMPING };
+        let curvature = Curvature::new(0);
         Ok(SearchState { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
     }
 

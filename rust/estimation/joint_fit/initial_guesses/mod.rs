@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 
 pub use prefilter::power_frequency;
 
-use self::order_grid::{grid_candidates, law_candidates, linspace, natural_axes, start_axes, GridSearch};
+use self::order_grid::{grid_candidate, law_candidates, linspace, natural_axes, start_axes, GridSearch};
 use self::prefilter::LowPassCache;
 use self::resonances::scan_candidates;
 use super::format::format_general;
@@ -29,9 +29,7 @@ use crate::signal::statistics::median;
 /// Maximum number of block pulses of the records for initial guesses.
 const MAX_START_PULSES: usize = 1024;
 /// Cutoff frequencies of the prefilters relative to the bandwidth of the outputs; None for no prefilter.
-const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 5] = [Some(1.0), Some(2.0), Some(4.0), Some(8.0), None];
-/// Minimum difference in some order between the candidates of one grid.
-const MIN_ORDER_SEPARATION: f64 = 0.35;
+const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 2] = [Some(2.0), None];
 /// Difference below which two orders are equal.
 const ORDER_TOLERANCE: f64 = 1e-9;
 
@@ -104,8 +102,7 @@ impl<'a> OrderGrids<'a> {
         self.check_hold_orders(free)?;
         let frequency = median(frequencies.concat());
         let natural = natural_axes(free);
-        let mut lattices = vec![(start_axes(free), MIN_ORDER_SEPARATION)];
-        lattices.extend(natural.iter().map(|axes| (axes.clone(), 0.0)));
+        let grids: Vec<_> = std::iter::once(start_axes(free)).chain(natural.clone()).collect();
         let unfiltered = self.source.records(self.pulse_count(free)?, numbers)?;
         let unfiltered = self.prefilter(&unfiltered, None)?;
         let fastest = PI / unfiltered.iter().map(Record::step).fold(f64::NEG_INFINITY, f64::max);
@@ -131,13 +128,11 @@ impl<'a> OrderGrids<'a> {
             let words = |corner| format!("prefilter {} rad/s", format_general(corner, 3));
             let origin = corner.map_or_else(|| "no prefilter".into(), words);
             let mut here: Vec<Candidate> = Vec::new();
-            for lattice in &lattices {
-                let more = grid_candidates(free, &coarse, lattice, &origin, &here)?;
+            for axes in &grids {
+                let more = grid_candidate(free, &coarse, axes, &origin, &here)?;
                 here.extend(more);
             }
-            if let Some(axes) =
-                natural.as_ref().filter(|_| multiple == PREFILTER_CUTOFF_RATIOS[0] || multiple.is_none())
-            {
+            if let Some(axes) = &natural {
                 here.extend(law_candidates(free, &coarse, axes, &origin)?);
             }
             attempts.extend(here);

@@ -34,11 +34,6 @@ impl GridRow {
         names.iter().map(value).collect()
     }
 
-    /// True if another row has the same orders, in any sequence.
-    pub(super) fn has_same_orders(&self, other: &Self) -> bool {
-        self.orders.len() == other.orders.len() && self.orders.iter().all(|pair| other.orders.contains(pair))
-    }
-
     /// Merge the orders and coefficients of another row into this one.
     fn merge(&mut self, other: &Self) {
         for (name, value) in &other.orders {
@@ -222,14 +217,8 @@ fn standard_deviation(values: &[f64]) -> f64 {
     mean(&squares).sqrt()
 }
 
-/// Increments of the local refinement of a grid point, and maximum number of moves with each.
-const LOCAL_INCREMENTS: [f64; 2] = [0.1, 0.05];
-const MAX_LOCAL_MOVES: usize = 8;
-/// Best rows of the table of each prefilter to examine first, then at most, and maximum number of initial guesses: the
-/// best row, then rows that differ sufficiently in some order.
-const FIRST_ROWS: usize = 25;
-const ROWS_PER_FILTER: usize = 400;
-const STARTS_PER_FILTER: usize = 4;
+/// Best rows of an order grid from which the coefficients follow by a law.
+const ROWS_BY_LAW: usize = 4;
 /// Ratios of a coefficient law at which the coefficients of one equation follow from those of another.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
 /// Absolute and relative difference below which two orders are equal.
@@ -240,75 +229,22 @@ pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &s
     Candidate::at(Iterate { point: Point { orders, coefficients, inputs: Vec::new() }, states: Vec::new() }, origin)
 }
 
-/// Candidates from separated rows of an order grid, the best one refined locally, without earlier candidates.
-pub(super) fn grid_candidates(
+/// Candidate from the best row of an order grid; None if an earlier candidate has its orders.
+pub(super) fn grid_candidate(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
-    (axes, apart): &(Axes, f64),
+    axes: &Axes,
     origin: &str,
     before: &[Candidate],
-) -> Result<Vec<Candidate>> {
-    let mut attempts: Vec<Candidate> = Vec::new();
-    let mut rows = SeparatedRows::new(free, coarse, axes, *apart);
-    let mut rank = 0;
-    while let Some(row) = rows.next()? {
-        let start = if rank == 0 { refine_locally(free, coarse, row)? } else { row };
-        rank += 1;
-        let values = start.values(&free.orders);
-        if before.iter().chain(&attempts).any(|other| are_orders_close(&values, &other.result.iterate.point.orders)) {
-            continue;
-        }
-        attempts.push(new_candidate(values, free.free_from(&start.coefficients), origin));
-        if rank >= STARTS_PER_FILTER {
-            break;
-        }
-    }
-    Ok(attempts)
+) -> Result<Option<Candidate>> {
+    let Some(row) = coarse.best_rows(&free.structure, axes, 1)?.into_iter().next() else { return Ok(None) };
+    let values = row.values(&free.orders);
+    let is_known = before.iter().any(|other| are_orders_close(&values, &other.result.iterate.point.orders));
+    Ok((!is_known).then(|| new_candidate(values, free.free_from(&row.coefficients), origin)))
 }
 
 fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
     values.iter().zip(others).all(|(a, b)| (a - b).abs() <= ORDER_TOLERANCES.0 + ORDER_TOLERANCES.1 * b.abs())
-}
-
-/// Iterator over the best rows of an order grid that differ from all previous ones in some order.
-struct SeparatedRows<'a> {
-    free: &'a ParameterSet,
-    coarse: &'a GridSearch<'a>,
-    axes: &'a Axes,
-    apart: f64,
-    picked: Vec<Vec<f64>>,
-    rows: std::vec::IntoIter<GridRow>,
-    seen: usize,
-    /// Table sizes still to request; empty if there are no more rows.
-    wanted: Vec<usize>,
-}
-
-impl<'a> SeparatedRows<'a> {
-    fn new(free: &'a ParameterSet, coarse: &'a GridSearch<'a>, axes: &'a Axes, apart: f64) -> Self {
-        let (picked, rows, wanted) = (Vec::new(), Vec::new().into_iter(), vec![ROWS_PER_FILTER, FIRST_ROWS]);
-        Self { free, coarse, axes, apart, picked, rows, seen: 0, wanted }
-    }
-
-    fn next(&mut self) -> Result<Option<GridRow>> {
-        loop {
-            for row in self.rows.by_ref() {
-                let values = row.values(&self.free.orders);
-                let distance = |p: &Vec<f64>| p.iter().zip(&values).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-                if self.picked.iter().all(|p| distance(p) >= self.apart) {
-                    self.picked.push(values);
-                    return Ok(Some(row));
-                }
-            }
-            let Some(keep) = self.wanted.pop() else { return Ok(None) };
-            let mut rows = self.coarse.best_rows(&self.free.structure, self.axes, keep)?;
-            let found = rows.len();
-            rows.drain(..self.seen.min(found));
-            (self.rows, self.seen) = (rows.into_iter(), found);
-            if found < keep {
-                self.wanted.clear();
-            }
-        }
-    }
 }
 
 /// Candidates with the coefficients of one equation from another by the law, the rest by least squares.
@@ -332,7 +268,7 @@ pub(super) fn law_candidates(
     }
     let named = structure.coefficient_names();
     let mut attempts = Vec::new();
-    for row in coarse.best_rows(structure, axes, STARTS_PER_FILTER)? {
+    for row in coarse.best_rows(structure, axes, ROWS_BY_LAW)? {
         let point: Axes = row.orders.iter().map(|(name, value)| (name.clone(), vec![*value])).collect();
         for ratio in LAW_RATIOS {
             let value = |(law, first, others): &(&Law, &String, usize)| {
@@ -356,38 +292,6 @@ pub(super) fn law_candidates(
         }
     }
     Ok(attempts)
-}
-
-/// Refine a row locally on finer grids around it.
-fn refine_locally(free: &ParameterSet, coarse: &GridSearch<'_>, mut row: GridRow) -> Result<GridRow> {
-    if row.orders.is_empty() {
-        return Ok(row);
-    }
-    for step in LOCAL_INCREMENTS {
-        for _ in 0..MAX_LOCAL_MOVES {
-            let axis = |(name, value): &(String, f64)| {
-                let place = free.orders.iter().position(|n| n == name);
-                let (low, high) = place.map_or((*value, *value), |at| free.bounds()[at]);
-                let around = [value - step, *value, value + step];
-                let mut values: Vec<f64> = around.iter().map(|v| round_nine_decimals(v.max(low).min(high))).collect();
-                values.sort_by(f64::total_cmp);
-                values.dedup();
-                (name.clone(), values)
-            };
-            let axes: Axes = row.orders.iter().map(axis).collect();
-            let found = coarse.best_rows(&free.structure, &axes, 1)?.into_iter().next();
-            match found {
-                Some(best) if !best.has_same_orders(&row) => row = best,
-                _ => break,
-            }
-        }
-    }
-    Ok(row)
-}
-
-/// Round a value to nine decimals.
-fn round_nine_decimals(value: f64) -> f64 {
-    format!("{value:.9}").parse().unwrap_or(value)
 }
 
 /// Increment of the order grid of the initial guesses; a start within half of it leads to the optimum.

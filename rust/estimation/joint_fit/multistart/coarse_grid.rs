@@ -1,93 +1,10 @@
 //! Coarse grid of the multistart: subsampled records on which candidates compete.
 
-use super::halving::{
-    are_all_close, is_same_iterate, is_same_optimum, merge_duplicates, RungExecutor, FIRST_BUDGET_EVALUATIONS,
-    PRESCREEN_EVALUATIONS,
-};
 use crate::error::Result;
 use crate::estimation::joint_fit::initial_guesses::power_frequency;
-use crate::estimation::joint_fit::objective::{Objective, MAX_PULSES_PER_SAMPLE};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
-use crate::estimation::joint_fit::problem::Candidate;
 use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::mean;
-
-/// Number of candidates that determine the step of the coarse grid.
-const PILOT_CANDIDATES: usize = 3;
-/// Largest relative change of a parameter of the best candidate on a finer grid for which the ranking is stable.
-const MAX_PARAMETER_CHANGE_RATIO: f64 = 0.1;
-
-/// Coarse grid and the candidates optimized on it so far.
-pub(super) struct CoarseGrid<'a> {
-    pub grid: Objective<'a>,
-    /// The grid of half the step, if it was computed.
-    pub half: Option<Objective<'a>>,
-    /// Remaining candidates after the prescreening.
-    pub prescreened_candidates: Vec<Candidate>,
-    /// Pilot candidates after the first budget.
-    pub pilots: Vec<Candidate>,
-}
-
-/// Choose the coarse grid by a few pilot candidates.
-///
-/// A stiff equation may have no stable scheme on a coarse grid, and a coarse grid has spurious optima. The step is
-/// halved until the pilot candidates no longer change; then all candidates start on that grid.
-pub(super) fn choose_coarse_grid<'a>(
-    laps: RungExecutor<'_>,
-    free: &ParameterSet,
-    coarse: Objective<'a>,
-    starts: &[Candidate],
-) -> Result<CoarseGrid<'a>> {
-    let glance = |grid: &Objective<'_>, starts: &[Candidate]| {
-        Ok(merge_duplicates(&laps.run(free, grid, starts, PRESCREEN_EVALUATIONS)?, is_same_iterate))
-    };
-    let mut glanced: Vec<Candidate> = glance(&coarse, starts)?;
-    if starts.len() <= PILOT_CANDIDATES || coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
-        return Ok(CoarseGrid { grid: coarse, half: None, prescreened_candidates: glanced, pilots: Vec::new() });
-    }
-    let (first, mut coarse) = (coarse.sampling.pulses_per_sample, coarse);
-    let mut before: Vec<(Objective<'a>, Candidate)> = Vec::new();
-    let mut pioneers: Vec<Candidate> = glanced.iter().take(PILOT_CANDIDATES).cloned().collect();
-    let mut half = None;
-    let reached = loop {
-        if coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
-            break pioneers;
-        }
-        let reached = laps.run(free, &coarse, &pioneers, FIRST_BUDGET_EVALUATIONS)?;
-        let finer = coarse.finer()?;
-        if let Some(best) = reached.first() {
-            if !coarse.is_refinement_significant(&best.result.iterate, &finer)? {
-                half = Some(finer);
-                break reached;
-            }
-            before.push((coarse, best.clone()));
-        }
-        (coarse, pioneers) = (finer, reached);
-        if pioneers.is_empty() {
-            // If no pilot has a stable scheme, other candidates may have one on half the step.
-            pioneers = glance(&coarse, starts)?;
-            pioneers.truncate(PILOT_CANDIDATES);
-        }
-    };
-    if coarse.sampling.pulses_per_sample == first {
-        glanced.drain(..PILOT_CANDIDATES.min(glanced.len()));
-        return Ok(CoarseGrid { grid: coarse, half, prescreened_candidates: glanced, pilots: reached });
-    }
-    let told = reached.first().map(|best| best.result.values());
-    let alike = |(_, best): &&(Objective<'a>, Candidate)| {
-        told.as_ref().is_some_and(|told| are_all_close(&best.result.values(), told, MAX_PARAMETER_CHANGE_RATIO, 0.0))
-    };
-    let mut starts = starts.to_vec();
-    if let Some((grid, _)) = before.iter().find(alike) {
-        let glanced = glance(grid, &starts)?;
-        if glanced.iter().map(|runner| 1 + runner.duplicates.len()).sum::<usize>() == starts.len() {
-            // This coarser grid has nearly the same optimum: one candidate per optimum found there continues.
-            starts = merge_duplicates(&laps.run(free, grid, &glanced, FIRST_BUDGET_EVALUATIONS)?, is_same_optimum);
-        }
-    }
-    let glanced = glance(&coarse, &starts)?;
-    Ok(CoarseGrid { grid: coarse, half, prescreened_candidates: glanced, pilots: Vec::new() })
-}
 
 /// Samples of the coarse fits over all runs; each run has at least [`MIN_RUN_SAMPLES`].
 const MAX_COARSE_SAMPLES: usize = 1200;

@@ -1,10 +1,11 @@
 //! Multistart with successive halving: short fits on subsampled records, of which the best continue.
 //!
 //! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
-//! samples. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
-//! term less ([`ReducedProblem`]), a lower order ([`LowerOrderProblem`]), one fixed order ([`FixedOrderProblem`]) or
-//! integer orders ([`IntegerOrderProblem`]). Bodies with friction start from linear fits ([`run_friction_multistart`]),
-//! non-linear terms from fits with the measured values of their expressions ([`run_nonlinear_multistart`]).
+//! samples. They start from optima of integer orders with the orders freed ([`IntegerOrderProblem`]) and from order
+//! grids. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
+//! term less ([`ReducedProblem`]) or one fixed order ([`FixedOrderProblem`]). Bodies with friction start from linear
+//! fits ([`run_friction_multistart`]), non-linear terms from fits with the measured values of their expressions
+//! ([`run_nonlinear_multistart`]).
 
 mod coarse_grid;
 mod friction;
@@ -18,8 +19,8 @@ pub use coarse_grid::{coarse_sampling, leading_part};
 pub use friction::run_friction_multistart;
 pub use halving::{competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors};
 pub use nested_models::{
-    distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
-    FixedOrderProblem, IntegerOrderProblem, LowerOrderProblem, ReducedProblem,
+    fixed_order_problems, integer_order_problems, reduced_problems, FixedOrderProblem, IntegerOrderProblem,
+    ReducedProblem,
 };
 pub use nonlinear::run_nonlinear_multistart;
-pub use search::{run_multistart, InitialGuessSource, MultistartContext};
+pub use search::{run_multistart, InitialGuessSource, MultistartContext, SELECTION_INTERVALS};

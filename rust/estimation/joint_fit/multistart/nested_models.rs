@@ -1,12 +1,11 @@
-//! Submodels: one term less, one fixed order, a lower order, or integer orders.
+//! Submodels: one term less, one fixed order, or integer orders.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use crate::equation::Initial;
 use crate::estimation::joint_fit::format::format_general;
 use crate::estimation::joint_fit::parameter_set::{ParameterSet, TimeScaling};
 use crate::estimation::joint_fit::problem::{Candidate, Iterate, OptimizationResult};
-use crate::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure};
+use crate::estimation::joint_fit::structure::{Coefficient, Equation, Order};
 use crate::estimation::output_error::Point;
 
 /// Submodel with one term removed or its coefficient fixed.
@@ -108,131 +107,6 @@ pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
         }
     }
     out
-}
-
-/// Remove problems that differ only in the names of their free parameters.
-#[must_use]
-pub fn distinct_problems(problems: Vec<ReducedProblem>) -> Vec<ReducedProblem> {
-    let mut seen = BTreeSet::new();
-    problems.into_iter().filter(|less| canonical_equation(less).is_none_or(|key| seen.insert(key))).collect()
-}
-
-/// Canonical text of an equation, with sorted terms and bounds in place of order names.
-///
-/// None if problems with equal text can still differ.
-fn canonical_equation(less: &ReducedProblem) -> Option<String> {
-    let structure = &less.free.structure;
-    let [item] = structure.equations.as_slice() else { return None };
-    if less.keeps_signals || structure.delayed {
-        return None;
-    }
-    let bound = |name: &String| less.free.orders.iter().position(|o| o == name).map(|at| less.free.bounds()[at]);
-    let of = |order: &Order| {
-        let weights: Vec<_> = order.weights.iter().map(|(name, weight)| (*weight, bound(name))).collect();
-        format!("{:?} {weights:?}", order.constant)
-    };
-    let term = |t: &crate::estimation::joint_fit::structure::Term| {
-        format!("{} {} {:?} {:?}", t.signal, of(&t.order), t.fixed_coefficient(), t.factor)
-    };
-    let mut terms: Vec<String> = item.terms.iter().map(term).collect();
-    terms.sort();
-    Some(format!("{} {} {terms:?}", item.output, of(&item.order)))
-}
-
-/// Frequency at which a pole is too fast to be identified from the samples.
-const FAST_POLE_RADIANS_PER_SAMPLE: f64 = 0.2;
-/// Difference below which two exponents of t are equal.
-const EXPONENT_TOLERANCE: f64 = 1e-9;
-
-/// Submodel of lower order: the highest autoregressive term takes the place of the highest derivative.
-///
-/// The coefficient of that term, without its fixed factor, is 1 in the submodel and `fast` in the full one.
-/// `others` are the coefficients of the remaining terms of the equation.
-#[derive(Debug, Clone, PartialEq)]
-pub struct LowerOrderProblem {
-    /// Free parameters.
-    pub free: ParameterSet,
-    coefficient: String,
-    factor: f64,
-    others: BTreeSet<String>,
-    fast: f64,
-}
-
-impl LowerOrderProblem {
-    /// Embed a candidate in the full problem: same dynamics with an additional fast pole.
-    #[must_use]
-    pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
-        let point = &runner.result.iterate.point;
-        let value = |name: &String| {
-            if *name == self.coefficient {
-                return -self.fast / self.factor;
-            }
-            let at = self.free.coefficients.iter().position(|c| c == name);
-            let value = at.map_or(0.0, |at| point.coefficients[at]);
-            if self.others.contains(name) {
-                self.fast * value
-            } else {
-                value
-            }
-        };
-        let order = |name: &String| self.free.orders.iter().position(|o| o == name).map_or(0.0, |at| point.orders[at]);
-        let mut found = runner.clone();
-        found.result.iterate.point.orders = whole.orders.iter().map(order).collect();
-        found.result.iterate.point.coefficients = whole.coefficients.iter().map(value).collect();
-        found.origin = format!("{}, from the equation of lower order", runner.origin);
-        found
-    }
-}
-
-/// Submodel of lower order of a single equation with fixed autoregressive orders; `step` is the sampling interval
-/// \[s\]. Free orders reach the lower order without it.
-#[must_use]
-pub fn lower_order_problem(free: &ParameterSet, step: f64) -> Option<LowerOrderProblem> {
-    let structure = &free.structure;
-    let [item] = structure.equations.as_slice() else { return None };
-    if structure.has_order_law() || !free.products.is_empty() || item.order.is_free() {
-        return None;
-    }
-    if item.autoregressive_terms().any(|term| term.order.is_free()) {
-        return None;
-    }
-    let own = item.terms.iter().enumerate().filter(|(_, term)| term.signal == item.output);
-    let (place, highest) =
-        own.reduce(|best, next| if next.1.order.constant > best.1.order.constant { next } else { best })?;
-    let Coefficient::Free(name) = &highest.coefficient else { return None };
-    let mut rest = item.terms.clone();
-    rest.remove(place);
-    let order = highest.order.constant;
-    if order <= 0.0
-        || rest.iter().any(|term| term.fixed_coefficient().is_some() || term.coefficient == highest.coefficient)
-    {
-        return None;
-    }
-    let mut driving = rest.iter().filter(|term| term.signal != item.output && !term.order.is_free());
-    if driving.any(|term| term.order.constant > order) {
-        // A term of another signal would exceed the lower order, which is invalid with a zero-order hold.
-        return None;
-    }
-    let others = rest.iter().filter_map(|term| term.coefficient.name().cloned()).collect();
-    let initial =
-        if structure.history { structure.initial.clone() } else { initial_terms_below(&structure.initial, order)? };
-    let lower = Equation { order: highest.order.clone(), terms: rest, ..item.clone() };
-    // The construction fails if a term of another signal exceeds the lower order.
-    let reduced = ParameterSet::from_structure(Structure { initial, ..structure.with_equation(0, lower) }).ok()?;
-    let fast = libm::pow(FAST_POLE_RADIANS_PER_SAMPLE / step, item.order.constant - order);
-    Some(LowerOrderProblem { free: reduced, coefficient: name.clone(), factor: highest.factor, others, fast })
-}
-
-/// Initial terms with exponents below an order; None if one of them coincides with an exponent of the offset.
-fn initial_terms_below(initial: &Initial, order: f64) -> Option<Initial> {
-    let Initial::Powers(powers) = initial.under() else { return Some(initial.clone()) };
-    let powers: Vec<f64> = powers.iter().copied().filter(|power| *power < order).collect();
-    let offsets = initial.offset_exponents(order);
-    if powers.iter().any(|power| offsets.iter().any(|offset| (power - offset).abs() < EXPONENT_TOLERANCE)) {
-        return None;
-    }
-    let under = if powers.is_empty() { Initial::Rest } else { Initial::Powers(powers) };
-    Some(initial.with_under(under))
 }
 
 /// Integer values of a free order; at most [`MAX_INTEGER_ORDER_PROBLEMS`] combinations are tried.

@@ -1,14 +1,13 @@
 //! Multistart with successive halving: candidates, budgets, promotion and submodels.
 
-use super::coarse_grid::{choose_coarse_grid, coarse_sampling};
+use super::coarse_grid::{coarse_sampling, leading_part};
 use super::halving::{
     competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors, sort_by_cost,
     RungExecutor, CANDIDATES_PER_SURVIVOR, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO,
     MIN_SURVIVORS, PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS,
 };
 use super::nested_models::{
-    distinct_problems, fixed_order_problems, integer_order_problems, lower_order_problem, reduced_problems,
-    FixedOrderProblem, IntegerOrderProblem, LowerOrderProblem, ReducedProblem,
+    fixed_order_problems, integer_order_problems, reduced_problems, FixedOrderProblem, ReducedProblem,
 };
 use crate::equation::Initial;
 use crate::error::{Error, Kind, Result};
@@ -16,14 +15,14 @@ use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER
 use crate::estimation::joint_fit::parameter_set::{ParameterSet, TimeScaling};
 use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::progress::ProgressListener;
-use crate::estimation::joint_fit::structure::{Equation, Structure};
+use crate::estimation::joint_fit::structure::Structure;
 use crate::parallel::Stop;
 use crate::recording::{Recordings, Sampling};
 
-/// Ratio of the best cost to the noise floor above which candidates behind the best are promoted, too. Candidates up to
-/// [`MAX_PROMOTION_COST_RATIO`] are promoted if they improve in a few evaluations.
+/// Ratio of the best cost to the noise floor above which problems with one free order get a multistart of their own.
 pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
-const MAX_PROMOTION_COST_RATIO: f64 = 100.0;
+/// Intervals of long records on which problems of integer orders are fitted for their initial guesses.
+pub const SELECTION_INTERVALS: usize = 6000;
 
 /// Source of initial guesses.
 pub trait InitialGuessSource {
@@ -36,7 +35,7 @@ pub trait InitialGuessSource {
     /// Source of initial guesses on other recordings.
     fn for_recordings<'b>(&'b self, source: &'b Recordings) -> Box<dyn InitialGuessSource + 'b>;
 
-    /// Optima of a problem of integer orders on all samples; None for other problems.
+    /// Optima of a problem of integer orders on the samples of a grid; None for other problems.
     ///
     /// # Errors
     /// As [`InitialGuessSource::initial_guesses`].
@@ -73,10 +72,6 @@ impl<'a> MultistartContext<'a> {
     fn time_scaling(self, free: &ParameterSet) -> TimeScaling {
         TimeScaling::from_runs(&free.problem, &self.source.spans())
     }
-
-    fn largest_step(self) -> f64 {
-        self.source.spans().iter().fold(0.0, |step, span| span.0.max(step))
-    }
 }
 
 /// Run the multistart on subsampled records; return the candidates best first.
@@ -84,7 +79,7 @@ impl<'a> MultistartContext<'a> {
 /// # Errors
 /// As the source, the initial guesses and the callback; [`Error::Interrupted`].
 pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    if let Some(found) = integer_order_multistart(free, course)? {
+    if let Some(found) = integer_order_multistart(free, course, None)? {
         return Ok(found);
     }
     if free.structure.history {
@@ -93,13 +88,18 @@ pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Res
     Ok(multistart_without_history(free, course)?.0)
 }
 
-/// Optima of a problem of integer orders on all samples, best first; None for other problems.
-fn integer_order_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Option<Vec<Candidate>>> {
+/// Optima of a problem of integer orders on all samples or the leading intervals, best first; None for other problems.
+fn integer_order_multistart(
+    free: &ParameterSet,
+    course: MultistartContext<'_>,
+    leading_intervals: Option<usize>,
+) -> Result<Option<Vec<Candidate>>> {
     if !free.orders.is_empty() || !free.problem.is_linear() {
         return Ok(None);
     }
     let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
-    let grid = Objective::new((&free.problem, course.source, course.stop), weights, Sampling::default(), false)?;
+    let sampling = Sampling { leading_intervals, ..Sampling::default() };
+    let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
     let Some(starts) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
     let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
     let found = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
@@ -135,30 +135,16 @@ fn multistart_without_history<'a>(
     free: &'a ParameterSet,
     course: MultistartContext<'a>,
 ) -> Result<(Vec<Candidate>, Objective<'a>)> {
-    let starts = course.starts.initial_guesses(free)?;
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
+    let mut starts = course.starts.initial_guesses(free)?;
     let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
     let sampling = coarse_sampling(free, course.source)?;
-    let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
-    let chosen = choose_coarse_grid(laps, free, grid, &starts)?;
-    let (mut coarse, mut half) = (chosen.grid, chosen.half);
-    let mut reached = chosen.pilots;
-    reached.extend(laps.run(free, &coarse, &chosen.prescreened_candidates, FIRST_BUDGET_EVALUATIONS)?);
-    reached = sort_by_cost(reached);
-    while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
-        let finer = half.take().map_or_else(|| coarse.finer(), Ok)?;
-        if let Some(best) = reached.first()
-            && !coarse.is_refinement_significant(&best.result.iterate, &finer)?
-        {
-            half = Some(finer);
-            break;
-        }
-        coarse = finer;
-        reached = laps.run(free, &coarse, &starts, FIRST_BUDGET_EVALUATIONS)?;
-    }
-    let (first, wholes) = (reached.clone(), Vec::new());
-    let mut run =
-        MultistartState { free, course, laps, coarse, half, starts, first, integer_order_optima: wholes, reached };
+    let coarse = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
+    let integer_order_optima = integer_order_optima(free, course, &coarse, &starts)?;
+    starts.extend(integer_order_optima.iter().cloned());
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
+    let (first, reached, half) = (Vec::new(), Vec::new(), None);
+    let mut run = MultistartState { free, course, laps, coarse, half, starts, first, integer_order_optima, reached };
+    run.optimize_starts()?;
     run.add_nested_models()?;
     let told = run.laps.starts;
     let found = run.promote_survivors()?;
@@ -168,19 +154,80 @@ fn multistart_without_history<'a>(
     Ok(found)
 }
 
+/// Best candidate of each problem of integer orders, near the usual ones and near the first guess.
+fn integer_order_optima(
+    free: &ParameterSet,
+    course: MultistartContext<'_>,
+    coarse: &Objective<'_>,
+    starts: &[Candidate],
+) -> Result<Vec<Candidate>> {
+    let usual = free.integer_orders();
+    let near = starts.first().map_or(&usual, |start| &start.result.iterate.point.orders);
+    let mut found = Vec::new();
+    for less in integer_order_problems(free, near) {
+        // With fixed orders most initial guesses lead to the same optimum.
+        let ended = optimize_submodel(&less.free, course, coarse, MAX_FINAL_SURVIVORS)?;
+        found.extend(ended.iter().take(1).map(|runner| less.embed(runner)));
+    }
+    Ok(found)
+}
+
+/// Optimize a submodel from its own initial guesses; the best `going` of them continue.
+///
+/// Of integer orders the leading intervals of long records suffice. Empty if two of its terms coincide.
+fn optimize_submodel(
+    free: &ParameterSet,
+    course: MultistartContext<'_>,
+    coarse: &Objective<'_>,
+    going: usize,
+) -> Result<Vec<Candidate>> {
+    let part = leading_part(free, course.source, SELECTION_INTERVALS)?;
+    if let Some(found) = integer_order_multistart(free, course.for_submodel(), part)? {
+        return Ok(found);
+    }
+    let Some(starts) = none_if_invalid_model(course.starts.initial_guesses(free))? else { return Ok(Vec::new()) };
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: None };
+    let mut runners = merge_duplicates(&laps.run(free, coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+    runners.truncate(going);
+    let ended = laps.run(free, coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
+    laps.run(free, coarse, &select_survivors(&ended), SECOND_BUDGET_EVALUATIONS)
+}
+
 impl<'a> MultistartState<'a> {
-    /// Add the optima of submodels as candidates: a coefficient at 0, fixed orders, or an additional fast pole.
+    /// Optimize all initial guesses on a grid that does not change the best of them.
+    ///
+    /// A stiff equation may have no stable scheme on a coarse grid, and a coarse grid has spurious optima. The step is
+    /// halved until the best candidate no longer changes. Optima of integer orders start again on each grid.
+    fn optimize_starts(&mut self) -> Result<()> {
+        let mut starts = self.starts.clone();
+        loop {
+            let glanced = self.laps.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
+            let glanced = merge_duplicates(&glanced, is_same_iterate);
+            self.reached = self.laps.run(self.free, &self.coarse, &glanced, FIRST_BUDGET_EVALUATIONS)?;
+            self.first.clone_from(&self.reached);
+            if self.coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
+                return Ok(());
+            }
+            let finer = self.coarse.finer()?;
+            if let Some(best) = self.reached.first() {
+                if !self.coarse.is_refinement_significant(&best.result.iterate, &finer)? {
+                    self.half = Some(finer);
+                    return Ok(());
+                }
+                starts = merge_duplicates(&self.reached, is_same_optimum);
+                starts.extend(self.integer_order_optima.iter().cloned());
+            }
+            self.coarse = finer;
+        }
+    }
+
+    /// Add the optima of submodels as candidates: a coefficient at 0, or a fixed order.
     fn add_nested_models(&mut self) -> Result<()> {
-        let Some(best) = self.reached.first() else { return Ok(()) };
-        let orders = best.result.iterate.point.orders.clone();
-        for less in distinct_problems(reduced_problems(self.free)) {
+        if self.reached.is_empty() {
+            return Ok(());
+        }
+        for less in reduced_problems(self.free) {
             self.add_reduced_model(&less)?;
-        }
-        if let Some(less) = lower_order_problem(self.free, self.course.largest_step()) {
-            self.add_lower_order_model(&less)?;
-        }
-        for less in integer_order_problems(self.free, &orders) {
-            self.add_integer_order_model(&less)?;
         }
         let unit = self.course.time_scaling(self.free);
         for one in fixed_order_problems(self.free) {
@@ -213,64 +260,20 @@ impl<'a> MultistartState<'a> {
             let ended = self.laps.run(&less.free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
             return self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>());
         }
-        if is_rich(self.free) && less.free.orders.len() < self.free.orders.len() {
-            // With several terms of free order, the reduced problem still has many optima and gets its own multistart.
-            let ended = multistart_without_history(&less.free, self.course.for_submodel())?.0;
-            // Initial terms can change which of its optima is the best.
-            let there = competitive_candidates(&ended)
-                .into_iter()
-                .take(MIN_SURVIVORS)
-                .map(|runner| less.embed(&runner, self.free));
-            return self.evaluate_and_add(&there.collect::<Vec<_>>());
-        }
-        let ended = self.optimize_nested_model(&less.free, MIN_SURVIVORS)?;
-        self.add(ended.iter().take(1).map(|runner| less.embed(runner, self.free)).collect());
-        Ok(())
-    }
-
-    fn add_lower_order_model(&mut self, less: &LowerOrderProblem) -> Result<()> {
-        let ended = self.optimize_nested_model(&less.free, MIN_SURVIVORS)?;
-        self.add(ended.iter().take(1).map(|runner| less.embed(runner, self.free)).collect());
-        Ok(())
-    }
-
-    fn add_integer_order_model(&mut self, less: &IntegerOrderProblem) -> Result<()> {
-        // With fixed orders most initial guesses lead to the same optimum.
-        let ended = self.optimize_nested_model(&less.free, MAX_FINAL_SURVIVORS)?;
-        let there: Vec<Candidate> = ended.iter().take(1).map(|runner| less.embed(runner)).collect();
-        self.integer_order_optima.extend(there.iter().cloned());
-        self.add(there);
-        Ok(())
-    }
-
-    /// Optimize a submodel from its own initial guesses; `going` of them continue.
-    fn optimize_nested_model(&self, free: &ParameterSet, going: usize) -> Result<Vec<Candidate>> {
-        if let Some(found) = integer_order_multistart(free, self.course.for_submodel())? {
-            return self.laps.run(free, &self.coarse, &found, SECOND_BUDGET_EVALUATIONS);
-        }
-        // With integer orders two of its terms may coincide.
-        let Some(starts) = none_if_invalid_model(self.course.starts.initial_guesses(free))? else {
-            return Ok(Vec::new());
-        };
-        let mut runners =
-            merge_duplicates(&self.laps.run(free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
-        runners.truncate(going);
-        let ended = self.laps.run(free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
-        self.laps.run(free, &self.coarse, &select_survivors(&ended), SECOND_BUDGET_EVALUATIONS)
+        let ended = optimize_submodel(&less.free, self.course, &self.coarse, MIN_SURVIVORS)?;
+        self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>())
     }
 
     /// Add the optimum with one order fixed: the full problem must not fit worse.
     fn add_fixed_order_model(&mut self, one: &FixedOrderProblem, unit: &TimeScaling) -> Result<()> {
         let level = self.reached.first().map_or(0.0, Candidate::cost_per_residual);
         if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.course.floor {
-            // Above the noise floor a multistart with one free order is worth its cost. Bounds may leave no order grid.
+            // Bounds may leave no order grid.
             if let Some((ended, _)) =
                 none_if_invalid_model(multistart_without_history(&one.free, self.course.for_submodel()))?
             {
-                let there = competitive_candidates(&ended)
-                    .into_iter()
-                    .take(MAX_FINAL_SURVIVORS)
-                    .map(|runner| one.embed(&runner, self.free));
+                let there = competitive_candidates(&ended).into_iter().take(MAX_FINAL_SURVIVORS);
+                let there = there.map(|runner| one.embed(&runner, self.free));
                 return self.evaluate_and_add(&there.collect::<Vec<_>>());
             }
         }
@@ -313,20 +316,10 @@ impl<'a> MultistartState<'a> {
         let (contenders, lost) = reached.split_at(competitive_candidates(&reached).len());
         let (ahead, rest) =
             contenders.split_at(contenders.len().min(MIN_SURVIVORS.max(reached.len() / CANDIDATES_PER_SURVIVOR)));
-        let (mut rest, mut lost) = (rest.to_vec(), lost.to_vec());
         let mut found = laps.run(free, &coarse, ahead, SECOND_BUDGET_EVALUATIONS)?;
-        let level = found.first().map_or(0.0, Candidate::cost_per_residual);
-        if level > NOISE_FLOOR_FACTOR * self.course.floor {
-            // The best cost is above the noise floor: candidates behind may still lead to a better optimum.
-            rest = continue_improving(laps, free, &coarse, &rest)?;
-            let farthest = MAX_PROMOTION_COST_RATIO * contenders[0].cost_per_residual();
-            let stirring;
-            (stirring, lost) = promote_improving(laps, free, &coarse, &lost, farthest)?;
-            rest.extend(continue_improving(laps, free, &coarse, &stirring)?);
-        }
-        found.extend(rest);
+        found.extend_from_slice(rest);
         let mut found = rank_candidates(&coarse, self.half, found)?;
-        found.extend(lost);
+        found.extend_from_slice(lost);
         Ok((found, coarse))
     }
 }
@@ -348,12 +341,6 @@ fn rank_candidates(
     let order = half.rank_results(&runners.iter().map(|runner| &runner.result).collect::<Vec<_>>())?;
     let mut runners: Vec<Option<Candidate>> = runners.into_iter().map(Some).collect();
     Ok(order.into_iter().filter_map(|i| runners[i].take()).collect())
-}
-
-/// True if an equation has several autoregressive terms of free order.
-fn is_rich(free: &ParameterSet) -> bool {
-    let several = |e: &Equation| e.autoregressive_terms().filter(|term| term.order.is_free()).count() > 1;
-    free.structure.equations.iter().any(several)
 }
 
 /// Multistart of a problem with many initial terms per run, which are added for the survivors only.
@@ -378,55 +365,6 @@ fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -
     let mut ahead = rank_candidates(&coarse, None, laps.run(free, &coarse, &going, FIRST_BUDGET_EVALUATIONS)?)?;
     ahead.extend(rest.into_iter().map(|i| reached[i].clone()));
     Ok(merge_duplicates(&ahead, is_same_optimum))
-}
-
-/// Relative cost decrease per first budget below which a candidate behind the best has converged and is stopped.
-const MIN_COST_DECREASE_RATIO: f64 = 0.05;
-/// Evaluations in which a candidate far behind must lower its cost by [`MIN_PROMOTION_DECREASE_RATIO`] to be promoted.
-const PROMOTION_EVALUATIONS: usize = 5;
-const MIN_PROMOTION_DECREASE_RATIO: f64 = 0.1;
-
-/// Optimize candidates while they improve, for at most the second budget.
-pub(super) fn continue_improving(
-    laps: RungExecutor<'_>,
-    free: &ParameterSet,
-    coarse: &Objective<'_>,
-    behind: &[Candidate],
-) -> Result<Vec<Candidate>> {
-    let (mut ended, mut going) = (Vec::new(), behind.to_vec());
-    for _ in 0..SECOND_BUDGET_EVALUATIONS / FIRST_BUDGET_EVALUATIONS {
-        let mut further = Vec::new();
-        for (runner, at) in going.iter().zip(laps.run_each(free, coarse, &going, FIRST_BUDGET_EVALUATIONS)?) {
-            let Some(at) = at else { continue };
-            let gets_on = at.cost_per_residual() < (1.0 - MIN_COST_DECREASE_RATIO) * runner.cost_per_residual();
-            if gets_on { &mut further } else { &mut ended }.push(at);
-        }
-        going = further;
-    }
-    ended.extend(going);
-    Ok(ended)
-}
-
-/// Split candidates up to a cost limit into those that improve in a few evaluations, and the others.
-pub(super) fn promote_improving(
-    laps: RungExecutor<'_>,
-    free: &ParameterSet,
-    coarse: &Objective<'_>,
-    lost: &[Candidate],
-    farthest: f64,
-) -> Result<(Vec<Candidate>, Vec<Candidate>)> {
-    let (near, mut still): (Vec<Candidate>, Vec<Candidate>) =
-        lost.iter().cloned().partition(|r| r.cost_per_residual() <= farthest);
-    let mut moving = Vec::new();
-    let ends = laps.run_each(free, coarse, &near, PROMOTION_EVALUATIONS)?;
-    for (runner, at) in near.into_iter().zip(ends) {
-        match at.filter(|at| at.cost_per_residual() < (1.0 - MIN_PROMOTION_DECREASE_RATIO) * runner.cost_per_residual())
-        {
-            Some(at) => moving.push(at),
-            None => still.push(runner),
-        }
-    }
-    Ok((moving, still))
 }
 
 /// Optimize candidates on coarse grids; return them best first.
