@@ -13,15 +13,19 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import ftlm
 from ftlm import progress
+from ftlm.cli import framework
 from ftlm.cli.framework import broken_line, print_text
 from ftlm.cli.main import app
+from ftlm.cli.reading_options import Force
 from ftlm.utils.formatting import EscapedStream, escape_standard_streams
 from measured import DATA, needs_data
 
@@ -618,3 +622,22 @@ def test_a_command_imports_what_it_needs_alone(words, tmp_path):
     )
     out = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert out.stdout.splitlines()[-1] == "imported: []"
+
+
+def test_a_file_to_write_is_checked_before_the_work(tmp_path):
+    done = []
+
+    @framework.command
+    def work(*, out: Annotated[str, framework.output_file("Write.")], force: Force = False) -> None:
+        done.append((out, force))
+
+    commands, path = typer.Typer(), tmp_path / "a.csv"
+    commands.command()(work)
+    assert CliRunner().invoke(commands, ["-o", str(path)]).exit_code == 0
+    path.write_text("mine")
+    for words in (["-o", str(path)], ["--out", str(tmp_path / "no" / "a.csv")]):
+        refused = CliRunner().invoke(commands, words)
+        assert refused.exit_code == 3
+        assert "overwrite it with --force" in refused.stderr or "is no folder; make it first" in refused.stderr
+    assert CliRunner().invoke(commands, ["-o", str(path), "--force"]).exit_code == 0
+    assert done == [(str(path), False), (str(path), True)]

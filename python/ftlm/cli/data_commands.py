@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from typing import Annotated
 
-from typer import Argument, Option
+from typer import Argument
 
-from ftlm.cli.framework import command, print_text, say_written, show
+from ftlm.cli.framework import command, output_file, print_text, say_written, show
 from ftlm.cli.reading_options import OUTPUT_PANEL, Files, Force, Json, ReadingOptions, Text
-from ftlm.utils.files import COMMAND_MESSAGES, check_free
 
 
 @command
@@ -19,17 +18,17 @@ def open_(
     reading: ReadingOptions,
     write_columns: Annotated[
         Text,
-        Option(
+        output_file(
+            "Write columns, units and layout to this file for --columns.",
+            "--write-columns",
             metavar="TOML",
-            rich_help_panel=OUTPUT_PANEL,
-            help="Write columns, units and layout to this file for --columns.",
+            panel=OUTPUT_PANEL,
         ),
     ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Preview a file: columns, units, roles, step, assumptions with contrary evidence, next command."""
-    check_free(write_columns, force=force, words=COMMAND_MESSAGES)
     opened = reading.preview_file(file)
     if write_columns is not None:
         opened.write_columns(write_columns, force=force)

@@ -16,6 +16,7 @@ from ftlm.cli.framework import (
     command,
     figure_kind,
     numbers,
+    output_file,
     parse_numbers,
     print_text,
     say_written,
@@ -31,7 +32,7 @@ from ftlm.experiment_design.problem import Kind
 from ftlm.model.serialization import load_model
 from ftlm.plot import matplotlib_figures as design_plots
 from ftlm.progress import Progress
-from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically
+from ftlm.utils.files import write_atomically
 from ftlm.utils.parameters import parameter
 
 #: Options of one design only.
@@ -69,17 +70,16 @@ def control(
     limit: Annotated[Number, Option(help="Largest command; default none.")] = None,
     path: Annotated[Text, Option(metavar="SIZE:SECONDS", help="Plan a smooth move of --output of this size.")] = None,
     trajectory: Annotated[
-        Text, Option(metavar="FILE", help="Write reference, command and path to this .csv file.")
+        Text, output_file("Write reference, command and path to this .csv file.", "--trajectory")
     ] = None,
     samples: Annotated[int, Option(help="Parameter samples on which the design is checked.")] = 100,
     seed: Annotated[int, Option(min=0, help="Seed of these samples.")] = 0,
-    out: Annotated[Text, Option("-o", "--out", metavar="FILE", help="Write the controller to this .json file.")] = None,
+    out: Annotated[Text, output_file("Write the controller to this .json file.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Design a controller on a model: margins, their ranges over the model's uncertainty, controller file."""
     given = dict(locals())
-    check_free(out, trajectory, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".json")
     check_ending(trajectory, ".csv")
     if trajectory is not None and path is None:
@@ -160,14 +160,11 @@ def input_shaper(
         Literal["simulated", "measured"], Option(help="Poles of the equations together, or of each alone.")
     ] = "simulated",
     rate: Annotated[float, Option(help="Sampling rate of the reference [Hz].")] = 500.0,
-    out: Annotated[
-        Text, Option("-o", "--out", metavar="FILE", help="Write its impulse response to this .csv file.")
-    ] = None,
+    out: Annotated[Text, output_file("Write its impulse response to this .csv file.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Design an input shaper from the poles of a model."""
-    check_free(out, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".csv")
     made = designs.input_shaper(load_model(model), kind, modes=modes, coupling=coupling)
     taps = made.impulses(rate)
@@ -220,15 +217,12 @@ def design_input(
         Number, Option(help="Period of the reference square wave [s]; default a fifth of the duration.")
     ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of random initial inputs.")] = 0,
-    out: Annotated[
-        Text, Option("-o", "--out", metavar="FILE", help="Write the run to this .csv file for ftlm record.")
-    ] = None,
-    plot: Annotated[Text, Option(metavar="FILE", help="Write a figure to this .png, .pdf or .svg file.")] = None,
+    out: Annotated[Text, output_file("Write the run to this .csv file for ftlm record.")] = None,
+    plot: Annotated[Text, output_file("Write a figure to this .png, .pdf or .svg file.", "--plot")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Design the input that determines the parameters best within the limits of the machine."""
-    check_free(out, plot, force=force, words=COMMAND_MESSAGES)
     check_ending(out, ".csv", ", as a run for a rig does")
     figure_kind(plot)
     loaded = load_model(model)

@@ -75,7 +75,6 @@ from ftlm.structure_selection import select as choice
 from ftlm.structure_selection.automatic import IntegerOrderForm
 from ftlm.structure_selection.result import Selection
 from ftlm.structure_selection.select import automatic_output
-from ftlm.utils.files import COMMAND_MESSAGES, check_free
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads
 
@@ -172,7 +171,6 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
-    check_free(out, report, force=force, words=COMMAND_MESSAGES)
     equation = check_structures([structure], shape)
     given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
     given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
@@ -481,7 +479,6 @@ def identify_frequency(
     as_json: Json = False,
 ) -> None:
     """Identify a model from a frequency response or impedance, with 95 % intervals."""
-    check_free(out, report, force=force, words=COMMAND_MESSAGES)
     if structure.startswith(("flexible-link", "arm:")) or structure == "auto":
         raise ModelError(f"--structure {structure!r}: a frequency response takes an equation in words")
     records = [reading.load(file) for file in files]
@@ -533,7 +530,6 @@ def select(
     as_json: Json = False,
 ) -> None:
     """Select terms and orders that improve the score on validation data."""
-    check_free(out, report, force=force, words=COMMAND_MESSAGES)
     equation = check_structures(structures, shape)
     runs = reading.runs(files, equation)
     made = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
@@ -570,7 +566,6 @@ def consistency(
     as_json: Json = False,
 ) -> None:
     """Identify segments of a run separately, and list the parameters that differ significantly."""
-    check_free(report, force=force, words=COMMAND_MESSAGES)
     runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
     method = OutputError() if loss is None else OutputError(loss=loss)

@@ -22,7 +22,7 @@ from typer.core import TyperCommand
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.progress import Progress
-from ftlm.utils.files import write_atomically
+from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically
 from ftlm.utils.formatting import columns, wrap_text
 from ftlm.utils.parameters import use_interface
 from ftlm.utils.resources import duration_bounds, estimate_duration
@@ -177,16 +177,24 @@ class Command(TyperCommand):
                     formatter.write_dl(records)
 
 
+def output_file(help: str, *flags: str, metavar: str = "FILE", panel: str | None = None) -> Any:
+    """Return an option for a file to write; a command refuses a path that it cannot write before it computes."""
+    option: Any = typer.Option(*flags or ("-o", "--out"), metavar=metavar, rich_help_panel=panel, help=help)
+    option.is_output = True
+    return option
+
+
 def command(work: Callable[..., None]) -> Callable[..., None]:
     """Turn a function into a command.
 
     A dataclass parameter expands to its fields: each becomes an option at that place, and the function receives the
     dataclass. Its `panel` is that of the options in the help, its `methods` those that use them. Errors become one
-    line on standard error and an exit code.
+    line on standard error and an exit code. Existing files of :func:`output_file` are refused unless `force` is set.
     """
     records: dict[str, type[Any]] = {}
     options: list[inspect.Parameter] = []
     methods_by_field: dict[str, tuple[str, ...]] = {}
+    outputs: list[str] = []
     for parameter in inspect.signature(work, eval_str=True).parameters.values():
         kind = parameter.annotation
         if isinstance(kind, type) and is_dataclass(kind):
@@ -196,6 +204,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
                 methods_by_field |= dict.fromkeys((f.name for f in fields(kind)), kind.methods)
         else:
             options.append(parameter.replace(annotation=_with_help(kind)))
+            if hasattr(get_args(kind)[1], "is_output"):
+                outputs.append(parameter.name)
 
     @functools.wraps(work)
     def run(**given: Any) -> None:
@@ -205,6 +215,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     def execute(**given: Any) -> None:
         made = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in records.items()}
         try:
+            if outputs:
+                check_free(*(given[name] for name in outputs), force=given["force"], words=COMMAND_MESSAGES)
             work(**given, **made)
             sys.stdout.flush()
         except KeyboardInterrupt:

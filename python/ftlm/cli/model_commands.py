@@ -16,6 +16,7 @@ from ftlm.cli.framework import (
     command,
     figure_kind,
     interval,
+    output_file,
     print_outcome,
     show,
     write_figure,
@@ -28,7 +29,7 @@ from ftlm.model.model import Model
 from ftlm.model.serialization import load_model
 from ftlm.plot import matplotlib_figures as plots
 from ftlm.report.html_report import model_page
-from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically
+from ftlm.utils.files import write_atomically
 
 
 def _with_runs(
@@ -86,14 +87,13 @@ def simulate(
     *,
     model: SavedModel,
     file: Annotated[str, Argument(metavar="FILE", help="Run with the inputs of the simulation.")],
-    out: Annotated[str, Option("-o", "--out", metavar="CSV", help="Write the simulated run to this file.")],
+    out: Annotated[str, output_file("Write the simulated run to this file.", metavar="CSV")],
     reading: ReadingOptions,
     tolerance: Annotated[float, Option(help="Relative tolerance of the step refinement.")] = 1e-6,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Simulate a saved model on the inputs of a run and write the outputs as csv."""
-    check_free(out, force=force, words=COMMAND_MESSAGES)
     loaded, runs = _with_runs(model, reading, [file], quiet=as_json)
     free = loaded.simulate(runs[0], tolerance=tolerance)
     free.to_csv(out, force=force)
@@ -112,7 +112,6 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write the HTML report of a saved model, with validation runs."""
-    check_free(out, force=force, words=COMMAND_MESSAGES)
     loaded, runs = _with_runs(model, reading, validation, quiet=as_json)
     page = model_page(loaded, out, validation=runs or None, force=force)
     print_outcome(f"written: {page}", as_json=as_json, written=str(page))
@@ -122,9 +121,7 @@ def report(
 def plot(
     *,
     model: SavedModel,
-    out: Annotated[
-        str, Option("-o", "--out", metavar="FILE", help="Write the figure to this .png, .pdf or .svg file.")
-    ],
+    out: Annotated[str, output_file("Write the figure to this .png, .pdf or .svg file.")],
     files: Annotated[Texts, Argument(metavar="[RUN]...", help="Runs, for fit, residuals and series.")] = None,
     kind: Annotated[
         Literal["fit", "residuals", "series", "bode", "poles", "step", "impulse"],
@@ -135,7 +132,6 @@ def plot(
     as_json: Json = False,
 ) -> None:
     """Plot a saved model: fit or residuals on runs, Bode plot, poles, step or impulse response."""
-    check_free(out, force=force, words=COMMAND_MESSAGES)
     figure_kind(out)
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     alone = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
@@ -163,14 +159,11 @@ def export(
     ],
     band: Annotated[Text, Option(metavar="LOW:HIGH", help="Frequency band for control [rad/s].")] = None,
     order: Annotated[int, Option(help="Order of Oustaloup's filter, for control.")] = 5,
-    out: Annotated[
-        Text, Option("-o", "--out", metavar="FILE", help="Write to this file; default standard output.")
-    ] = None,
+    out: Annotated[Text, output_file("Write to this file; default standard output.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Export a saved model for another tool, to a file or to standard output."""
-    check_free(out, force=force, words=COMMAND_MESSAGES)
     limits = None if band is None else _both_ends(band)
     text = export_text(load_model(model), to, band=limits, order=order)
     if out is None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from typer import Argument, Option
 
 from ftlm.arm.flexible_link import Form, InputOrder, Law, flexible_link
-from ftlm.cli.framework import numbers, pairs, ranges
+from ftlm.cli.framework import numbers, output_file, pairs, ranges
 from ftlm.cli.reading_options import METHOD_PANEL, OUTPUT_PANEL, STRUCTURE_PANEL, Number, Text, Texts
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
@@ -50,15 +50,10 @@ StoreFile = Annotated[
     Text,
     Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Checkpoint file; the same command resumes from it."),
 ]
-Out = Annotated[
-    Text,
-    Option("-o", "--out", metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Write the model to this .json file."),
-]
-Page = Annotated[
-    str, Option("-o", "--out", metavar="HTML", rich_help_panel=OUTPUT_PANEL, help="Write the page to this file.")
-]
+Out = Annotated[Text, output_file("Write the model to this .json file.", panel=OUTPUT_PANEL)]
+Page = Annotated[str, output_file("Write the page to this file.", metavar="HTML", panel=OUTPUT_PANEL)]
 Report = Annotated[
-    Text, Option("--report", metavar="HTML", rich_help_panel=OUTPUT_PANEL, help="Write an HTML report to this file.")
+    Text, output_file("Write an HTML report to this file.", "--report", metavar="HTML", panel=OUTPUT_PANEL)
 ]
 Verbose = Annotated[
     bool, Option("-v", "--verbose", rich_help_panel=OUTPUT_PANEL, help="Print all details and all warnings.")

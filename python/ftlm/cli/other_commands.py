@@ -21,7 +21,7 @@ from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
 from ftlm.reproduction.optimizer_comparison import CONTEST_STEP
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import ALWAYS_SAVED
-from ftlm.utils.files import COMMAND_MESSAGES, check_folder, check_free
+from ftlm.utils.files import check_folder
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads
 
@@ -89,7 +89,6 @@ def reproduce(
     as_json: Json = False,
 ) -> None:
     """Recompute the tables and figures of the paper on simulated or measured runs, as one HTML page."""
-    check_free(out, force=force, words=COMMAND_MESSAGES)
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
@@ -132,7 +131,6 @@ def orders(
     as_json: Json = False,
 ) -> None:
     """Compare integer and fractional orders of the arm's links by cross-validation over runs, as an HTML page."""
-    check_free(out, force=force, words=COMMAND_MESSAGES)
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
         found = orders_on_unseen_runs(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
