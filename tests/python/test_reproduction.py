@@ -263,7 +263,7 @@ def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
     data = SimpleNamespace(panel=Panel((), (), (replace(better, is_degenerate=True),)), simulated=False)
     claim = _order_check(data)
     assert claim.verdict == "cannot be told"
-    assert "not told in 1 cases" in claim.computed
+    assert "Not told in 1 cases" in claim.computed
 
 
 def test_a_fit_that_must_not_be_used_is_no_case_of_a_claim(reproduction):

@@ -154,6 +154,11 @@ class Check:
         return str(self.ruling)
 
     @property
+    def brief(self) -> str:
+        """First of the computed numbers, as text."""
+        return self.computed.partition(". ")[0]
+
+    @property
     def holds(self) -> bool | None:
         """Whether the claim holds in every case; None if it depends on a factor or is not decidable."""
         return {"holds": True, "does not hold": False}.get(self.ruling.word)
@@ -262,12 +267,14 @@ def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
         for r in found.ran
         for k in PRIOR_COVARIANCES
     ]
-    last = [
-        f"{symbol(r.output)}, K0 = {prior_text(k)}: {a:.2g}"
-        + "".join(f", {symbol(n)} {v:g}" for n, v in r.orders.get(k, {}).items() if not n.startswith("alpha"))
-        for r, k, a in back
-        if r.p == LAST_P
-    ]
+    last = {k: {r.output: [a] for r, prior, a in back if r.p == LAST_P and prior == k} for k in PRIOR_COVARIANCES}
+    values = ". ".join(f"a of p = {LAST_P} with K0 = {prior_text(k)}: {by_angle(each)}" for k, each in last.items())
+    orders = "; ".join(
+        f"{symbol(r.output)}, K0 = {prior_text(k)}: "
+        + ", ".join(f"{symbol(n)} {v:g}" for n, v in r.orders[k].items() if not n.startswith("alpha"))
+        for r, k, _ in back
+        if k in r.orders
+    )
     yield Check(
         "Identified from its own response, a printed model returns its coefficients.",
         combine_cases(
@@ -281,9 +288,9 @@ def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
                 for r, k, a in back
             ]
         ),
-        f"a of p = {LAST_P}, and the orders that a search around the printed ones returns: {'; '.join(last)}",
+        f"{values}. Orders of a search around the printed ones: {orders}",
         f"a of p = {LAST_P}: {by_angle({o: [_printed_a(o, LAST_P)] for o in deviations}, 5)}",
-        f"a within {MIN_RELATIVE_DIFFERENCE:.0%}, without noise, at the printed orders, with the row's own p",
+        f"a within {100 * MIN_RELATIVE_DIFFERENCE:g} %, without noise, at the printed orders, with the row's own p",
     )
 
 
@@ -301,14 +308,12 @@ def _table_checks(found: Reproduction) -> Iterable[Check]:
         f"a of p = {LAST_P}: {by_angle({o: [_printed_a(o, LAST_P)] for o in tables}, 5)}",
         f"a, b, d, g and NR of all four rows within a factor of {MAX_COEFFICIENT_RATIO:g}, signs included",
     )
-    best = "; ".join(
-        f"{symbol(o)} {t.rank} of {t.among}, first β {t.best['beta']:g}, γ {t.best['gamma']:g}, μ {t.best['mu']:g}"
-        for o, t in tables.items()
-    )
+    places = ", ".join(f"{symbol(o)} {t.rank} of {t.among}" for o, t in tables.items())
+    best = by_angle({o: [t.best[n] for n in ("beta", "gamma", "mu")] for o, t in tables.items()})
     yield Check(
         "The printed orders are the best ones, by any error.",
         combine_cases(_of_angles({o: t.rank == 1 for o, t in tables.items()})),
-        f"place by the equation error: {best}",
+        f"place by the equation error: {places}. First are β, γ, μ: {best}",
         "place 1",
         f"place 1 among β, γ, μ from {printed.MIN_GRID_ORDER:g} to {printed.MAX_GRID_ORDER:g} in increments of "
         f"{printed.GRID_INCREMENT:g}, p = {LAST_P}, closest settings",
@@ -334,7 +339,9 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
 def _innovation_checks(found: Reproduction) -> Iterable[Check]:
     trials = found.panel.trials
     ruling = combine_cases(_of_trials(trials, [error_falls(t) for t in trials]))
-    rule = f"no step of p is worse, and p = {LAST_P} is better than p = {FIRST_P} by {MIN_RELATIVE_DIFFERENCE:.0%}"
+    rule = (
+        f"no step of p is worse, and p = {LAST_P} is better than p = {FIRST_P} by {100 * MIN_RELATIVE_DIFFERENCE:g} %"
+    )
     stated = {o: [float(r.error or 0.0) for r in printed.FRACTIONAL_ROWS[o].values()] for o in printed.ANGLE_NAMES}
     yield Check(
         "A larger innovation length p gives a smaller error (45): Tables 4 and 5.",
@@ -354,7 +361,7 @@ def _innovation_checks(found: Reproduction) -> Iterable[Check]:
             f"{_by_prior(found, lambda t: t.convergence_steps.values())}. No cases, because all p arrive by step "
             f"{TRACE_EVERY}: {len(trials) - len(apart)} of {len(trials)}",
             "curves of p = 7 that fall first",
-            f"all p arrive, no larger p later, and p = {LAST_P} {MIN_STEP_SAVING:.0%} sooner than p = {FIRST_P}",
+            f"all p arrive, no larger p later, and p = {LAST_P} {100 * MIN_STEP_SAVING:g} % sooner than p = {FIRST_P}",
         )
     weak = [t for t in trials if t.prior == WEAK_PRIOR]
     ruling = combine_cases(_of_trials(weak, [error_falls(t) for t in weak]))
@@ -458,7 +465,7 @@ def _order_check(found: Reproduction) -> Check:
     return Check(
         "Fractional orders describe the arm better than whole ones.",
         ruling,
-        f"{ruling.counts}; not told in {sum(len(f.free_nr) for f in freed) - len(known)} cases. NR with integer and "
+        f"{ruling.counts}. Not told in {sum(len(f.free_nr) for f in freed) - len(known)} cases. NR with integer and "
         f"with free orders on their own run: {'; '.join(both)}. Orders whose interval excludes the integer one: "
         f"{'; '.join(away)}",
         "orders 1.8 to 2 in Tables 4 and 5",
@@ -512,9 +519,9 @@ def _form_check(found: Reproduction) -> Iterable[Check]:
     yield Check(
         "Equations (22)–(25) find the orders of an arm that (14)–(15) describe.",
         combine_cases(cases),
-        f"{len(away)} of {count} orders are more than {MAX_STANDARD_ERRORS:g} standard errors from the truth (in "
-        f"brackets): {', '.join(away) or 'none'}. Fit in percent of (14)–(15) and of (22)–(25): "
-        f"{by_angle(fits, 4)}{omitted}",
+        f"{len(away)} of {count} orders are more than {MAX_STANDARD_ERRORS:g} standard errors from the truth. "
+        f"They are, with the truth in brackets: {', '.join(away) or 'none'}. Fit in percent of (14)–(15) and of "
+        f"(22)–(25): {by_angle(fits, 4)}{omitted}",
         "(22)–(25) in place of (14)–(15)",
         f"every order within {MAX_STANDARD_ERRORS:g} standard errors; output error from the currents of the simulated "
         "arm",
@@ -529,8 +536,8 @@ def _derivative_check(found: Reproduction) -> Check:
     return Check(
         "Eliminating the other angle leaves the current as it is: (19), (21).",
         combine_cases([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in dropped.items()]),
-        f"order of the current's derivative: {format_list(dropped.values(), 2)} at the printed orders, "
-        f"{format_list(p.order for p in parts)} at those identified, where it changes the deflection by NR {changed}. "
+        f"order of the current's derivative: {format_list(dropped.values(), 2)} at the printed orders. "
+        f"At those identified it is {format_list(p.order for p in parts)} and changes the deflection by NR {changed}. "
         "Correlation of the deflection with the current as measured, by (14)–(15), by (22)–(25): "
         f"{by_angle({p.output: p.correlations.values() for p in parts}, 2)}",
         "order 0",
@@ -563,7 +570,7 @@ def _table_3_check() -> Check:
         f"{len(off)} of {len(rows)} coefficients are not those printed{words}. The maker's effective parameters, "
         f"torque with gear and efficiency, give all of them to {100 * effective:.1g} %",
         "" if worst is None else f"{worst} = {rows[worst][2]:g}",
-        f"every coefficient within {MIN_RELATIVE_DIFFERENCE:.0%}",
+        f"every coefficient within {100 * MIN_RELATIVE_DIFFERENCE:g} %",
     )
 
 
@@ -575,7 +582,7 @@ def _one_record_check() -> Check:
         "standard deviation of the angle by RMSE / NR, genetic algorithm and multi-innovation [rad]: "
         f"{by_angle(spreads)}",
         "one record, which has one standard deviation",
-        f"both standard deviations within {MAX_DEVIATION_MISMATCH:.0%}",
+        f"both standard deviations within {100 * MAX_DEVIATION_MISMATCH:g} %",
     )
 
 

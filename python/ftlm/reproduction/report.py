@@ -54,11 +54,13 @@ def _verdict_section(found: Reproduction) -> Section:
             typeset(c.claim),
             Markup("<strong>{}</strong>").format(typeset(c.verdict)),
             figures.share_picture(c.ruling),
-            *map(typeset, (c.computed, c.printed, c.rule)),
+            typeset(c.brief),
         ]
         for c in found.checks
     ]
-    heads = "the paper's claim", "verdict", "cases", "computed", "printed", "a case holds with"
+    numbers = [[typeset(text) for text in (c.claim, c.computed, c.printed, c.rule)] for c in found.checks]
+    behind = Table("Numbers", ("the paper's claim", "computed", "printed", "rule of a case"), numbers, wrap=True)
+    heads = "the paper's claim", "verdict", "cases", "computed"
     note = (
         "A verdict is computed from all its cases: arms, records, angles, both ends of K₀. A claim holds, or does not, "
         "if all cases agree, and turns with each factor whose change alone changes the outcome. Bars show the share of "
@@ -69,8 +71,8 @@ def _verdict_section(found: Reproduction) -> Section:
         "What holds and what does not",
         tables=[Table("Verdicts", heads, rows, note=note, wrap=True, stacked=True)],
         warnings=[missing] * (found.sine is None),
-        fold="All cases",
-        folded_tables=tables.case_tables(found),
+        fold="All numbers, rules and cases",
+        folded_tables=[behind, *tables.case_tables(found)],
     )
 
 
@@ -235,7 +237,7 @@ def reproduction_page(found: Reproduction, path: str | os.PathLike[str], *, forc
     origin = (
         "a simulated arm whose links move with their hubs, truth known," if found.simulated else f"the runs {names},"
     )
-    strongest = f"{found.checks[0].claim} {found.checks[0].computed.partition('. ')[0]}. " if found.ran else ""
+    strongest = f"The printed models, run under the paper's current: {found.checks[0].brief}. " if found.ran else ""
     lead = (
         f"Section 5 of the paper, recomputed on {origin} beside what the paper prints. {typeset(strongest)}Numbers in "
         f"rows marked “printed” are the paper's; every other number, figure and verdict on this page is computed. "
@@ -257,7 +259,7 @@ def reproduction_text(found: Reproduction) -> str:
     """Summary for a terminal: checks, and fits."""
     lines = []
     for check in found.checks:
-        lines += [f"{check.verdict.upper()}: {check.claim}", f"    {check.computed.partition('. ')[0]}"]
+        lines += [f"{check.verdict.upper()}: {check.claim}", f"    {check.brief}"]
     for stage in found.stages.values():
         lines += ["", f"Stage {stage.number}: fit of the free run in percent, driven as identified"]
         lines.append(" " * 26 + "".join(f"{o + run:>16}" for o in stage.outputs for run in (" square", " sine")))
