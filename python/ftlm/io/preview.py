@@ -304,9 +304,8 @@ class _FilePreview:
             clock, assumed = self.pool.time(wanted.time, matrices if len(matrices) == 1 else [], self._named_signals())
         except DataError as error:
             if is_response(self.pool):
-                command = (
-                    f"ftlm identify-frequency {shlex.quote(os.fspath(self.table.path))} --structure {_ARC_WORDS!r}"
-                )
+                path = shlex.quote(os.fspath(self.table.path))
+                command = f"ftlm identify-frequency {path} {parameter('structure', _ARC_WORDS)}"
                 how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_WORDS!r})", command)
                 return (
                     None,
