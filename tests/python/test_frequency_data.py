@@ -599,9 +599,7 @@ def test_bad_arguments_are_refused_in_words(options, error, words):
 
 
 def test_too_few_frequencies_and_responses_of_size_0_are_refused():
-    with pytest.raises(
-        ftlm.DataError, match=r"2 frequencies give 4 values, and 4 parameters are free \(alpha, a, r, b\)"
-    ):
+    with pytest.raises(ftlm.DataError, match="2 frequencies give 4 values, and 4 parameters are free"):
         ftlm.identify_frequency(arc().slice(0.06, 0.08), ARC)
     dead = ftlm.FrequencyData.from_arrays(W, np.where(W > 1e3, 0, 1.0))
     with pytest.raises(ftlm.DataError, match=r"the response is 0 at row \d+, \d+ in all, and has no relative weight"):

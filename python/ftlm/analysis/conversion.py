@@ -293,7 +293,7 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
         early = next((name for name, seconds in delay.items() if seconds < 0.0), None)
         if early is not None:
             raise ModelError(f"{early} acts {-delay[early]:g} s before its sample; shift its rows, and identify again")
-        a, b, c, d = _sampled(a, b, c, d, [delay[name] for name in inputs], interval)
+        a, b, c, d = _sample_system(a, b, c, d, [delay[name] for name in inputs], interval)
     names = {"inputs": list(inputs), "outputs": list(model.outputs), "name": identifier(model.structure.name)}
     if step is not None:
         return control.ss(a, b, c, d, interval, **names)
@@ -343,7 +343,7 @@ def _filter_output(
     return a, b, c, d
 
 
-def _sampled(
+def _sample_system(
     a: Floats, b: Floats, c: Floats, d: Floats, delays: Sequence[float], step: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the state space at multiples of the step, for held inputs; late inputs are further states.

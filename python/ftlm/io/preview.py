@@ -38,7 +38,7 @@ from ftlm.utils.validation import CSV_TIME, join_names
 
 _MAX_LISTED_COLUMNS = 40
 #: Equation of a resistor in series with a resistor beside a constant-phase element.
-_ZARC = "D^alpha U = a U + r D^alpha I + b I"
+_ARC_WORDS = "D^alpha U = a U + r D^alpha I + b I"
 #: Names of time columns that imply seconds.
 _SECONDS_COLUMN_NAMES = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
 #: Part of a column's error message about its first bad cell.
@@ -304,8 +304,9 @@ class _FilePreview:
             clock, assumed = self.pool.time(wanted.time, matrices if len(matrices) == 1 else [], self._named_signals())
         except DataError as error:
             if is_response(self.pool):
-                command = f"ftlm identify-frequency {shlex.quote(os.fspath(self.table.path))} --structure {_ZARC!r}"
-                how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ZARC!r})", command)
+                path = shlex.quote(os.fspath(self.table.path))
+                command = f"ftlm identify-frequency {path} {parameter('structure', _ARC_WORDS)}"
+                how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_WORDS!r})", command)
                 return (
                     None,
                     (),
