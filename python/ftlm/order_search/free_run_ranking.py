@@ -52,9 +52,11 @@ def record_structure(rec: Record, structure: Structure) -> Structure:
 
 def free_run_errors(model: Model, rec: Record, run: Run) -> dict[str, Floats]:
     """Return measured minus simulated pulse means by output; not finite where the free run diverges."""
-    samples, _ = simulate_samples(replace(model, structure=record_structure(rec, model.structure)), run, 1, None)
+    simulated, _ = simulate_samples(replace(model, structure=record_structure(rec, model.structure)), run, 1, None)
     with np.errstate(over="ignore", invalid="ignore"):
-        return {name: rec.of(name) - (row[:-1] + row[1:]) / 2 for name, row in zip(model.outputs, samples, strict=True)}
+        return {
+            name: rec.of(name) - (row[:-1] + row[1:]) / 2 for name, row in zip(model.outputs, simulated, strict=True)
+        }
 
 
 def free_run_score(

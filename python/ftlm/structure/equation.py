@@ -368,7 +368,9 @@ class Equation:
 
     @check_arguments
     def check_input_orders(self, outputs: Sequence[str]) -> None:
-        """Raise if an input makes the velocity of an equation with friction jump; simulated outputs are exempt.
+        """Raise if an input makes an output that is not linear in it jump; simulated outputs are exempt.
+
+        Friction follows the velocity of the output, and a non-linear term its values within a pulse.
 
         Raises
         ------
@@ -378,9 +380,11 @@ class Equation:
         for item in self.terms:
             known = not (self.order.names or item.order.names or set(item.signals) <= set(outputs))
             if known and item.order.constant >= self.order.constant - 1e-9:
+                terms = self.nonlinear_terms
+                follows, what = (f"the non-linear term {terms[0]}", "motion") if terms else ("friction", "velocity")
                 raise ModelError(
                     f"order {item.order.constant:g} of {item.signal} is not below alpha = {self.order.constant:g}, and "
-                    f"friction in the equation of {self.output} then has no velocity to follow; lower it"
+                    f"{follows} in the equation of {self.output} then has no {what} to follow; lower it"
                 )
 
     @property

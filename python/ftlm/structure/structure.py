@@ -192,6 +192,9 @@ class Structure:
         if self.sensor_filter is not None:
             check_known("filtered signal", self.sensor_filter.signals, self.signals)
         self._check_offset()
+        for one in self.equations:
+            if one.friction is not None or one.nonlinear_terms:
+                one.check_input_orders(self.outputs)
         if self.has_friction:
             self._check_friction()
 
@@ -219,8 +222,6 @@ class Structure:
         """Raise for properties that the simulation with friction does not support."""
         rubbing = [self.equations[i].output for i in self.friction_equations]
         words = f"the equation of {rubbing[0]} has friction"
-        for i in self.friction_equations:
-            self.equations[i].check_input_orders(self.outputs)
         if len(self.equations) > 1 and self.coupling == "measured":
             raise ModelError(
                 f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
