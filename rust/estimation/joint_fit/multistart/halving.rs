@@ -11,11 +11,10 @@ use crate::estimation::joint_fit::progress::ProgressListener;
 use crate::estimation::output_error::{Experiment, Settings};
 use crate::parallel::Stop;
 
-/// Evaluations of every candidate. Then the best get [`SECOND_BUDGET_EVALUATIONS`]: one in [`CANDIDATES_PER_SURVIVOR`],
-/// but at least [`MIN_SURVIVORS`].
+/// Evaluations of every candidate. Then those near the best get [`SECOND_BUDGET_EVALUATIONS`].
 pub(super) const FIRST_BUDGET_EVALUATIONS: usize = 15;
 pub(super) const SECOND_BUDGET_EVALUATIONS: usize = 60;
-pub(super) const CANDIDATES_PER_SURVIVOR: usize = 3;
+/// Initial guesses of a submodel that continue.
 pub(super) const MIN_SURVIVORS: usize = 8;
 /// Evaluations of the prescreening.
 pub(super) const PRESCREEN_EVALUATIONS: usize = 2;

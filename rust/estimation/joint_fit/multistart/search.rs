@@ -3,8 +3,8 @@
 use super::coarse_grid::{coarse_sampling, leading_part};
 use super::halving::{
     competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors, sort_by_cost,
-    RungExecutor, CANDIDATES_PER_SURVIVOR, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO,
-    MIN_SURVIVORS, PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS,
+    RungExecutor, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO, MIN_SURVIVORS,
+    PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS,
 };
 use super::nested_models::{
     fixed_order_problems, integer_order_problems, reduced_problems, FixedOrderProblem, ReducedProblem,
@@ -311,16 +311,12 @@ impl<'a> MultistartState<'a> {
 
     /// Promote the survivors to the second budget; duplicates and candidates far behind do not continue.
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
-        let (laps, free, coarse) = (self.laps, self.free, self.coarse);
         let reached = merge_duplicates(&self.reached, is_same_optimum);
-        let (contenders, lost) = reached.split_at(competitive_candidates(&reached).len());
-        let (ahead, rest) =
-            contenders.split_at(contenders.len().min(MIN_SURVIVORS.max(reached.len() / CANDIDATES_PER_SURVIVOR)));
-        let mut found = laps.run(free, &coarse, ahead, SECOND_BUDGET_EVALUATIONS)?;
-        found.extend_from_slice(rest);
-        let mut found = rank_candidates(&coarse, self.half, found)?;
+        let (survivors, lost) = reached.split_at(competitive_candidates(&reached).len());
+        let found = self.laps.run(self.free, &self.coarse, survivors, SECOND_BUDGET_EVALUATIONS)?;
+        let mut found = rank_candidates(&self.coarse, self.half, found)?;
         found.extend_from_slice(lost);
-        Ok((found, coarse))
+        Ok((found, self.coarse))
     }
 }
 
