@@ -447,6 +447,9 @@ class Sound:
 
     autocovariances = whitening_filter
 
+    def arx_model(self):
+        return [self.normal(50), self.normal(40)], [[self.normal(50), self.normal(40)]], self.one(0, 3, 10)
+
     def is_white(self):
         return self.normal(60), self.one(5, 25)
 

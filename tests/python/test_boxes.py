@@ -7,6 +7,7 @@ import ftlm
 from ftlm.order_search.result import search_summary
 from ftlm.order_search.search import rank_orders
 from ftlm.utils.formatting import number
+from stores import keep_share
 from test_store import EQUATION, bytes_of
 
 #: From this many candidates on boxes screen.
@@ -62,8 +63,7 @@ def test_boxes_keep_the_table_of_squared_equation_errors(run, tmp_path):
     whole = search(run, store=path, **options)
     check_one_by_one(run, whole, **options)
     assert whole.excluded_by_box > whole.candidates // 4
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) * 19 // 20])
+    keep_share(path, 0.5)
     assert 0 < ftlm.search_status(path)["y"].done_count < whole.candidates
     assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
 
@@ -78,9 +78,7 @@ def test_boxes_give_the_same_bits_for_more_threads(run, whole, threads):
 def test_boxes_give_the_same_bits_for_any_threads_in_a_store_and_when_cut(run, whole, tmp_path):
     path = tmp_path / "s.ftlm"
     assert bytes_of(search(run, store=path, threads=1)) == bytes_of(whole)
-    data = path.read_bytes()
-    # What is searched, and where, stands first and is most of it.
-    path.write_bytes(data[: len(data) * 17 // 20])
+    keep_share(path, 0.5)
     assert 0 < ftlm.search_status(path)["y"].done_count < whole.candidates
     assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
 
@@ -126,10 +124,8 @@ def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tm
     assert small.exclusion_counts["bound"] < small.candidates // 10
     assert whole.exclusion_counts["bound"] > whole.candidates // 2
     assert bytes_of(closely(unruly, threads=3)) == bytes_of(whole)
-    data = path.read_bytes()
-    # What is searched, and where, stands first and is most of it.
-    for share in (0.88, 0.97):
-        path.write_bytes(data[: int(len(data) * share)])
+    for share in (0.3, 0.7):
+        keep_share(path, share)
         assert 0 < ftlm.search_status(path)["y"].done_count < whole.candidates
         assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
 

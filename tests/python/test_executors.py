@@ -19,6 +19,7 @@ import ftlm
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.order_search import batches
 from ftlm.utils.checkpoint_file import CheckpointFile
+from stores import keep_share
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 
@@ -108,7 +109,7 @@ def test_spawned_processes_give_the_same_bytes_and_resume(run, expected, tmp_pat
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert bytes_of(search(run, pool)) == expected
         assert bytes_of(search(run, pool, store=path)) == expected
-        os.truncate(path, path.stat().st_size * 2 // 3)
+        keep_share(path, 0.5)
         assert not ftlm.search_status(path)["y"].complete
         assert bytes_of(ftlm.resume_search(path, executor=pool)["y"]) == expected
     assert bytes_of(ftlm.resume_search(path)["y"]) == expected
@@ -221,7 +222,7 @@ def test_spawned_processes_give_the_same_bytes_of_a_stage_and_resume(stage_run, 
     path = tmp_path / "s.ftlm"
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert bytes_of(search_stage(stage_run, pool, store=path)) == stage_expected
-        os.truncate(path, path.stat().st_size * 2 // 3)
+        keep_share(path, 0.5)
         assert not ftlm.search_status(path)["stage"].complete
         assert bytes_of(ftlm.resume_search(path, executor=pool)["stage"]) == stage_expected
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from msgspec import UNSET
@@ -10,6 +9,7 @@ from msgspec import UNSET
 import ftlm
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.search import make_job
+from ftlm.utils.checkpoint_file import RECORD_ENCODER
 
 FREE = {1: ("alpha1", "beta2", "alpha2", "gamma1", "mu2"), 2: ("alpha3", "beta4", "alpha4", "gamma3", "mu4")}
 
@@ -385,5 +385,5 @@ def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or
     job = make_job(
         [clean_a], structure.equation("theta11"), ftlm.order_grid(increment=0.5), SearchSettings(row_basis="time"), m=64
     )
-    assert b"hints" not in msgspec.msgpack.encode(job.request("theta11"))
+    assert b"hints" not in RECORD_ENCODER.encode(job.request("theta11"))
     assert set(structure.equation("theta11").order_names) == {"alpha1", "beta1", "gamma1", "mu1"}

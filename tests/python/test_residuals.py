@@ -323,7 +323,7 @@ def test_the_whitening_filter_is_that_of_yule_and_walker():
 def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatch):
     # A slow sine of a few samples: were its correlations judged as they are, the limit would be above 1.
     monkeypatch.setattr(
-        NoiseModel, "fit", lambda series, inputs, lags: NoiseModel(np.ones(1), 0, [e - e.mean() for e in series], 1.0)
+        NoiseModel, "fit", lambda series, signal, lags: NoiseModel(np.ones(1), 0, [e - e.mean() for e in series], 1.0)
     )
     n = 60
     t = np.arange(n)
@@ -417,7 +417,7 @@ def test_coloured_noise_under_slow_inputs_raises_no_alarm():
         ):
             for shape in SLOW_INPUTS.values():
                 u = shape(t)
-                model = NoiseModel.fit([noise], [[u]], 25)
+                model = NoiseModel.fit([noise], [u], 25)
                 failed += residual_tests._independence([noise], [u], model, 25, first=0).failed
                 tried += 1
     assert failed <= 0.03 * tried

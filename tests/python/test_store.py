@@ -29,6 +29,7 @@ from ftlm.order_search.checkpoint import CoupledTable, Rounds, Section, Store, V
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.search import make_job
 from ftlm.utils.checkpoint_file import RECORD_ENCODER, CheckpointFile
+from stores import keep
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 COARSE = ftlm.order_grid(increment=0.1)
@@ -57,12 +58,6 @@ def tables_of(text):
         name: {n: v for n, v in found.items() if n not in ("verdict", "findings")}
         for name, found in json.loads(text).items()
     }
-
-
-def keep(path, count):
-    """Drop all records but the first ones: a search that was stopped there."""
-    with contextlib.closing(sqlite3.connect(path)) as file, file:
-        file.execute("DELETE FROM search WHERE number > ?", (count,))
 
 
 def records(path):

@@ -262,7 +262,11 @@ def describe_collinear_inputs(runs: Sequence[Run], structure: Structure) -> str 
     """Return a message that names two proportional inputs of one equation and order, or None."""
     for item in structure.equations:
         linear = [t for t in item.terms if t.nonlinear is None]
-        driving = [t for t in linear if t.signal != item.output and isinstance(t.coefficient, str)]
+        driving = [
+            t
+            for t in linear
+            if t.signal != item.output and isinstance(t.coefficient, str) and all(t.signal in run for run in runs)
+        ]
         for one, other in itertools.combinations(driving, 2):
             if one.signal == other.signal or one.order != other.order:
                 continue

@@ -379,8 +379,7 @@ def run_residual_tests(
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
         outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
         if sensitivities is not None and outputs[name].fails_colored:
-            moves = sensitivities().get(name, [])
-            outputs[name] = _test_beyond_parameters(outputs[name], moves, signals, lags, runs[0].inputs)
+            outputs[name] = _test_beyond_parameters(outputs[name], sensitivities().get(name, []), signals, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
@@ -408,7 +407,6 @@ def _test_output(
     series = [np.where(gone, np.nan, e) for e, gone in zip(series, gaps, strict=True)]
     white_test = _whiteness(series, everything.size, lags)
     moving = {n: signals[n] for n in run_inputs if not is_constant(signals[n])}
-    noise = NoiseModel.fit(series, list(moving.values()), lags)
     loops = {
         name: feedback_test(series, moving[name], [v for n, v in moving.items() if n != name])
         for name in commands
@@ -416,6 +414,7 @@ def _test_output(
     }
     inputs = {}
     for name, values in signals.items():
+        noise = NoiseModel.fit(series, values, lags)
         inputs[name] = _independence(series, values, noise, lags, first=0)
         if inputs[name].failed and not commands.get(name, True):
             # What answers within the sample is no sign of what the model lacks.
@@ -429,20 +428,19 @@ def _test_beyond_parameters(
     sensitivities: Sequence[Floats],
     signals: Mapping[str, list[Floats]],
     lags: int,
-    run_inputs: Sequence[str],
 ) -> OutputResiduals:
     """Return the tests with those of inputs that fail by no more than errors of the parameters as passed.
 
     Least squares do not know the color of the noise, and leave residuals that follow an input as far as the parameters
     are uncertain. A step of generalized least squares takes that part away.
     """
-    moving = [signals[n] for n in run_inputs if not is_constant(signals[n])]
-    noise = NoiseModel.fit(output.residuals, moving, lags)
-    beyond = noise.subtract(output.residuals, sensitivities)
     inputs = dict(output.inputs)
     for name, test in output.inputs.items():
-        again = _independence(beyond, signals[name], noise, lags, first=test.first) if test.failed else test
-        inputs[name] = again if again.passed else test
+        if test.failed:
+            noise = NoiseModel.fit(output.residuals, signals[name], lags)
+            beyond = noise.subtract(output.residuals, sensitivities)
+            again = _independence(beyond, signals[name], noise, lags, first=test.first)
+            inputs[name] = again if again.passed else test
     return replace(output, inputs=inputs)
 
 
@@ -461,7 +459,7 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Autoregressive model of residuals without what follows the inputs.
+    """Autoregressive model of residuals without what follows an input.
 
     Parameters
     ----------
@@ -481,12 +479,13 @@ class NoiseModel:
     inflation: float
 
     @classmethod
-    def fit(cls, series: list[Floats], inputs: list[list[Floats]], lags: int) -> NoiseModel:
-        """Fit an ARX model to residuals and keep its noise.
+    def fit(cls, series: list[Floats], signal: list[Floats], lags: int) -> NoiseModel:
+        """Fit an ARX model to residuals and one input, and keep its noise.
 
         An autoregression of the residuals alone takes what follows a periodic or slow input for noise, and so hides it.
+        What follows another input is noise here.
         """
-        through, start, innovations, parameters = _core.arx_model(series, inputs, lags)
+        through, start, innovations, parameters = _core.arx_model(series, [signal], lags)
         rows = sum(row.size for row in innovations)
         return cls(through, start, innovations, rows / max(rows - parameters, 1))
 

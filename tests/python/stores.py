@@ -1,0 +1,17 @@
+"""Stores of searches that were stopped."""
+
+import contextlib
+import sqlite3
+
+
+def keep(path, count):
+    """Drop all records but the first ones: a search that was stopped there."""
+    with contextlib.closing(sqlite3.connect(path)) as file, file:
+        file.execute("DELETE FROM search WHERE number > ?", (count,))
+
+
+def keep_share(path, share):
+    """Drop all records but this share of them."""
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        (last,) = file.execute("SELECT MAX(number) FROM search").fetchone()
+    keep(path, int(share * last))
