@@ -311,9 +311,11 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
         for (input, columns) in inputs.iter().zip(row[1..fixed].chunks_exact_mut(lags.max(1))) {
             columns.iter_mut().enumerate().for_each(|(k, value)| *value = input[run][t - 1 - k]);
         }
-        row[fixed..size - 1].iter_mut().enumerate().for_each(|(k, value)| *value = series[run][t - 1 - k]);
+        // A missing sample counts as the mean, so that few gaps do not cost most rows.
+        let there = |value: f64| if value.is_nan() { 0.0 } else { value };
+        row[fixed..size - 1].iter_mut().enumerate().for_each(|(k, value)| *value = there(series[run][t - 1 - k]));
         row[size - 1] = series[run][t];
-        row[fixed..].iter().all(|value| !value.is_nan())
+        !row[size - 1].is_nan()
     };
     let (mut gram, mut row, mut rows) = (vec![vec![0.0; size]; size], vec![0.0; size], 0_usize);
     for (run, values) in series.iter().enumerate() {
@@ -355,7 +357,7 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
         .enumerate()
         .map(|(run, values)| {
             let error = |t: usize| {
-                let there = fill(run, t, &mut row);
+                let there = fill(run, t, &mut row) && (1..=order).all(|k| !values[t - k].is_nan());
                 let fitted: f64 = row.iter().zip(&coefficients).map(|(value, factor)| value * factor).sum();
                 if there {
                     scale * (row[size - 1] - fitted)

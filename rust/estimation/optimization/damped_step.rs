@@ -397,6 +397,11 @@ pub trait Problem {
     fn allows_extrapolation(&self) -> bool {
         true
     }
+
+    /// Whether the first step may be almost Gauss–Newton, as the minimization follows an optimum that is nearly known.
+    fn starts_near_optimum(&self) -> bool {
+        false
+    }
 }
 /// Ratio of the prediction errors at the last step above which the better model is used for the next one.
 const MIN_PREDICTION_IMPROVEMENT: f64 = 1.5;

@@ -210,7 +210,7 @@ impl<P: Problem> Search<'_, P> {
         let evaluation = self.problem.evaluate(&start)?;
         let point = self.problem.point_of_evaluation(&evaluation, start);
         let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.is_admissible(&point));
-        let is_near = self.problem.allows_extrapolation();
+        let is_near = self.problem.starts_near_optimum();
         let damping = if is_near { INITIAL_DAMPING_NEAR_OPTIMUM } else { INITIAL_DAMPING };
         let curvature = Curvature::new(0);
         Ok(SearchState { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })

@@ -191,6 +191,10 @@ impl<'a> Problem for OutputErrorProblem<'a> {
     fn allows_extrapolation(&self) -> bool {
         self.allows_extrapolation
     }
+
+    fn starts_near_optimum(&self) -> bool {
+        self.allows_extrapolation
+    }
 }
 
 /// Move a point by steps in its coordinates, within bounds; return it and the largest change.
