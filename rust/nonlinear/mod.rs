@@ -2,7 +2,7 @@
 //!
 //! D^α y = Σ c D^ν s + Σ k D^μ n, where n is an expression over signals and derivatives of them
 //! ([`DerivedSignal`](crate::expression::DerivedSignal)). Orders of the derivatives of outputs are at most α − μ. The
-//! scheme is of second order in the step, and implicit ([`march`]). Memory is a blocked online convolution with the
+//! scheme is of second order in the step, and implicit. Memory is a blocked online convolution with the
 //! kernels of fractional integrals alone.
 
 mod forcing;
