@@ -11,7 +11,7 @@ def keep(path, count):
 
 
 def keep_share(path, share):
-    """Drop all records but this share of them."""
+    """Drop all records but this share of them; what is searched and one batch stay, and one record goes."""
     with contextlib.closing(sqlite3.connect(path)) as file:
         (last,) = file.execute("SELECT MAX(number) FROM search").fetchone()
-    keep(path, int(share * last))
+    keep(path, min(max(int(share * last), 2), last - 1))

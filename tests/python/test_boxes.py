@@ -124,7 +124,7 @@ def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tm
     assert small.exclusion_counts["bound"] < small.candidates // 10
     assert whole.exclusion_counts["bound"] > whole.candidates // 2
     assert bytes_of(closely(unruly, threads=3)) == bytes_of(whole)
-    for share in (0.3, 0.7):
+    for share in (0.4, 0.8):
         keep_share(path, share)
         assert 0 < ftlm.search_status(path)["y"].done_count < whole.candidates
         assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
