@@ -57,7 +57,7 @@ FINDING_TOPICS: dict[str, Topic] = {
         "reference signal with {ask[reference]}",
     ),
     "chaos": Topic(
-        "the simulation forgets its parameters",
+        "the motion is chaotic",
         "fit parts of the run that are shorter than that, or use {ask[method is least-squares]}",
     ),
     "range": Topic("the simulation overflows", "choose other orders, or fewer terms"),
@@ -297,9 +297,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "other_intersample_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{input} is {other} between samples, by its runs, and was taken as {taken}|: taken as {other}, it leaves "
-        "{ratio:.3g} times the sum of squared residuals, and {parameter} is {other_value:.4g} instead of {value:.4g} ± "
-        "{error:.2g}",
+        "{input} was taken as {taken} between samples, but the runs favor {other}|: the sum of squared residuals falls "
+        "to {ratio:.3g} times its value, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
         "{input} fits better as {other} between samples than as {taken}: {parameter} is {other_value:.4g}, not "
         "{value:.4g}",
         "state {input}={kind} in {ask[intersample]} if that is how it acted",
@@ -344,15 +343,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "nonlinear_range": FindingKind(
         "other",
         LEVEL_FACT,
-        "{term} in the equation of {output} is {share:.3g} % of {whole} (rms) with {ranges}|; nothing is known of it "
-        "beyond",
+        "{term} is {share:.3g} % of {whole} (rms) in the equation of {output}|, which is fitted only for {ranges}",
     ),
     "run_forgets": FindingKind(
         "chaos",
         LEVEL_DO_NOT_USE,
         "a small change of a parameter moves the free run {growth:.2g} times as much in its second half as in its "
-        "first: the motion is chaotic or nearly so, the run forgets its parameters after {seconds:.3g} s|, and "
-        "intervals of a fit to all of it mean nothing; {remedy}",
+        "first: the motion is chaotic or nearly so|. After {seconds:.3g} s the run depends on its parameters too "
+        "strongly for a fit, and intervals of a fit to all of it mean nothing; {remedy}",
     ),
     "free_runs_of_some": FindingKind(
         "search",

@@ -274,12 +274,12 @@ pub struct ArxModel {
     pub parameters: usize,
 }
 
-/// ARX model of series with one spectrum, by least squares. O((lags · inputs)² · N).
+/// ARX model with a noise spectrum that all series share, by least squares. O((lags · inputs)² · N).
 ///
-/// In a spectrum of the series alone, what follows an input counts as noise, and hides itself. The order of the
-/// autoregression, `most` at most, minimizes the Bayesian information criterion; inputs have lags from 1 to `most`, as
-/// far as the number of samples allows. At lag 0 a controller's input contains the noise itself. NaN counts as a missing
-/// sample of a series; `inputs` have one row for each series and no missing samples.
+/// An AR model without the inputs would take the response to an input for noise, and mask it. The order of the AR part,
+/// at most `most`, minimizes the Bayesian information criterion; inputs have lags 1 to `most`, fewer if samples are few.
+/// Lag 0 is left out: under feedback, the input at lag 0 contains the current noise. NaN is a missing sample of a series;
+/// `inputs` have one row for each series and no missing samples.
 ///
 /// ```
 /// // A sinusoid that follows an input, and noise that changes its sign at random: the filter is that of the noise.

@@ -72,11 +72,10 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
 
 
 def intersample_findings(fit: Fit) -> list[Finding]:
-    """Return a finding on each input whose other behavior between samples the runs clearly prefer.
+    """Return a finding on each input for which the runs clearly prefer the other hold, zero-order or first-order.
 
-    An input that changes from row to row may be a staircase that the plant received, or samples of a smooth signal.
-    Half a sample of delay lies between the two, which a fit takes for a property of the plant. Each such input is
-    refitted from the optimum with its other behavior.
+    Rows alone do not tell a staircase from samples of a smooth signal. The wrong hold is half a sample of delay, which
+    biases the parameters. Each input that changes in most rows is refitted from the optimum with the other hold.
     """
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or structure.has_friction or structure.limits:

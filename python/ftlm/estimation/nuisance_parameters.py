@@ -184,9 +184,9 @@ def offset_test(
 def output_sensitivities(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
 ) -> dict[str, list[Floats]]:
-    """Return the sensitivities of each output's residuals, per run with shape (parameters, samples); {} if not finite.
+    """Return d(residuals)/d(parameters) of each output, per run, with shape (parameters, samples); {} if not finite.
 
-    Initial terms are projected out of them.
+    Their projection on the initial terms is subtracted.
     """
     try:
         grid, here = evaluate_at_point(runs, structure, values, every)

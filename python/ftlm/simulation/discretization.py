@@ -381,8 +381,8 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
             point = parameter("at", dict.fromkeys(term.signals, 0.3))
             linear = choose_text(f"model.linearized({point})", "Model.linearized in Python")
             raise ModelError(
-                f"the equation of {item.output} has the non-linear term {term}, which {what} does not know; use the "
-                f"linear model about an operating point, {linear}, or free runs (simulate, compare)"
+                f"the equation of {item.output} has the non-linear term {term}, and {what} is for linear models; "
+                f"use the linear model about an operating point, {linear}, or free runs (simulate, compare)"
             )
 
 
@@ -391,7 +391,7 @@ def check_frictionless(equations: Sequence[Equation], what: str) -> None:
     for item in equations:
         if item.friction is not None:
             raise ModelError(
-                f"the equation of {item.output} has friction, which {what} does not know; use "
+                f"the equation of {item.output} has friction, and {what} is for linear models; use "
                 f"{parameter('method', 'output-error')} and simulations (simulate, compare), or leave the friction out"
             )
 

@@ -429,10 +429,10 @@ def _test_beyond_parameters(
     signals: Mapping[str, list[Floats]],
     lags: int,
 ) -> OutputResiduals:
-    """Return the tests with those of inputs that fail by no more than errors of the parameters as passed.
+    """Return the tests, with a failure turned into a pass if errors of the parameters explain it.
 
-    Least squares do not know the color of the noise, and leave residuals that follow an input as far as the parameters
-    are uncertain. A step of generalized least squares takes that part away.
+    Least squares ignores the color of the noise, so errors of the parameters alone can correlate residuals with an
+    input. One generalized least-squares step removes that part.
     """
     inputs = dict(output.inputs)
     for name, test in output.inputs.items():
@@ -459,7 +459,7 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Autoregressive model of residuals without what follows an input.
+    """AR noise model of residuals, less their response to an input.
 
     Parameters
     ----------
@@ -480,10 +480,10 @@ class NoiseModel:
 
     @classmethod
     def fit(cls, series: list[Floats], signal: list[Floats], lags: int) -> NoiseModel:
-        """Fit an ARX model to residuals and one input, and keep its noise.
+        """Fit an ARX model to residuals and one input; keep its noise part.
 
-        An autoregression of the residuals alone takes what follows a periodic or slow input for noise, and so hides it.
-        What follows another input is noise here.
+        An AR model of the residuals alone would take the response to a periodic or slow input for noise, and mask it.
+        Responses to other inputs count as noise.
         """
         through, start, innovations, parameters = _core.arx_model(series, [signal], lags)
         rows = sum(row.size for row in innovations)
