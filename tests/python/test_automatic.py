@@ -32,9 +32,10 @@ def record(
         ([7.0], [1.0, 4.0], 6, "u(t - 0:1 s)"),
         ([12.0, 40.0], [1.0, 3.0, 40.0], 0, "D^1 u"),
         ([60.0], [1.0, 6.0, 0.0], 0, "D^2 y = a1 D^1 y + b0 u"),
+        ([1.0, 0.4, 30.0], [1.0, 0.5, 25.0], 0, "D^2 y = a1 D^1 y + a0 y + b2 D^2 u + b1 D^1 u + b0 u"),
     ],
 )
-def test_auto_finds_a_delay_a_zero_and_an_integrator(
+def test_auto_finds_a_delay_zeros_feedthrough_and_an_integrator(
     numerator: list[float], denominator: list[float], late: int, words: str
 ) -> None:
     run, _ = record(numerator, denominator, seed=1, hold=20, late=late)
@@ -42,6 +43,22 @@ def test_auto_finds_a_delay_a_zero_and_an_integrator(
     found = ftlm.select(run, "auto", threads=1)
     assert words in found.winner.name
     assert found.best.model.compare(other).fit_percent["y"] > truth - 0.5
+
+
+def test_auto_finds_the_level_of_an_output_rather_than_a_pole_and_a_zero_at_zero() -> None:
+    # An oven that is kept at 55 degrees by 20 %, and is then heated twice.
+    u = np.full(800, 20.0)
+    u[60:400], u[400:] = 45.0, 30.0
+    pole = np.exp(-1 / 40)
+    y = 55 + lfilter([0, 0.6 * (1 - pole)], [1, -pole], np.r_[np.zeros(12), u - 20][:800])
+    noisy = y + 0.1 * np.random.default_rng(0).standard_normal(800)
+    run = ftlm.Run.from_arrays(step=1.0, inputs={"u": u}, outputs={"y": noisy})
+    found = ftlm.select(run, "auto", threads=1)
+    assert found.winner.name == "D^1 y = a0 y + b0 u(t - 0:60 s), with an output level"
+    values = found.best.parameters
+    assert values["a0"].value == pytest.approx(-1 / 40, rel=0.02)
+    assert values["b0"].value == pytest.approx(0.6 / 40, rel=0.02)
+    assert values["delay_u"].value == pytest.approx(12, abs=0.3)
 
 
 def test_a_candidate_that_fails_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -211,6 +211,20 @@ def test_given_starts_overrule():
         ftlm.equation(WORDS, offset="nothing")
 
 
+def test_a_level_that_is_asked_for_does_not_imply_rest():
+    # The input is 20 before the first row, too; nothing shows whether the plant rested then.
+    u = np.full(800, 20.0)
+    u[60:400], u[400:] = 45.0, 30.0
+    pole = np.exp(-1 / 40)
+    y = 55 + lfilter([0, 0.6 * (1 - pole)], [1, -pole], u - 20) + 0.1 * np.random.default_rng(0).standard_normal(800)
+    run = ftlm.Run.from_arrays(step=1.0, inputs={"u": u}, outputs={"y": y})
+    found = ftlm.identify(run, ftlm.equation("D y = a y + b u", offset="level"))
+    assert found.parameters["a"].value == pytest.approx(-1 / 40, rel=0.02)
+    assert found.parameters["b"].value == pytest.approx(0.6 / 40, rel=0.02)
+    assert found.fit_percent["y"] > 97
+    assert found.model.compare(run).fit_percent["y"] > 97
+
+
 def test_initial_values_of_the_textbook_are_refused_with_caputos_powers():
     """Bagley and Torvik: D^2 y + D^1.5 y + y = 1 + t with y(0) = y'(0) = 1 has the solution 1 + t."""
     t = 0.05 * np.arange(201)

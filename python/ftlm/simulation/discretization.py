@@ -131,9 +131,9 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smo
     Raises for missing signals, signals whose squares underflow, delays of outputs, and missing samples of inputs. Other
     missing samples are interpolated and must not be fitted.
     """
+    initial = resolve_initial_conditions(run, structure)
     run, structure = without_level(run, structure)
     _check_known_inputs(structure)
-    initial = resolve_initial_conditions(run, structure)
     step, means, sensor, _ = recording(run, structure, initial).pulses(m, filtered)
     signals = record_signals(structure)
     return Record(
@@ -161,10 +161,10 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
     Free delays and limits are the core's to apply. Raises for missing signals, delays of outputs, and missing samples
     of inputs.
     """
+    initial = resolve_initial_conditions(run, structure) if initial is None else initial
     run, structure = without_level(run, structure)
     _check_missing(run, structure)
     check_derivative_orders(run, structure)
-    initial = resolve_initial_conditions(run, structure) if initial is None else initial
     sensor, signals = structure.sensor_filter, structure.signals
     return _core.Recording(
         {

@@ -113,8 +113,8 @@ def output_simulation(
     Initial terms of a model that is not linear in them are fitted on a grid of its own.
     """
     structure, signals = model.structure, record_signals(model.structure)
+    start = resolve_initial_conditions(run, structure)
     run, plain = without_level(run, structure)
-    start = resolve_initial_conditions(run, plain)
     frictions = [(i, (model.equations[i].friction or Friction(0.0)).law) for i in structure.friction_equations]
     equations = [(linear_tuple(e, signals), [float(t.fixed or 0.0) for t in e.terms]) for e in model.equations]
     core = _core.OutputSimulation(recording(run, plain, start), equations, frictions, times, derived_signals(structure))

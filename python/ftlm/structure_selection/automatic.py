@@ -20,13 +20,14 @@ from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
 MAX_ORDER = 4
 #: Largest delay in samples, and as a share of the shortest run.
 MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
-#: Number of best candidates for which variants are also fitted (an integrator, feedthrough, an offset), and number of
-#: candidates that are validated, of integer and of fractional orders.
+#: Number of best candidates whose neighbors are fitted first, and number of candidates that are validated, of integer
+#: and of fractional orders.
 EXTENDED_CANDIDATES, VALIDATED_CANDIDATES, VALIDATED_FRACTIONAL = 3, 6, 2
 #: Difference of Schwarz criteria beyond which a candidate of integer orders is not validated, and one of fractional
 #: orders.
 MAX_BIC_GAP, MAX_FRACTIONAL_BIC_GAP = 60.0, 10.0
-#: Smallest decrease of the Schwarz criterion for which delays or an offset are tried in all candidates.
+#: Smallest decrease of the Schwarz criterion for which delays or an offset are tried in all candidates, and the largest
+#: distance from the best one of forms whose neighbors are fitted.
 MIN_BIC_DECREASE = 6.0
 #: Order of the best form of integer orders for which D^2 y = a1 D^mu y + a0 y + … is tried.
 FRACTIONAL_DAMPING_ORDER = 2
@@ -165,10 +166,24 @@ class AutomaticSelection:
         fits = self._fit_zeros(forms, probes)
         if self._is_delayed(fits, offset):
             fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
+        return self._fit_neighbors(fits)
+
+    def _fit_neighbors(self, fits: list[FittedForm]) -> list[FittedForm]:
+        """Add the neighbors of the best forms, and of each that turns out to be as good; best first.
+
+        A high order may hide a property that it imitates: a level, direct feedthrough, a pole that a zero cancels. Each
+        step to a form that has it and is simpler lowers the criterion.
+        """
         done = {f.form for f in fits}
-        more = [v for f in fits[:EXTENDED_CANDIDATES] if f.form for v in _variants(f.form) if v not in done]
-        fits += self._fit(more)
-        return sorted(fits, key=lambda f: f.bic)
+        new = [f.form for f in fits[:EXTENDED_CANDIDATES]]
+        expanded: set[IntegerOrderForm | None] = {None}
+        while new:
+            expanded.update(new)
+            more = [n for n in dict.fromkeys(n for form in new if form for n in _neighbors(form)) if n not in done]
+            done.update(more)
+            fits = sorted([*fits, *self._fit(more)], key=lambda f: f.bic)
+            new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
+        return fits
 
     def _fit_zeros(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
         """Add the fits of forms with all zeros, and of those with fewer that can have the least criterion; best first.
@@ -257,13 +272,18 @@ class AutomaticSelection:
         return sorted(found, key=lambda f: f.bic)
 
 
-def _variants(form: IntegerOrderForm) -> list[IntegerOrderForm]:
-    """Forms that differ in one property: an integrator, direct feedthrough, a level."""
-    return [
-        replace(form, integrator=True),
-        replace(form, zeros=form.order),
+def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
+    """Forms that differ in one property: an integrator, direct feedthrough, an offset, a canceled pole and zero."""
+    found = [
+        replace(form, integrator=not form.integrator),
+        replace(form, zeros=form.order if form.zeros < form.order else form.order - 1),
         replace(form, offset="level" if form.offset == "none" else "none"),
     ]
+    if form.zeros > 0:
+        lower = replace(form, order=form.order - 1, zeros=form.zeros - 1, integrator=False)
+        # A pole and a zero at s = 0 do what a level does.
+        found += [lower, replace(lower, offset="level"), replace(lower, integrator=form.integrator)]
+    return [f for f in dict.fromkeys(found) if f.zeros >= 0 and f.order > int(f.integrator)]
 
 
 def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:

@@ -422,7 +422,12 @@ def scatter_factor(joint: JointFit) -> float:
 
 
 def schwarz_criterion(joint: JointFit, numbers: int, scatter: float) -> float:
-    """Schwarz's criterion with `scatter` samples per effective sample; doi:10.1214/aos/1176344136."""
+    """Schwarz's criterion with `scatter` samples per effective sample; doi:10.1214/aos/1176344136.
+
+    Initial terms count like parameters: a pole that a zero cancels adds one, which does what a level does.
+    """
     samples = joint.samples / scatter
     each = samples / max(len(joint.noise), 1)
-    return sum(each * 2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()) + numbers * math.log(samples)
+    return sum(each * 2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()) + (
+        numbers + joint.initial_terms
+    ) * math.log(samples)
