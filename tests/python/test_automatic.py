@@ -61,6 +61,18 @@ def test_auto_finds_the_level_of_an_output_rather_than_a_pole_and_a_zero_at_zero
     assert values["delay_u"].value == pytest.approx(12, abs=0.3)
 
 
+def test_noise_with_a_color_does_not_raise_the_order() -> None:
+    g = np.random.default_rng(1)
+    u = np.repeat(g.choice([-1.0, 1.0], 100), 15)
+    b, a, _ = cont2discrete(([4.0], [1.0, 0.8, 4.0]), 0.05)[:3]
+    y = lfilter(np.ravel(b), a, u) + lfilter([0.05], [1, -0.95], g.standard_normal(1500))
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y})
+    found = ftlm.select(run, "auto", threads=1)
+    assert found.winner.name == "D^2 y = a1 D^1 y + a0 y + b0 u"
+    lower, upper = found.best.intervals["a1"]
+    assert lower < -0.8 < upper
+
+
 def test_a_candidate_that_fails_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     from ftlm.structure_selection import stepwise
 

@@ -13,7 +13,7 @@ from ftlm.estimation.output_error import JointFit
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.candidates import describe_structure
-from ftlm.structure_selection.cross_validation import Trial, parameter_count, schwarz_criterion
+from ftlm.structure_selection.cross_validation import Trial, parameter_count, scatter_factor, schwarz_criterion
 from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
 
 #: Highest integer order.
@@ -23,8 +23,8 @@ MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
 #: Number of best candidates whose neighbors are fitted first, and number of candidates that are validated, of integer
 #: and of fractional orders.
 EXTENDED_CANDIDATES, VALIDATED_CANDIDATES, VALIDATED_FRACTIONAL = 3, 6, 2
-#: Difference of Schwarz criteria beyond which a candidate of integer orders is not validated, and one of fractional
-#: orders.
+#: Difference of Schwarz criteria beyond which a candidate of integer orders is not validated, unless it is the best of
+#: its order, and one of fractional orders.
 MAX_BIC_GAP, MAX_FRACTIONAL_BIC_GAP = 60.0, 10.0
 #: Smallest decrease of the Schwarz criterion for which delays or an offset are tried in all candidates, and the largest
 #: distance from the best one of forms whose neighbors are fitted.
@@ -98,12 +98,22 @@ def delays_of_inputs(runs: Sequence[Run], given: Delays, *, delayed: bool) -> di
 
 @dataclass(frozen=True)
 class FittedForm:
-    """Form or structure with its fit and criterion."""
+    """Form or structure with its fit, its number of parameters, the color of its residuals, and its criterion."""
 
     structure: Structure
     joint: JointFit
-    bic: float
-    form: IntegerOrderForm | None = None
+    form: IntegerOrderForm | None
+    parameters: int
+    scatter: float
+    bic: float = math.inf
+
+
+def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
+    """Sort by Schwarz's criterion, best first, with the color of the whitest residuals among them."""
+    scatter = min((f.scatter for f in fits), default=1.0)
+    return sorted(
+        (replace(f, bic=schwarz_criterion(f.joint, f.parameters, scatter)) for f in fits), key=lambda f: f.bic
+    )
 
 
 @dataclass
@@ -131,9 +141,18 @@ class AutomaticSelection:
         """Fit the candidates and validate the best; return all trials in order."""
         fits = self._fit_integer_orders()
         if fits:
-            best = self._validate(fits, VALIDATED_CANDIDATES, MAX_BIC_GAP, fits[0].bic)
-            forms = self._fit_fractional_forms(fits, best)
-            self._validate(forms, VALIDATED_FRACTIONAL, MAX_FRACTIONAL_BIC_GAP, fits[0].bic)
+            # Noise with a color lets high orders fit it: the best of every order is validated, whatever its criterion.
+            known = {f.form for f in fits}
+            fewer = [replace(f, zeros=m) for f in _leaders(fits) for m in range(f.zeros)]
+            fits = _rank([*fits, *self._fit([f for f in fewer if f not in known])])
+            leaders = _leaders(fits)
+            ahead = [f for f in fits if f.form in leaders]
+            near = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in leaders]
+            best = self._validate([*ahead, *near[: VALIDATED_CANDIDATES - len(ahead)]])
+            every = _rank([*fits, *self._fit_fractional_forms(fits, best)])
+            least = min(f.bic for f in every if f.form is not None)
+            fractional = [f for f in every if f.form is None and f.bic < least + MAX_FRACTIONAL_BIC_GAP]
+            self._validate(fractional[:VALIDATED_FRACTIONAL])
         return self.evaluator.trials
 
     def _fit(self, forms: Sequence[IntegerOrderForm]) -> list[FittedForm]:
@@ -149,13 +168,11 @@ class AutomaticSelection:
         found = []
         for (structure, form, _), joint in zip(items, joints, strict=True):
             if isinstance(joint, JointFit):
-                found.append(FittedForm(structure, joint, self._criterion(structure, joint), form))
+                count = parameter_count(structure, joint, self.evaluator.folds)
+                found.append(FittedForm(structure, joint, form, count, scatter_factor(joint)))
             else:
                 self.evaluator.trials.append(self.evaluator.validate(describe_structure(structure), structure, joint))
-        return sorted(found, key=lambda f: f.bic)
-
-    def _criterion(self, structure: Structure, joint: JointFit) -> float:
-        return schwarz_criterion(joint, parameter_count(structure, joint, self.evaluator.folds), 1.0)
+        return _rank(found)
 
     def _fit_integer_orders(self) -> list[FittedForm]:
         """Fit integer orders, and variants of the best; best first."""
@@ -181,7 +198,7 @@ class AutomaticSelection:
             expanded.update(new)
             more = [n for n in dict.fromkeys(n for form in new if form for n in _neighbors(form)) if n not in done]
             done.update(more)
-            fits = sorted([*fits, *self._fit(more)], key=lambda f: f.bic)
+            fits = _rank([*fits, *self._fit(more)])
             new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
         return fits
 
@@ -191,7 +208,7 @@ class AutomaticSelection:
         A form with fewer zeros leaves no less, so its criterion is lower by at most the penalty of its zeros.
         """
         known = {f.form for f in fits}
-        full = [*fits, *self._fit([f for f in forms if f not in known])]
+        full = _rank([*fits, *self._fit([f for f in forms if f not in known])])
         least = min((f.bic for f in full), default=math.inf)
         fewer = [
             replace(form, zeros=m)
@@ -200,7 +217,7 @@ class AutomaticSelection:
             for m in range(form.order - 1)
             if fitted.bic - (form.order - 1 - m) * self._penalty(fitted) < least
         ]
-        return sorted([*full, *self._fit(fewer)], key=lambda f: f.bic)
+        return _rank([*full, *self._fit(fewer)])
 
     def _penalty(self, fitted: FittedForm) -> float:
         """Penalty of one zero of every input in the criterion."""
@@ -211,16 +228,16 @@ class AutomaticSelection:
         plain, late = (delays_of_inputs(self.runs, self.delays, delayed=d) for d in (False, True))
         if plain == late:
             return False
-        probes = self._fit([IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])
-        for probe in probes:
-            known = [f.bic for f in fits if probe.form is not None and f.form == replace(probe.form, delayed=False)]
-            if probe.bic < min(known, default=math.inf) - MIN_BIC_DECREASE:
-                return True
-        return False
+        every = _rank([*fits, *self._fit([IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])])
+        known = {f.form: f.bic for f in every if f.form is not None}
+        return any(
+            bic < known.get(replace(form, delayed=False), math.inf) - MIN_BIC_DECREASE
+            for form, bic in known.items()
+            if form.delayed
+        )
 
-    def _validate(self, fits: Sequence[FittedForm], count: int, gap: float, least: float) -> FittedForm | None:
-        """Validate the best fits; return the one with the best prediction."""
-        ahead = [f for f in fits if f.bic < least + gap][:count]
+    def _validate(self, ahead: Sequence[FittedForm]) -> FittedForm | None:
+        """Validate fits; return the one with the best prediction."""
         found = self.evaluator.map_candidates(
             lambda f: self.evaluator.validate(describe_structure(f.structure), f.structure, f.joint), ahead
         )
@@ -269,7 +286,14 @@ class AutomaticSelection:
             delayed = structure(text, delayed=True)
             begin = [{**late, **values_of(found[0].joint)}, *(start(delayed, a) for a in texts[text])]
             found += self._fit_structures([(delayed, None, begin)])
-        return sorted(found, key=lambda f: f.bic)
+        return _rank(found)
+
+
+def _leaders(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
+    """Best form of each order by the criterion among the forms of that order."""
+    forms = [f for f in fits if f.form is not None]
+    orders = sorted({f.form.order for f in forms if f.form})
+    return [g.form for n in orders if (g := _rank([f for f in forms if f.form and f.form.order == n])[0]).form]
 
 
 def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:

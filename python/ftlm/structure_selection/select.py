@@ -229,19 +229,13 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
         if key not in kept or trial.score < kept[key].score:
             kept[key] = trial
     ranked = _rank_trials(list(kept.values()))
-    scatter = min(scatter_factor(t.joint) for t in there if t.joint is not None)
-    ranked = [
-        t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked
-    ]
+    ranked = _with_criteria(ranked)
     best = ranked[0]
     near = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], best)]
     # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
     for k, trial in zip(near, work.map_items(work.refine_trial, [ranked[k] for k in near]), strict=True):
         ranked[k] = trial
-    scatter = min(scatter_factor(t.joint) for t in ranked if t.joint is not None)
-    ranked = [
-        t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked
-    ]
+    ranked = _with_criteria(ranked)
     eligible, words = _eligible_indices(ranked, near) if prefers_integer_orders else (near, "")
     best, winner = ranked[0], _winner([ranked[k] for k in eligible])
     found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
@@ -267,6 +261,15 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
         tuple(findings),
         None if not unseen else found.validate(unseen),
     )
+
+
+def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
+    """Return ranked trials with their Schwarz criteria, in which the color of noise is that of the best's residuals.
+
+    A higher order that predicts worse leaves whiter residuals where it fits drifts and disturbances of these samples.
+    """
+    scatter = 1.0 if ranked[0].joint is None else scatter_factor(ranked[0].joint)
+    return [t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked]
 
 
 def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Identification) -> list[Finding]:
