@@ -338,6 +338,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "the {words} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
     "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
+    "coefficient_on_bound": FindingKind(
+        "edge",
+        LEVEL_WITH_CARE,
+        "{parameter} = {value:.4g} is on its bound, beyond which the data are fitted better ({outside:.4g} without it)|"
+        "; it has no interval, and those of the others are for this value",
+        "{parameter} = {value:.4g} is on its bound, beyond which the data are fitted better",
+    ),
     "genetic_on_bound": FindingKind(
         "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
     ),

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm import _core
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import ConvergenceError, DataError, ModelError
+from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, fit_within_bounds
 from ftlm.estimation.frequency_result import FrequencyIdentification
 from ftlm.estimation.model_checks import (
     SAME_MODEL_POWER,
@@ -554,6 +555,7 @@ def identify_frequency(
     fixed: Mapping[str, float] | None = None,
     delay: Mapping[str, float | tuple[float, float]] | None = None,
     start: Mapping[str, float] | None = None,
+    bounds: Bounds | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FrequencyIdentification:
     """Identify orders, coefficients and delays from a measured frequency response or impedance.
@@ -578,6 +580,9 @@ def identify_frequency(
         See :func:`ftlm.equation`: grids of orders bound them, too; a delay (low, high) is estimated.
     start
         Additional initial guess by name; missing values are 1, and 0 for a delay.
+    bounds
+        (lower, upper) of coefficients and orders by name; infinite for an open side. A coefficient that ends on a bound
+        is fixed there and has no interval, and a finding names it.
     progress
         Callback with (parts done, total parts).
 
@@ -597,10 +602,37 @@ def identify_frequency(
     ConvergenceError
         No initial guess has a finite response.
     """
-    wanted = _structure(structure, orders, fixed, delay)
+    wanted, limits = check_bounds(_structure(structure, orders, fixed, delay), bounds, start)
     records = _match_records(as_frequency_data(data), wanted)
     kind, weight = _weights(records, weights)
-    problem = ResponseProblem(wanted, records, weight)
+    check_known("start", start or {}, ResponseProblem(wanted, records, weight).names)
+
+    def fit(asked: Structure, only: Mapping[str, float] | None) -> tuple[FrequencyIdentification, Mapping[str, float]]:
+        problem = ResponseProblem(asked, records, weight)
+        given = start if only is None else only
+        known = {n: v for n, v in given.items() if n in problem.names} if isinstance(given, Mapping) else given
+        found = _fit_response(problem, records, weight, kind, known, progress, alone=only is not None)
+        return found, found.values
+
+    result, found = fit_within_bounds(wanted, limits, fit)
+    result = replace(result, findings=(*result.findings, *found))
+    PACKAGE_LOGGER.info("identified: %s", result.verdict)
+    for item in result.findings:
+        PACKAGE_LOGGER.warning("%s", item)
+    return result
+
+
+def _fit_response(
+    problem: ResponseProblem,
+    records: list[FrequencyData],
+    weight: list[Floats],
+    kind: str,
+    start: Mapping[str, float] | None,
+    progress: Callable[[int, int], None] | None,
+    *,
+    alone: bool,
+) -> FrequencyIdentification:
+    """Fit a response problem from automatic initial guesses and the given one, or from that `alone`."""
     count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
     if count <= numbers:
         raise DataError(
@@ -619,8 +651,9 @@ def identify_frequency(
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
     # Starts race on no more frequencies than tell them apart; the best goes on with all.
     few, light = zip(*(_subsample_data(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
-    racing = problem if count <= 2 * MAX_MULTISTART_FREQUENCIES else ResponseProblem(wanted, few, light)
-    begun = [*_user_start(racing, start, *racing.constraints()[:2]), *initial_guesses(racing)]
+    racing = problem if count <= 2 * MAX_MULTISTART_FREQUENCIES else ResponseProblem(problem.structure, few, light)
+    begun = _user_start(racing, start, *racing.constraints()[:2])
+    begun += [] if alone else initial_guesses(racing)
     course.advance_to(STARTS_END_FRACTION)
     fits = []
     for values in begun:
@@ -648,7 +681,7 @@ def identify_frequency(
     if at_limit and not _is_bound_significant(problem, records, best, kind):
         held = [text for text in held if text not in map(exponent_bound, at_limit)]
     ends = [f if racing is problem else _fit_again(problem, racing, f) for f in _near_optima(fits, racing, kind)]
-    result = _result(
+    return _result(
         problem,
         records,
         best,
@@ -658,10 +691,6 @@ def identify_frequency(
         exact=best.cost <= NEGLIGIBLE_RESIDUAL_SHARE**2 * total,
         ends=ends,
     )
-    PACKAGE_LOGGER.info("identified: %s", result.verdict)
-    for item in result.findings:
-        PACKAGE_LOGGER.warning("%s", item)
-    return result
 
 
 def _structure(
@@ -800,8 +829,11 @@ def _user_start(
     if not isinstance(start, Mapping):
         raise ModelError(f"start is {type(start).__name__}; give values by name, such as {{'alpha': 0.8}}")
     check_known("start", start, problem.names)
-    free = len(problem.orders) + len(problem.coefficients)
-    values = np.array([float(start.get(n, 1.0 if k < free else 0.0)) for k, n in enumerate(problem.names)])
+    usual = dict.fromkeys(problem.coefficients, 1.0)
+    for name in problem.orders:
+        grid = problem.structure.order_values.get(name, (1.0,))
+        usual[name] = min(max(1.0, grid[0]), grid[-1])
+    values = np.array([float(start.get(n, usual.get(n, 0.0))) for n in problem.names])
     begun = problem.in_problem_units(values)
     if not (np.all(np.isfinite(values)) and np.all(rows @ begun <= limits + 1e-9)):
         raise ModelError(

@@ -281,8 +281,9 @@ class FrequencyIdentification:
     @property
     def parameters(self) -> dict[str, Parameter]:
         """Orders, coefficients and delays by name, with standard errors, intervals and units."""
+        values = {**self.values, **self.model.coefficients}
         return parameter_estimates(
-            self.model, self.values, errors=self.standard_errors, intervals=self.intervals, free=self.names
+            self.model, values, errors=self.standard_errors, intervals=self.intervals, free=self.names
         )
 
     @property
@@ -371,7 +372,8 @@ class FrequencyIdentification:
         for p in self.parameters.values():
             low, high = p.interval
             ends = f"[{format_bound(low, '.5g')}, {format_bound(high, '.5g')}]"
-            rows.append((p.name, f"{p.value:.6g}", f"± {format_bound(p.standard_error)}", ends, p.unit))
+            error = "fixed" if p.fixed else f"± {format_bound(p.standard_error)}"
+            rows.append((p.name, f"{p.value:.6g}", error, "" if p.fixed else ends, p.unit))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         lines = [
             f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip()
