@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
@@ -14,8 +15,17 @@ from ftlm.utils.validation import check_known, real_number
 
 Bounds = Mapping[str, tuple[float, float]]
 
-
 FitType = TypeVar("FitType")
+
+
+def check_intervals(bounds: object, *, finite: bool = False) -> None:
+    """Raise ModelError unless each bound is a pair of rising numbers by name; only finite ones if `finite`."""
+    if not isinstance(bounds, Mapping):
+        raise ModelError(f"bounds = {bounds!r} is no mapping; write {{name: (low, high)}}")
+    for name, pair in bounds.items():
+        ends = [real_number(f"bound of {name}", v) for v in pair] if isinstance(pair, (tuple, list)) else []
+        if not (len(ends) == 2 and ends[0] < ends[1]) or (finite and not all(map(math.isfinite, ends))):
+            raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
 
 
 def check_bounds(structure: Structure, bounds: Bounds | None, start: object = None) -> tuple[Structure, Bounds]:
@@ -26,6 +36,7 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
     ModelError
         A name that is no free order or coefficient, no rising pair of numbers, or a start out of its bounds.
     """
+    check_intervals(bounds or {})
     out, given = {}, bounds or {}
     inputs = {item.name: item for item in structure.free_inputs}
     # A coefficient that follows from a law is no free parameter.
@@ -38,11 +49,7 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
                 f"{parameter('bounds')} has {name}, and the {item.words} has its bounds {item.bounds[0]:g} to "
                 f"{item.bounds[1]:g} where it is freed; change them there"
             )
-        if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
-            raise ModelError(f"bounds of {name}: {pair!r} is no pair (lower, upper); use ∓inf for an open side")
-        low, high = (real_number(f"bound of {name}", end) for end in pair)
-        if not low < high:
-            raise ModelError(f"bounds of {name}: {low:g} is not below {high:g}; give (lower, upper), or fix the number")
+        low, high = map(float, pair)
         value = start.get(name) if isinstance(start, Mapping) else None
         if value is not None and not low <= real_number(f"start value of {name}", value) <= high:
             raise ModelError(
@@ -65,13 +72,13 @@ def fit_within_bounds(
     estimates by name.
     """
 
-    def beyond(values: Mapping[str, float]) -> dict[str, float]:
+    def violations(values: Mapping[str, float]) -> dict[str, float]:
         ends = {n: (values[n], min(max(values[n], low), high)) for n, (low, high) in bounds.items() if n in values}
         return {n: end for n, (value, end) in ends.items() if value != end}
 
     found, values = fit(structure, None)
     fixed, outside = dict[str, float](), dict[str, float]()
-    while out := beyond(values):
+    while out := violations(values):
         fixed |= out
         outside |= {n: values[n] for n in out}
         found, values = fit(structure.with_coefficients(fixed), None)
@@ -79,7 +86,7 @@ def fit_within_bounds(
         others = {n: v for n, v in fixed.items() if n != name}
         with contextlib.suppress(ConvergenceError):
             inner, there = fit(structure.with_coefficients(others), {**values, name: fixed[name]})
-            if not beyond(there):
+            if not violations(there):
                 found, values, fixed = inner, there, others
     on = [make_finding("coefficient_on_bound", parameter=n, value=v, outside=outside[n]) for n, v in fixed.items()]
     return found, on

@@ -605,7 +605,7 @@ def identify_frequency(
     wanted, limits = check_bounds(_structure(structure, orders, fixed, delay), bounds, start)
     records = _match_records(as_frequency_data(data), wanted)
     kind, weight = _weights(records, weights)
-    check_known("start", start or {}, ResponseProblem(wanted, records, weight).names)
+    _user_start(ResponseProblem(wanted, records, weight), start)
 
     def fit(asked: Structure, only: Mapping[str, float] | None) -> tuple[FrequencyIdentification, Mapping[str, float]]:
         problem = ResponseProblem(asked, records, weight)
@@ -652,7 +652,7 @@ def _fit_response(
     # Starts race on no more frequencies than tell them apart; the best goes on with all.
     few, light = zip(*(_subsample_data(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
     racing = problem if count <= 2 * MAX_MULTISTART_FREQUENCIES else ResponseProblem(problem.structure, few, light)
-    begun = _user_start(racing, start, *racing.constraints()[:2])
+    begun = _user_start(racing, start)
     begun += [] if alone else initial_guesses(racing)
     course.advance_to(STARTS_END_FRACTION)
     fits = []
@@ -820,9 +820,7 @@ def _subsample_data(record: FrequencyData, weight: Floats) -> tuple[FrequencyDat
     ]
 
 
-def _user_start(
-    problem: ResponseProblem, start: Mapping[str, float] | None, rows: Floats, limits: Floats
-) -> list[Floats]:
+def _user_start(problem: ResponseProblem, start: Mapping[str, float] | None) -> list[Floats]:
     """Return the initial guess of the user, if any."""
     if start is None:
         return []
@@ -834,7 +832,7 @@ def _user_start(
         grid = problem.structure.order_values.get(name, (1.0,))
         usual[name] = min(max(1.0, grid[0]), grid[-1])
     values = np.array([float(start.get(n, usual.get(n, 0.0))) for n in problem.names])
-    begun = problem.in_problem_units(values)
+    begun, (rows, limits, _) = problem.in_problem_units(values), problem.constraints()
     if not (np.all(np.isfinite(values)) and np.all(rows @ begun <= limits + 1e-9)):
         raise ModelError(
             f"{parameter('start')} is out of the bounds of orders or delays, or not finite; choose values within them"

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol, cast, get_args
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.closed_loop import instrument_runs, mark_reference_fit
-from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, fit_within_bounds
+from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.confidence_intervals import Intervals
 from ftlm.estimation.estimators import estimate_order_search, estimate_output_error
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction
@@ -101,6 +101,7 @@ class OutputError:
         check_choice("loss", self.loss, get_args(Loss))
         check_choice("intervals", self.intervals, get_args(Intervals))
         check_choice("noise", self.noise, get_args(Noise))
+        check_intervals(self.bounds or {})
         if not (self.start is None or isinstance(self.start, (Identification, Model, Mapping))):
             raise ModelError(
                 f"start is {type(self.start).__name__}; give an identification, a model, or values by name"
