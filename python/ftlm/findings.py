@@ -906,7 +906,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "residuals at neighboring frequencies are correlated: the model is incomplete",
     ),
     "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit has not converged"),
-    "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "an order or a delay is on its bound: {bound}"),
+    "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "a parameter is on its bound: {bound}"),
     "response_not_told_apart": FindingKind(
         "unseen",
         LEVEL_DO_NOT_USE,

@@ -241,7 +241,7 @@ def test_weights_are_what_they_are_called():
 def test_an_order_ends_on_the_bound_of_its_lattice_and_says_so():
     found = ftlm.identify_frequency(arc(1), ARC, orders={"alpha": "0.3:0.7:0.1"})
     assert found.orders["alpha"] == pytest.approx(0.7, abs=1e-9)
-    assert any(w == "an order or a delay is on its bound: alpha is at most 0.7" for w in found.warnings)
+    assert any(w == "a parameter is on its bound: alpha is at most 0.7" for w in found.warnings)
 
 
 # ------------------------------------------------------------------------------------------------ the fit itself
@@ -569,7 +569,7 @@ def test_data_are_never_changed():
     ("options", "error", "words"),
     [
         ({"structure": 3}, ftlm.ModelError, r"structure is int; give an equation"),
-        ({"structure": "R0 - p(R1, CPE1)"}, ftlm.ModelError, r"is a circuit; give its equation, such as 'D\^alpha U"),
+        ({"structure": "R0 - X1"}, ftlm.ModelError, r"'X1' is no element; known: R \(resistor\), C"),
         ({"structure": "D^0.5 U = 2 I"}, ftlm.ModelError, r"no parameter is free"),
         ({"structure": "D^2 U = a U - fc*sign(D U) + b I"}, ftlm.ModelError, r"have friction, which a frequency resp"),
         ({"structure": "D U = a U + b sat(I, 3)"}, ftlm.ModelError, r"I saturates or has a dead zone, which a frequ"),

@@ -449,9 +449,11 @@ def identify_frequency(
     structure: Annotated[
         str,
         Option(
-            metavar="EQUATION",
+            "--structure",
+            "--circuit",
+            metavar="EQUATION|CIRCUIT",
             rich_help_panel=STRUCTURE_PANEL,
-            help="Equation in words, such as D^alpha y = a0 y + b0 u.",
+            help="Equation in words, or a circuit such as R0-p(R1,CPE1).",
         ),
     ],
     weights: Annotated[
