@@ -9,7 +9,7 @@ import numpy as np
 
 from ftlm.data.frequency_data import FrequencyData
 from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseProblem, ResponseRecord, halton
-from ftlm.structure.circuit import Circuit
+from ftlm.structure.circuit import Circuit, impedance_with_slopes
 from ftlm.utils.validation import Complex, Floats
 
 #: Points of time constants and ratios at which initial guesses are tried, and decades of ratios within a group.
@@ -63,7 +63,7 @@ class CircuitProblem(ResponseProblem):
         named = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
         out: list[tuple[Complex, Complex | None]] = []
         for record in self.records:
-            z, by_name = self.circuit.impedance_with_slopes(record.frequency, named)
+            z, by_name = impedance_with_slopes(self.circuit, record.frequency, named)
             z = z + np.zeros(record.frequency.size)
             columns = [by_name[n] + np.zeros_like(z) for n in self.names] if slopes else None
             out.append((z, None if columns is None else np.stack(columns, axis=1)))
@@ -115,7 +115,7 @@ class CircuitProblem(ResponseProblem):
                 }.get(letters, {f"{name}_R": size, f"{name}_tau": tau})
             shapes = []
             for part in parts:
-                z, slopes = self.circuit.impedance_with_slopes(every, unit, part)
+                z, slopes = impedance_with_slopes(self.circuit, every, unit, part)
                 shapes.append((z + np.zeros(every.size), list(slopes)))
             table = np.stack([z * weight for z, _ in shapes], axis=1)
             sizes = _positive_least_squares(

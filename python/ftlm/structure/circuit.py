@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ftlm.errors import ModelError
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.validation import Complex, Floats, check_known
+from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 
 #: Element with its parameters: (letters, name). Group: ("series" or "parallel", parts).
 Node: TypeAlias = tuple[str, Any]
@@ -212,37 +212,8 @@ class Circuit:
 
     @check_arguments
     def impedance(self, w: ArrayLike) -> Complex:
-        """Return the impedance [Ω] at angular frequencies [rad/s]."""
-        return self.impedance_with_slopes(np.asarray(w, dtype=np.float64), {})[0]
-
-    def impedance_with_slopes(
-        self, w: Floats, more: Mapping[str, float], node: Node | None = None
-    ) -> tuple[Complex, dict[str, Complex]]:
-        """Return the impedance of a part, and its derivatives by ln of every parameter, by an exponent itself.
-
-        Parameters
-        ----------
-        w
-            Angular frequencies [rad/s].
-        more
-            Values by name besides those of the circuit.
-        node
-            Part of the circuit's tree; None for all of it.
-        """
-        kind, rest = node or self.tree
-        if kind not in ("series", "parallel"):
-            names = [rest + suffix for suffix, _ in CIRCUIT_ELEMENTS[kind].parameters]
-            values = {**self.values, **more}
-            z, slopes = CIRCUIT_ELEMENTS[kind].impedance(
-                np.asarray(1j * w, dtype=np.complex128), [values[n] for n in names]
-            )
-            return z, dict(zip(names, slopes, strict=True))
-        parts = [self.impedance_with_slopes(w, more, part) for part in rest]
-        if kind == "series":
-            total = np.asarray(np.sum([z for z, _ in parts], axis=0), dtype=np.complex128)
-            return total, {n: slope for _, slopes in parts for n, slope in slopes.items()}
-        beside = np.asarray(1.0 / np.sum([1.0 / z for z, _ in parts], axis=0), dtype=np.complex128)
-        return beside, {n: (beside / z) ** 2 * slope for z, slopes in parts for n, slope in slopes.items()}
+        """Return the impedance [Ω] at angular frequencies [rad/s], finite, above 0."""
+        return impedance_with_slopes(self, as_floats("w", w), {})[0]
 
     def polynomials(self) -> tuple[Polynomial, Polynomial]:
         """Return numerator and denominator of the impedance as coefficients by power of s.
@@ -286,3 +257,35 @@ class Circuit:
 
     def __str__(self) -> str:
         return re.sub(r"\s", "", self.text)
+
+
+def impedance_with_slopes(
+    circuit: Circuit, w: Floats, more: Mapping[str, float], node: Node | None = None
+) -> tuple[Complex, dict[str, Complex]]:
+    """Return the impedance of a part, and its derivatives by ln of every parameter, by an exponent itcircuit.
+
+    Parameters
+    ----------
+    circuit
+        Circuit with values.
+    w
+        Angular frequencies [rad/s].
+    more
+        Values by name besides those of the circuit.
+    node
+        Part of the circuit's tree; None for all of it.
+    """
+    kind, rest = node or circuit.tree
+    if kind not in ("series", "parallel"):
+        names = [rest + suffix for suffix, _ in CIRCUIT_ELEMENTS[kind].parameters]
+        values = {**circuit.values, **more}
+        z, slopes = CIRCUIT_ELEMENTS[kind].impedance(
+            np.asarray(1j * w, dtype=np.complex128), [values[n] for n in names]
+        )
+        return z, dict(zip(names, slopes, strict=True))
+    parts = [impedance_with_slopes(circuit, w, more, part) for part in rest]
+    if kind == "series":
+        total = np.asarray(np.sum([z for z, _ in parts], axis=0), dtype=np.complex128)
+        return total, {n: slope for _, slopes in parts for n, slope in slopes.items()}
+    beside = np.asarray(1.0 / np.sum([1.0 / z for z, _ in parts], axis=0), dtype=np.complex128)
+    return beside, {n: (beside / z) ** 2 * slope for z, slopes in parts for n, slope in slopes.items()}
