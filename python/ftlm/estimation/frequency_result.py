@@ -15,7 +15,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
-from ftlm.analysis.model_algebra import transfer_function
+from ftlm.analysis.model_algebra import Ratio
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.model_checks import has_growing_mode, unstable_poles_text
@@ -24,6 +24,7 @@ from ftlm.findings import Finding, group_findings, make_finding, texts
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates, parameter_frame
 from ftlm.structure.circuit import Circuit
+from ftlm.structure.order import MAX_IMPROPER_ORDER
 from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
@@ -272,15 +273,14 @@ class FrequencyIdentification:
         Raises
         ------
         ModelError
-            A circuit that is no equation with powers of s, or whose impedance grows with the frequency.
+            A circuit that is no equation with powers of s.
         """
         if isinstance(self.source, Model):
             return self.source
         top, bottom = self.source.polynomials()
         output, input = self.data[0].output, self.data[0].input
-        made = transfer_function(
-            [(c, p) for p, c in top.items()], [(c, p) for p, c in bottom.items()], output=output, input=input
-        )
+        # An inductor in series is a derivative of the current.
+        made = Ratio(top, bottom, 0.0).model(output, input, improper_order=MAX_IMPROPER_ORDER)
         return replace(made, units={output: "V", input: "A"})
 
     @property
