@@ -154,6 +154,16 @@ def test_summary_report_validation_and_json(tmp_path):
     assert ftlm.plot.nyquist(found) is not None
 
 
+def test_equal_groups_are_numbered_from_the_fastest_on():
+    fast, slow = parallel(r(0.02), cpe(0.1, 0.85)), parallel(r(0.03), cpe(30.0, 0.9))
+    for seed in range(4):
+        found = ftlm.identify_frequency(spectrum(r(0.01) + slow + fast, seed=seed), "R0-p(R1,CPE1)-p(R2,CPE2)")
+        assert [found.values[n] for n in ("R1", "R2")] == pytest.approx([0.02, 0.03], rel=0.05)
+        assert [found.values[n] for n in ("CPE1_alpha", "CPE2_alpha")] == pytest.approx([0.85, 0.9], abs=0.02)
+    kept = ftlm.identify_frequency(spectrum(r(0.01) + slow + fast), "R0-p(R1,CPE1)-p(R2,CPE2)", fixed={"CPE1_Q": 30.0})
+    assert kept.values["R1"] == pytest.approx(0.03, rel=0.05)
+
+
 def test_an_exponent_ends_at_1_and_bounds_are_kept():
     z = CASES["R0-p(R1,C1)"][0](0.01, 0.05, 2.0)
     found = ftlm.identify_frequency(

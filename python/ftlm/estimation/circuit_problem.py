@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -84,6 +85,26 @@ class CircuitProblem(ResponseProblem):
     def default_start(self) -> dict[str, float]:
         """Return the best initial guess by name."""
         return dict(zip(self.names, self.in_seconds(self.initial_guesses()[0]).tolist(), strict=True))
+
+    def sort_groups(self, values: Floats) -> Floats:
+        """Return values with equal parallel groups in series from the fastest to the slowest."""
+        kind, rest = self.circuit.tree
+        if kind != "series" or self.circuit.values or self.bounds:
+            return values
+        out = values.copy()
+        named = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
+        every = np.concatenate([r.frequency for r in self.records])
+        w = np.geomspace(every.min() / 1e3, every.max() * 1e3, 2000)
+        alike: dict[str, list[tuple[float, list[int]]]] = {}
+        for part in (p for p in rest if p[0] == "parallel"):
+            z, slopes = impedance_with_slopes(self.circuit, w, named, part)
+            places = [self.names.index(n) for n in slopes]
+            shape = re.sub(r"_?\d+'", "'", repr(part))
+            alike.setdefault(shape, []).append((-float(w[np.argmin(z.imag)]), places))
+        for group in alike.values():
+            for (_, source), (_, target) in zip(sorted(group), group, strict=True):
+                out[target] = values[source]
+        return out
 
     def initial_guesses(self) -> list[Floats]:
         """Return feasible initial guesses, most promising first.

@@ -226,6 +226,8 @@ def _fit_response(
     best = _fit_again(problem, racing, first)
     if racing is problem and first.cost < best.cost:
         best = first
+    if start is None and np.any((placed := problem.sort_groups(best.values)) != best.values):
+        best = _fit(problem, placed)
     course.advance_to(1.0)
     held = [words[k] for k in best.active_constraints]
     at_limit = [n for n in problem.exponents if exponent_bound(n) in held]

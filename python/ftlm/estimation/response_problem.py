@@ -95,6 +95,10 @@ class ResponseProblem:
             usual[name] = min(max(1.0, grid[0]), grid[-1])
         return usual
 
+    def sort_groups(self, values: Floats) -> Floats:
+        """Return values in which exchangeable parts have a fixed order; equations have none."""
+        return values
+
     def initial_guesses(self) -> list[Floats]:
         """Return feasible initial guesses, most promising first."""
         return initial_guesses(self)
