@@ -161,3 +161,16 @@ def test_units_survive_pandas_xarray_parquet_and_csv(tmp_path):
     assert raw.units == {"u": "V", "y": ""}
     np.testing.assert_allclose(raw["y"], foreign["y"])
     np.testing.assert_allclose(raw["u"], foreign["u"])
+
+
+@pytest.mark.parametrize("units", [{}, {"units": "s"}])
+def test_groups_of_an_hdf5_file_have_a_time_each(tmp_path, units):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "two.h5", "w") as file:
+        for rows, step in ((40, 0.1), (50, 0.05)):
+            t = step * np.arange(rows)
+            file[f"run{rows}/time"], file[f"run{rows}/u"], file[f"run{rows}/y"] = t, np.sin(t), np.cos(t)
+            file[f"run{rows}/time"].attrs.update(units)
+    for rows, step in ((40, 0.1), (50, 0.05)):
+        run = ftlm.load(tmp_path / "two.h5", inputs={"u": f"run{rows}/u"}, outputs={"y": f"run{rows}/y"})
+        assert (run.step, run.length) == (step, rows)
