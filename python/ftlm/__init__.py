@@ -79,6 +79,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.reproduction.reproduction import reproduce as reproduce
     from ftlm.simulation.simulate import explicit_euler as explicit_euler
     from ftlm.simulation.simulate import simulate as simulate
+    from ftlm.structure.circuit import Circuit as Circuit
     from ftlm.structure.equation import Equation as Equation
     from ftlm.structure.equation import Friction as Friction
     from ftlm.structure.equation import Stribeck as Stribeck
@@ -144,6 +145,7 @@ _MODULE_BY_NAME = {
         "order_search.search": "resume_search search_status",
         "reproduction.reproduction": "Reproduction reproduce",
         "simulation.simulate": "explicit_euler simulate",
+        "structure.circuit": "Circuit",
         "structure.equation": "Equation Friction Stribeck Term",
         "structure.order": "Order",
         "structure.order_grid": "OrderGrid order_grid",

@@ -337,6 +337,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "the {words} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
     "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
+    "coefficient_on_bound": FindingKind(
+        "edge",
+        LEVEL_WITH_CARE,
+        "{parameter} = {value:.4g} is on its bound, beyond which the data are fitted better ({outside:.4g} without it)|"
+        "; it has no interval, and those of the others are for this value",
+        "{parameter} = {value:.4g} is on its bound, beyond which the data are fitted better",
+    ),
     "genetic_on_bound": FindingKind(
         "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
     ),
@@ -897,7 +904,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "residuals at neighboring frequencies are correlated: the model is incomplete",
     ),
     "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit has not converged"),
-    "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "an order or a delay is on its bound: {bound}"),
+    "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "a parameter is on its bound: {bound}"),
     "response_not_told_apart": FindingKind(
         "unseen",
         LEVEL_DO_NOT_USE,

@@ -120,7 +120,9 @@ def excel(folder):
         sheet.append([1000 * t, u, y])
     book.create_sheet("Tabelle2")
     book.save(folder / "made.xlsx")
-    return Stranger("messung.xlsx", (folder / "made.xlsx").read_bytes(), ("-u", "u=Strom", "-y", "y=Winkel"))
+    return Stranger(
+        "messung.xlsx", (folder / "made.xlsx").read_bytes(), ("-u", "u=Strom", "-y", "y=Winkel", "--units", "y=rad")
+    )
 
 
 ODS = (

@@ -471,8 +471,12 @@ def test_a_file_is_told_as_ftlm_open_tells_it(used, content, tmp_path):
     shown = view.file(file)
     assert "300 rows, step 0.05 s, 14.95 s in all" in shown
     assert "by their names" in shown
-    assert [o["structure"] for o in file.preview["offers"]][:2] == ["D y = a0 y + b0 u", "D^alpha y = a0 y + b0 u"]
-    assert [len(ftlm.equation(o["structure"]).outputs) for o in file.preview["offers"]] == [1] * 5
+    assert [o["structure"] for o in file.preview["offers"]][:3] == [
+        "D y = a0 y + b0 u",
+        "D y = a0 y + b0 u(t - 0:1.5 s)",
+        "D^alpha y = a0 y + b0 u",
+    ]
+    assert [len(ftlm.equation(o["structure"]).outputs) for o in file.preview["offers"]] == [1] * 9
 
 
 def scripted(page, key, content, folder):
@@ -495,6 +499,26 @@ def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
     assert printed.splitlines()[0].startswith(used.desk.models[key].description["verdict"]["level"].upper())
     model = ftlm.load_model(tmp_path / "lag-model.json")
     assert model.coefficients["a0"] == pytest.approx(-2, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "structure",
+    [
+        "D y = a0 y + k y^3 + b0 u",
+        "D y = a0 y + b0 u(t - 0:1.5 s)",
+        "D^2 y = a1 D y - fc sign(D y) + b0 u",
+        "D^3 y = a2 D^2 y + a1 D y + a0 y + b0 u",
+    ],
+)
+def test_an_equation_with_a_power_a_delay_or_friction_is_fitted_on_the_page(page, content, loop, structure):
+    assert page.upload("lag.csv", content)[0] == 200
+    (key,) = page.desk.files
+    wanted = {"estimation": key, "share": 0.3, "way": "fit", "structure": [structure]}
+    assert page.own("POST", "models", wanted)[0] == 200
+    loop(settled(page.desk))
+    (model,) = page.desk.models.values()
+    assert model.state == "made", model.error
+    assert page.own("GET", f"models/{model.key}/report")[0] == 200
 
 
 def test_a_choice_is_that_of_the_same_lines_and_knows_runs_in_motion(page, content, tmp_path):

@@ -193,7 +193,11 @@ def test_from_a_dropped_file_to_downloads(browser, served, content, tmp_path):
         model = made(page, 1)
         assert model.locator(".first strong").inner_text().lower() in ("trust", "with care", "do not use")
         assert model.locator("svg.chart").first.is_visible()
-        for name, ending in (("Report", "report.html"), ("Script", "script.py"), ("Model", "model.json")):
+        for name, ending in (
+            ("Download report", "report.html"),
+            ("Download script", "script.py"),
+            ("Download model", "model.json"),
+        ):
             with page.expect_download() as waiting:
                 model.get_by_role("link", name=name, exact=True).click()
             assert waiting.value.suggested_filename == f"dropped-1-{ending}"

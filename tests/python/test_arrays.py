@@ -69,6 +69,7 @@ CALLS = {
         (lambda x: ftlm.FrequencyData(W, x), DATA.response),
         (lambda x: ftlm.FrequencyData(W, DATA.response, x), W),
     ],
+    "ftlm.Circuit.impedance": [(ftlm.Circuit("R0-C1", {"R0": 1.0, "C1": 0.1}).impedance, W)],
     "ftlm.Model.frequency_response": [(MODEL.frequency_response, W)],
     "ftlm.Model.step_response": [(MODEL.step_response, T)],
     "ftlm.Model.step": [(MODEL.step, T)],

@@ -131,3 +131,46 @@ def test_what_is_missing_is_named(run, monkeypatch, library, way):
 def test_dates_of_python_count_like_those_of_numpy():
     day = [datetime.date(2024, 2, 28), datetime.date(2024, 2, 29), datetime.date(2024, 3, 1)]
     assert ftlm.Run.from_arrays(time=day, outputs={"y": [1.0, 2.0, 4.0]}, inputs=None).step == 86400.0
+
+
+def test_units_survive_pandas_xarray_parquet_and_csv(tmp_path):
+    pandas, xarray = pytest.importorskip("pandas"), pytest.importorskip("xarray")
+    t = np.arange(50) * 0.1
+    run = ftlm.Run.from_arrays(
+        step=0.1, inputs={"u": np.sin(t)}, outputs={"y": np.cos(t)}, units={"u": "mV", "y": "deg"}
+    )
+    frame, signals = run.to_frame(), {"inputs": ["u"], "outputs": ["y"]}
+    frame.to_parquet(tmp_path / "pandas.parquet")
+    run.to_parquet(tmp_path / "run.parquet")
+    run.to_csv(tmp_path / "run.csv")
+    foreign = pandas.DataFrame({"t": t, "u": run["u"] * 1e3, "y": np.degrees(run["y"])})
+    foreign.rename(columns={"t": "t [s]", "u": "u [mV]", "y": "y [deg]"}).to_csv(tmp_path / "named.csv", index=False)
+    rows = foreign.to_csv(index=False).split("\n", 1)
+    (tmp_path / "below.csv").write_text(f"{rows[0]}\ns,mV,deg\n{rows[1]}")
+    attributes = xarray.Dataset({n: ("t", foreign[n], {"units": u}) for n, u in (("u", "mV"), ("y", "deg"))}, {"t": t})
+    for again in (
+        ftlm.Run.from_frame(frame, **signals),
+        ftlm.Run.from_frame(run.to_xarray(), **signals),
+        ftlm.Run.from_frame(attributes, **signals),
+        *(ftlm.load(path, **signals) for path in sorted(tmp_path.iterdir())),
+    ):
+        assert again.units == {"u": "V", "y": "rad"}
+        np.testing.assert_allclose(again["y"], run["y"], rtol=1e-12)
+    # A unit that is given takes precedence, and an empty one takes the numbers as they are.
+    raw = ftlm.load(tmp_path / "named.csv", **signals, units={"y": "", "u": "V"})
+    assert raw.units == {"u": "V", "y": ""}
+    np.testing.assert_allclose(raw["y"], foreign["y"])
+    np.testing.assert_allclose(raw["u"], foreign["u"])
+
+
+@pytest.mark.parametrize("units", [{}, {"units": "s"}])
+def test_groups_of_an_hdf5_file_have_a_time_each(tmp_path, units):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "two.h5", "w") as file:
+        for rows, step in ((40, 0.1), (50, 0.05)):
+            t = step * np.arange(rows)
+            file[f"run{rows}/time"], file[f"run{rows}/u"], file[f"run{rows}/y"] = t, np.sin(t), np.cos(t)
+            file[f"run{rows}/time"].attrs.update(units)
+    for rows, step in ((40, 0.1), (50, 0.05)):
+        run = ftlm.load(tmp_path / "two.h5", inputs={"u": f"run{rows}/u"}, outputs={"y": f"run{rows}/y"})
+        assert (run.step, run.length) == (step, rows)

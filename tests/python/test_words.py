@@ -396,6 +396,7 @@ COMMAND_LINE_FLAGS = {
         "not-negated",
         "no-browser",
         "kind",
+        "circuit",
     ),
 }
 

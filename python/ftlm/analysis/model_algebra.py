@@ -32,15 +32,15 @@ Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class _Ratio:
+class Ratio:
     """Numerator and denominator in powers of s, and a delay [s]."""
 
     top: Polynomial
     bottom: Polynomial
     delay: float
 
-    def model(self, output: str, signal: str) -> Model:
-        """Return the equation of this transfer function."""
+    def model(self, output: str, signal: str, *, improper_order: float = 0.0) -> Model:
+        """Return the equation of this transfer function, whose numerator may be higher by `improper_order`."""
         bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
         if not bottom or not top:
             raise ModelError(f"the {'denominator' if top else 'numerator'} is 0; there is no such model")
@@ -48,7 +48,7 @@ class _Ratio:
         shift = -min(0.0, *bottom, *top)
         highest = max(bottom)
         order, gain = highest + shift, bottom[highest]
-        if max(top) > highest:
+        if max(top) > highest + improper_order:
             raise ModelError(
                 f"the numerator is of order {max(top) + shift:g} and the denominator of order {order:g}, so a step "
                 "would drive the output to infinity; add a pole far out, or identify it from frequency responses with "
@@ -101,7 +101,7 @@ def transfer_function(
     >>> print(ftlm.transfer_function([1], [(2, 1.5), (1, 0)], 0.1).equations[0])
     D^1.5 y = -0.5 y + 0.5 u
     """
-    return _Ratio(_polynomial("num", num), _polynomial("den", den), delay).model(output, input)
+    return Ratio(_polynomial("num", num), _polynomial("den", den), delay).model(output, input)
 
 
 def _polynomial(name: str, given: Sequence[float] | Sequence[Pair]) -> Polynomial:
@@ -120,7 +120,7 @@ def _polynomial(name: str, given: Sequence[float] | Sequence[Pair]) -> Polynomia
     return out
 
 
-def _ratio(model: Model, what: str) -> tuple[_Ratio, str, str]:
+def _ratio(model: Model, what: str) -> tuple[Ratio, str, str]:
     """Return the transfer function of a linear model of one output and one input, and their names."""
     check_no_input_nonlinearity(model, what)
     if model.structure.has_friction or model.structure.sensor_filter is not None:
@@ -136,14 +136,14 @@ def _ratio(model: Model, what: str) -> tuple[_Ratio, str, str]:
     (output,), (signal,) = transfer.outputs, transfer.inputs
     top = {p: c for c, p in transfer.numerators[output, signal]}
     bottom = {p: c for c, p in transfer.denominator[output]}
-    return _Ratio(top, bottom, transfer.delay[signal]), output, signal
+    return Ratio(top, bottom, transfer.delay[signal]), output, signal
 
 
 def series(first: Model, second: Model) -> Model:
     """Return the series connection: the output of `first` is the input of `second`. Delays add up."""
     (a, _, signal), (b, output, _) = _ratio(first, "a series"), _ratio(second, "a series")
     top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
-    return _Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
+    return Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
 
 
 def parallel(first: Model, second: Model) -> Model:
@@ -156,7 +156,7 @@ def parallel(first: Model, second: Model) -> Model:
         )
     top = multiply_polynomials(a.top, b.bottom)
     add_polynomial(top, multiply_polynomials(b.top, a.bottom))
-    return _Ratio(top, multiply_polynomials(a.bottom, b.bottom), a.delay).model(output, signal)
+    return Ratio(top, multiply_polynomials(a.bottom, b.bottom), a.delay).model(output, signal)
 
 
 def feedback(forward: Model, back: Model | float, sign: int) -> Model:
@@ -167,7 +167,7 @@ def feedback(forward: Model, back: Model | float, sign: int) -> Model:
     if isinstance(back, Model):
         b, _, _ = _ratio(back, "feedback")
     else:
-        b = _Ratio({0.0: float(back)}, {0.0: 1.0}, 0.0)
+        b = Ratio({0.0: float(back)}, {0.0: 1.0}, 0.0)
     if a.delay or b.delay:
         raise ModelError(
             f"the loop has a delay of {a.delay + b.delay:g} s, and a closed loop with a delay is no equation; use "
@@ -175,7 +175,7 @@ def feedback(forward: Model, back: Model | float, sign: int) -> Model:
         )
     bottom = multiply_polynomials(a.bottom, b.bottom)
     add_polynomial(bottom, multiply_polynomials(a.top, b.top), -float(sign))
-    return _Ratio(multiply_polynomials(a.top, b.bottom), bottom, 0.0).model(output, signal)
+    return Ratio(multiply_polynomials(a.top, b.bottom), bottom, 0.0).model(output, signal)
 
 
 def inverse(model: Model) -> Model:
@@ -183,7 +183,7 @@ def inverse(model: Model) -> Model:
     own, output, signal = _ratio(model, "an inverse")
     if own.delay:
         raise ModelError(f"the inverse would know the input {own.delay:g} s before it acts; leave the delay out")
-    return _Ratio(own.bottom, own.top, 0.0).model(signal, output)
+    return Ratio(own.bottom, own.top, 0.0).model(signal, output)
 
 
 def _distinct_name(output: str, signal: str) -> str:

@@ -188,19 +188,28 @@ function offer(run) {
   if (place.dataset.offers === written) return;
   place.dataset.offers = written;
   place.replaceChildren();
+  const groups = {};
   for (const each of run.offers) {
+    if (run.outputs.length > 1 && !groups[each.output]) {
+      const group = groups[each.output] = document.createElement("div"), head = document.createElement("h3");
+      group.setAttribute("role", "group");
+      group.setAttribute("aria-label", `Structures of ${each.output}`);
+      head.textContent = each.output;
+      group.append(head);
+      place.append(group);
+    }
     const button = document.createElement("button"), name = document.createElement("strong");
     const why = document.createElement("span"), code = document.createElement("code");
     button.type = "button";
-    name.textContent = run.outputs.length > 1 ? `${each.name}, ${each.output}` : each.name;
+    name.textContent = each.name;
     why.textContent = each.why;
     code.textContent = each.structure;
     button.append(name, why, code);
     button.addEventListener("click", () => { $("structure").value = each.structure; mark(); check(); });
-    place.append(button);
+    (groups[each.output] || place).append(button);
   }
   if (run.offers.length && !run.offers.some((each) => each.structure === $("structure").value)) {
-    $("structure").value = run.offers[Math.min(1, run.offers.length - 1)].structure;
+    $("structure").value = run.offers[Math.min(2, run.offers.length - 1)].structure;
   }
   mark();
 }
@@ -214,7 +223,7 @@ function mark() {
 const WORDS = {
   fit: "The numbers of this equation are estimated.",
   inside: "Terms and free orders of this equation are added one by one, as long as what was not fitted to is predicted better. It takes several times as long.",
-  offered: "Each structure below is fitted to three quarters of the run and judged on the fourth, in turn.",
+  offered: "Each structure below without dry friction is fitted to three quarters of the run and judged on the fourth, in turn.",
   auto: "Whole orders 1 to 4, every input, then free orders: what predicts best what it was not fitted to. It takes minutes.",
 };
 
@@ -230,7 +239,7 @@ function ways() {
 function wanted() {
   const run = facts().find((each) => each.key === $("estimation").value), on = $("validation").value;
   const share = /^[0-9.]+$/.test(on) && on.length < 5, way = ask.elements.way.value;
-  const first = run ? run.offers.filter((each) => each.output === run.outputs[0]).map((each) => each.structure) : [];
+  const first = run ? run.offers.filter((each) => each.output === run.outputs[0] && !each.structure.includes("sign(")).map((each) => each.structure) : [];
   return {
     estimation: $("estimation").value, validation: share ? "" : on, share: share ? Number(on) : 0, way,
     structure: way === "auto" ? [] : way === "offered" ? first : [$("structure").value],

@@ -429,27 +429,36 @@ def _text(said: Mapping[str, Any], name: str) -> str:
 
 #: Outputs and inputs for which structures are suggested; longer lists are not readable.
 MAX_SUGGESTED_SIGNALS = 6
+#: Largest delay that is searched where one is suggested, as a share of the run.
+MAX_DELAY_SHARE = 0.1
 
 
-def suggest_structures(inputs: Sequence[str], outputs: Sequence[str]) -> list[dict[str, str]]:
-    """Structures suggested for each output: name, purpose, equation, output."""
+def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: float) -> list[dict[str, str]]:
+    """Structures suggested for each output of a run of some duration [s]: name, purpose, equation, output."""
     made: list[dict[str, str]] = []
     driven = list(inputs)[:MAX_SUGGESTED_SIGNALS]
     for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:
         drives = "".join(f" + b{k} {name}" for k, name in enumerate(driven))
-        for name, why, left, own in (
-            ("Lag", "first order: heating, filling, a motor's speed", "D", "a0 {y}"),
-            ("Lag of free order", "diffusion, batteries, creep: its order is estimated", "D^alpha", "a0 {y}"),
-            ("Oscillator", "second order: a mass on a spring", "D^2", "a1 D {y} + a0 {y}"),
+        ends = f"0:{MAX_DELAY_SHARE * duration:.2g} s"
+        late = "".join(f" + b{k} {name}(t - {ends})" for k, name in enumerate(driven))
+        for name, why, left, own, right in (
+            ("Lag", "first order: heating, filling, a motor's speed", "D", "a0 {y}", drives),
+            ("Lag with dead time", "a lag that answers late: its delay is estimated", "D", "a0 {y}", late),
+            ("Lag of free order", "diffusion, batteries, creep: its order is estimated", "D^alpha", "a0 {y}", drives),
+            ("Oscillator", "second order: a mass on a spring", "D^2", "a1 D {y} + a0 {y}", drives),
             (
                 "Oscillator, damping of free order",
                 "viscoelastic damping: its order is estimated",
                 "D^2",
                 "a1 D^mu {y} + a0 {y}",
+                drives,
             ),
-            ("Oscillator of free orders", "both orders are estimated", "D^alpha", "a1 D^mu {y} + a0 {y}"),
+            ("Oscillator of free orders", "both orders are estimated", "D^alpha", "a1 D^mu {y} + a0 {y}", drives),
+            ("Third order", "an oscillator behind a lag", "D^3", "a2 D^2 {y} + a1 D {y} + a0 {y}", drives),
+            ("Integrator", "an angle or a level driven by a torque or a flow", "D^2", "a1 D {y}", drives),
+            ("Integrator, dry friction", "a motor's angle that sticks", "D^2", "a1 D {y} - fc sign(D {y})", drives),
         ):
-            text = f"{left} {output} = {own.format(y=output)}{drives}"
+            text = f"{left} {output} = {own.format(y=output)}{right}"
             made.append({"name": name, "why": why, "structure": text, "output": output})
     for stage in (1, 2):
         if {f"I{stage}", f"theta{stage}1", f"theta{stage}2"} <= {*inputs, *outputs}:

@@ -99,7 +99,7 @@ def describe_file(task: Mapping[str, Any]) -> dict[str, Any]:
         "step": found.step,
         "problem": found.problem,
         "notes": list(found.notes),
-        "offers": [] if found.problem else suggest_structures(*_signals(found)),
+        "offers": [] if found.problem else suggest_structures(*_signals(found), (found.step or 1.0) * found.rows),
         **_run_preview(found),
     }
 

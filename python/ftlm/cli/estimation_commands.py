@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import typer
 from typer import Argument, Option
@@ -24,6 +24,7 @@ from ftlm.cli.options import (
     OrderGridOptions,
     Out,
     OutputErrorOptions,
+    ParameterBounds,
     RankingOptions,
     Report,
     StoreFile,
@@ -175,6 +176,7 @@ def identify(
     given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
     given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
     given |= {} if fit.start is None else {"start": load_model(fit.start)}
+    given |= {} if fit.bounds is None else {"bounds": ranges("--bounds", fit.bounds)}
     chosen = method_with_options(method, given)
     runs = reading.runs(files, equation)
     # The window is of the runs that are identified from.
@@ -447,9 +449,11 @@ def identify_frequency(
     structure: Annotated[
         str,
         Option(
-            metavar="EQUATION",
+            "--structure",
+            "--circuit",
+            metavar="EQUATION|CIRCUIT",
             rich_help_panel=STRUCTURE_PANEL,
-            help="Equation in words, such as D^alpha y = a0 y + b0 u.",
+            help="Equation in words, or a circuit such as R0-p(R1,CPE1).",
         ),
     ],
     weights: Annotated[
@@ -469,6 +473,7 @@ def identify_frequency(
             metavar="NAME=VALUE", rich_help_panel=METHOD_PANEL, help="Additional initial guess of a free parameter."
         ),
     ] = None,
+    bounds: ParameterBounds = None,
     out: Out = None,
     report: Report = None,
     validation: Annotated[
@@ -491,6 +496,7 @@ def identify_frequency(
             fixed=numbers("--fixed", fixed),
             delay=ranges("--delay", delay),
             start=numbers("--start", start) or None,
+            bounds=cast("Any", ranges("--bounds", bounds)),
             progress=progress,
         )
     checked = None if validation is None else result.validate(reading.load(validation))

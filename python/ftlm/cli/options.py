@@ -67,6 +67,10 @@ NoiseDeviations = Annotated[
 ]
 Orders = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix an order.")]
 Fixed = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix a coefficient.")]
+ParameterBounds = Annotated[
+    Texts,
+    Option(metavar="NAME=LOW:HIGH", rich_help_panel=METHOD_PANEL, help="Bounds of a parameter; inf for an open side."),
+]
 Delay = Annotated[
     Texts,
     Option(metavar="INPUT=SECONDS", rich_help_panel=STRUCTURE_PANEL, help="Delay of an input; LOW:HIGH is estimated."),
@@ -337,7 +341,7 @@ class OutputErrorOptions:
     """Options of the output-error method; None for an option that is not given."""
 
     panel: ClassVar[str] = METHOD_PANEL
-    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference", "noise")
+    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference", "noise", "bounds")
 
     loss: LossOption = None
     intervals: Annotated[
@@ -349,6 +353,7 @@ class OutputErrorOptions:
         Text, Option(metavar="SIGNAL", help="Reference signal of a closed loop; also name it with -u.")
     ] = None
     noise: Annotated[Noise | None, Option(help="Noise of the output; ar: an autoregression; default white.")] = None
+    bounds: ParameterBounds = None
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import io
@@ -19,7 +20,7 @@ import numpy as np
 from ftlm.data.construction import RunArguments
 from ftlm.data.run import Run
 from ftlm.data.sampling import as_seconds, missing_mask, uniform_times
-from ftlm.data.units import is_time_name, time_unit_of
+from ftlm.data.units import is_time_name, parse_unit, time_unit_of
 from ftlm.errors import DataError, ModelError
 from ftlm.utils.files import RUN_MESSAGES, check_new, write_atomically
 from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, join_names, names_to_columns, nearest
@@ -32,6 +33,7 @@ def arguments_from_frame(
     step: float | None,
     inputs: object,
     outputs: object,
+    units: Mapping[str, str] | None,
     time_unit: str | None,
     window: Sequence[float | None] | None,
     **more: Any,
@@ -59,6 +61,7 @@ def arguments_from_frame(
         time, clock = index
         label = "time (the index)" if time is None else f"time (the index {time!r})"
     wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
+    units = _stated_units(frame, wanted[0] | wanted[1]) | dict(units or {})
     labels = {s: f"signal {s!r} (column {column!r})" for part in wanted for s, column in part.items()}
     given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in wanted)
     if isinstance(time, str):
@@ -70,6 +73,7 @@ def arguments_from_frame(
         given_outputs,
         step=step,
         time=clock,
+        units=units,
         time_unit=unit,
         window=window,
         labels=labels,
@@ -77,6 +81,20 @@ def arguments_from_frame(
         time_label=label,
         **more,
     )
+
+
+def _stated_units(frame: object, columns: Mapping[str, Hashable]) -> dict[str, str]:
+    """Return the units that attributes of a frame or of its columns state, by signal; unknown ones are left out."""
+    whole = getattr(frame, "attrs", {}).get("units")
+    known = dict(whole) if isinstance(whole, Mapping) else {}
+    for column in columns.values():
+        with contextlib.suppress(KeyError, TypeError, ValueError, IndexError):
+            own = getattr(cast("Mapping[Any, object]", frame)[column], "attrs", {})
+            stated = own.get("units", own.get("unit"))
+            # A column of a pandas frame has the attributes of the frame.
+            known[column] = stated if isinstance(stated, str) else known.get(column)
+    units = {name: parse_unit(str(known.get(column) or "")) for name, column in columns.items()}
+    return {name: unit for name, unit in units.items() if unit}
 
 
 def _columns_of(frame: object) -> list[Hashable]:

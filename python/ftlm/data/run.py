@@ -226,7 +226,10 @@ class Run:
             Time between rows [s], > 0.
         inputs, outputs : mapping of str to column, or list of str
             Columns by signal name; a list names columns that keep their names.
-        units, intersample, name, resample, window, missing
+        units
+            As in `Run.from_arrays`, in place of those in ``frame.attrs["units"]`` by column, or in the ``attrs`` of a
+            column (``units`` or ``unit``).
+        intersample, name, resample, window, missing
             As in `Run.from_arrays`.
         time_unit : {"s", "ms", "us", "min", "h"}, optional
             Unit of the time column; default the unit in its name, as in ``time [ms]`` (with a warning), else s. A

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +15,16 @@ import numpy as np
 from markupsafe import Markup
 
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
+from ftlm.analysis.model_algebra import Ratio
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
-from ftlm.errors import DataError, FtlmError
+from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.model_checks import has_growing_mode, unstable_poles_text
 from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_from, verdict_html
 from ftlm.findings import Finding, group_findings, make_finding, texts
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates, parameter_frame
+from ftlm.structure.circuit import Circuit
+from ftlm.structure.order import MAX_IMPROPER_ORDER
 from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
@@ -50,8 +54,12 @@ def curve_frequencies(record: FrequencyData) -> tuple[Floats, Floats]:
     return np.unique(np.concatenate([measured, between, smooth])), measured
 
 
-def model_curve(model: Model, record: FrequencyData, omega: Floats) -> tuple[Complex, Floats | None, Floats | None]:
+def model_curve(
+    model: Model | Circuit, record: FrequencyData, omega: Floats
+) -> tuple[Complex, Floats | None, Floats | None]:
     """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
+    if isinstance(model, Circuit):
+        return model.impedance(omega), None, None
     at = model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
     response = frequency_response(model, omega)[at]
     if model.estimate is None or model.estimate.covariance is None:
@@ -60,7 +68,7 @@ def model_curve(model: Model, record: FrequencyData, omega: Floats) -> tuple[Com
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
-def bode_figures(model: Model, record: FrequencyData) -> list[Figure]:
+def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return gain and phase charts of a record and the model with its 95 % band."""
     omega, _ = curve_frequencies(record)
     response, wide, turned = model_curve(model, record, omega)
@@ -99,7 +107,7 @@ def bode_figures(model: Model, record: FrequencyData) -> list[Figure]:
     return figures
 
 
-def nyquist_figure(model: Model, record: FrequencyData) -> Figure:
+def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
     """Return the Nyquist chart of a record and the model; impedances with -Im upwards."""
     omega, _ = curve_frequencies(record)
     response, _, _ = model_curve(model, record, omega)
@@ -117,13 +125,13 @@ def nyquist_figure(model: Model, record: FrequencyData) -> Figure:
     )
 
 
-def response_figures(model: Model, record: FrequencyData) -> list[Figure]:
+def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
     bode, nyquist = bode_figures(model, record), nyquist_figure(model, record)
     return [nyquist, *bode] if record.unit.endswith("Ω") else [*bode, nyquist]
 
 
-def relative_residual_figure(model: Model, record: FrequencyData) -> Figure:
+def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
     """Return the chart of the residuals relative to the measured response, by frequency."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
@@ -204,8 +212,8 @@ class FrequencyIdentification:
 
     Parameters
     ----------
-    model
-        Identified model.
+    source
+        Identified model or circuit.
     data
         Records that it was fitted to.
     weights
@@ -226,7 +234,7 @@ class FrequencyIdentification:
         Findings about the model.
     """
 
-    model: Model
+    source: Model | Circuit
     data: tuple[FrequencyData, ...]
     weights: str
     values: Mapping[str, float]
@@ -246,19 +254,49 @@ class FrequencyIdentification:
         return texts(self.findings)
 
     @property
+    def circuit(self) -> Circuit:
+        """Circuit with its identified values.
+
+        Raises
+        ------
+        ModelError
+            Equations were identified.
+        """
+        if isinstance(self.source, Model):
+            raise ModelError("equations were identified, no circuit; use .model")
+        return self.source
+
+    @cached_property
+    def model(self) -> Model:
+        """Model that was identified; of a circuit its exact equation.
+
+        Raises
+        ------
+        ModelError
+            A circuit that is no equation with powers of s.
+        """
+        if isinstance(self.source, Model):
+            return self.source
+        top, bottom = self.source.polynomials()
+        output, input = self.data[0].output, self.data[0].input
+        # An inductor in series is a derivative of the current.
+        made = Ratio(top, bottom, 0.0).model(output, input, improper_order=MAX_IMPROPER_ORDER)
+        return replace(made, units={output: "V", input: "A"})
+
+    @property
     def orders(self) -> dict[str, float]:
         """Free orders with their estimates."""
-        return {n: v for n, v in self.values.items() if n in self.model.orders}
+        return {n: v for n, v in self.values.items() if isinstance(self.source, Model) and n in self.source.orders}
 
     @property
     def coefficients(self) -> dict[str, float]:
         """Free coefficients with their estimates."""
-        return {n: v for n, v in self.values.items() if n in self.model.coefficients}
+        return {n: v for n, v in self.values.items() if n not in self.orders and not n.startswith("delay_")}
 
     @property
     def errors(self) -> tuple[ResponseError, ...]:
         """Error of the model on each record."""
-        return tuple(error_of(self.model, record) for record in self.data)
+        return tuple(error_of(self.source, record) for record in self.data)
 
     @check_arguments
     def validate(self, data: FrequencyData | Sequence[FrequencyData]) -> FrequencyValidation:
@@ -274,15 +312,17 @@ class FrequencyIdentification:
         DataError
             A record has other signals.
         """
-        others = tuple(assign_signals(self.model, record) for record in as_frequency_data(data))
-        errors = tuple(error_of(self.model, record) for record in others)
+        others = tuple(assign_signals(self.source, record) for record in as_frequency_data(data))
+        errors = tuple(error_of(self.source, record) for record in others)
         return FrequencyValidation(others, errors, self._assess(errors, others))
 
     @property
     def parameters(self) -> dict[str, Parameter]:
         """Orders, coefficients and delays by name, with standard errors, intervals and units."""
+        given = self.source.values if isinstance(self.source, Circuit) else self.source.coefficients
+        values = {**self.values, **given}
         return parameter_estimates(
-            self.model, self.values, errors=self.standard_errors, intervals=self.intervals, free=self.names
+            self.source, values, errors=self.standard_errors, intervals=self.intervals, free=self.names
         )
 
     @property
@@ -295,7 +335,9 @@ class FrequencyIdentification:
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""
-        return parameter_frame(self.parameters.values(), self.model.structure.reference)
+        return parameter_frame(
+            self.parameters.values(), self.source.structure.reference if isinstance(self.source, Model) else {}
+        )
 
     @property
     def verdict(self) -> Verdict:
@@ -333,6 +375,9 @@ class FrequencyIdentification:
 
     def _unstable_poles(self) -> list[Finding]:
         """Return a finding on poles with a positive real part, if there are any."""
+        if isinstance(self.source, Circuit):
+            # Elements above 0 dissipate.
+            return []
         with contextlib.suppress(FtlmError):
             stable = self.model.stability(coupling="simulated")
             if stable.unstable_poles > 0 and has_growing_mode(self.model, "simulated"):
@@ -345,9 +390,11 @@ class FrequencyIdentification:
         from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 
         judged = self.verdict if validation is None else validation.verdict
-        lines = [*wrap_text(str(judged)), "", *equation_lines(self.model), ""]
+        lines = [*wrap_text(str(judged)), ""]
+        lines += [str(self.source)] if isinstance(self.source, Circuit) else equation_lines(self.source)
+        lines.append("")
         lines += self._numbers()
-        lines += [*behavior_lines(self.model), ""]
+        lines += [*([] if isinstance(self.source, Circuit) else behavior_lines(self.source)), ""]
         lines += _errors_in_words(self.errors)
         if validation is not None:
             lines += ["validation", *_errors_in_words(validation.errors)[1:]]
@@ -371,7 +418,8 @@ class FrequencyIdentification:
         for p in self.parameters.values():
             low, high = p.interval
             ends = f"[{format_bound(low, '.5g')}, {format_bound(high, '.5g')}]"
-            rows.append((p.name, f"{p.value:.6g}", f"± {format_bound(p.standard_error)}", ends, p.unit))
+            error = "fixed" if p.fixed else f"± {format_bound(p.standard_error)}"
+            rows.append((p.name, f"{p.value:.6g}", error, "" if p.fixed else ends, p.unit))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         lines = [
             f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip()
@@ -381,7 +429,7 @@ class FrequencyIdentification:
 
     def figures(self) -> list[Figure]:
         """Return Bode and Nyquist charts with the measured points, and residual charts."""
-        model = self.model
+        model = self.source
         return [f for r in self.data for f in (*response_figures(model, r), relative_residual_figure(model, r))]
 
     @check_arguments
@@ -405,30 +453,29 @@ class FrequencyIdentification:
             The file exists and ``force`` is not set, or cannot be written.
         """
         from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
-        from ftlm.report.typesetting import equation_html, parameter_table
 
         shown, more = first_findings(self.findings)
-        equations = [equation_html(e, self.model.structure.delay) for e in self.model.equations]
+        source = self.source
         new = () if validation is None else validation.data
         charts = Section(
             f"{'Validation' if new else 'Estimation'}: measured and modeled response",
-            figures=[f for record in new or self.data for f in response_figures(self.model, record)],
+            figures=[f for record in new or self.data for f in response_figures(self.source, record)],
             small=True,
         )
         about = Section(
             "Model",
-            [Markup("<p>{}</p>").format(e) for e in equations],
+            [self._equations_html()],
             warnings=shown,
             more=more,
-            tables=[parameter_table(self.model), *behavior_tables(self.model)],
-            figures=behavior_figures(self.model),
+            tables=[self._parameter_table(), *([] if isinstance(source, Circuit) else behavior_tables(source))],
+            figures=[] if isinstance(source, Circuit) else behavior_figures(source),
             small=True,
         )
         rows: list[list[Cell]] = [_error_row("estimation", e) for e in self.errors]
         rows += [] if validation is None else [_error_row("validation", e) for e in validation.errors]
         heads = ("data", "record", "response", "error, % rms", "largest, %", "at [rad/s]")
         notes = [w for r in self.data for w in r.warnings]
-        figures = [relative_residual_figure(self.model, record) for record in self.data]
+        figures = [relative_residual_figure(self.source, record) for record in self.data]
         residuals = Section(
             "Residuals" if not new else "Residuals, and the fit to the estimation data",
             [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
@@ -438,7 +485,7 @@ class FrequencyIdentification:
         )
         return write_page(
             path,
-            title=title_of(self.model),
+            title=f"Impedance of {source}" if isinstance(source, Circuit) else title_of(source),
             sections=[charts, about, residuals],
             force=force,
             verdict=verdict_box(self.verdict if validation is None else validation.verdict),
@@ -451,7 +498,11 @@ class FrequencyIdentification:
             return [v if math.isfinite(v) else None for v in pair]
 
         return {
-            "equations": [str(e) for e in self.model.equations],
+            **(
+                {"circuit": str(self.source)}
+                if isinstance(self.source, Circuit)
+                else {"equations": [str(e) for e in self.source.equations]}
+            ),
             "weights": self.weights,
             "values": dict(self.values),
             "standard_errors": {n: e if math.isfinite(e) else None for n, e in self.standard_errors.items()},
@@ -469,17 +520,36 @@ class FrequencyIdentification:
         return self.summary()
 
     def _repr_html_(self) -> str:
-        from ftlm.report.typesetting import equation_html, parameter_table
-
-        equations = Markup("").join(
-            Markup("<p>{}</p>").format(equation_html(e, self.model.structure.delay)) for e in self.model.equations
-        )
         drawn = Markup("").join(Markup(f._repr_html_()) for f in self.figures())
-        return str(verdict_html(self.verdict) + equations + parameter_table(self.model).to_html() + drawn)
+        return str(verdict_html(self.verdict) + self._equations_html() + self._parameter_table().to_html() + drawn)
+
+    def _equations_html(self) -> Markup:
+        """Return the equations or the circuit as HTML."""
+        from ftlm.report.typesetting import equation_html
+
+        if isinstance(self.source, Circuit):
+            return Markup("<p>{}</p>").format(str(self.source).replace("-", " − "))
+        delay = self.source.structure.delay
+        lines = (Markup("<p>{}</p>").format(equation_html(e, delay)) for e in self.source.equations)
+        return Markup("").join(lines)
+
+    def _parameter_table(self) -> Table:
+        """Return the table of the parameters with their intervals."""
+        from ftlm.report.typesetting import parameter_table, unit_html
+
+        if isinstance(self.source, Model):
+            return parameter_table(self.source)
+        rows: list[list[Cell]] = []
+        for p in self.parameters.values():
+            known = [v if math.isfinite(v) else None for v in (p.standard_error, *p.interval)]
+            rows.append([p.name, p.value, *known, unit_html(p.unit)])
+        return Table("Parameters", ("name", "value", "standard error", "95 % from", "to", "unit"), rows)
 
 
-def assign_signals(model: Model, record: FrequencyData) -> FrequencyData:
+def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyData:
     """Return a record with the output and input names of the model it is compared with."""
+    if isinstance(model, Circuit):
+        return replace(record, output=record.output or "U", input=record.input or "I", unit=record.unit or "Ω")
     inputs = response_inputs(model, coupled=True)
     out = {"output": record.output, "input": record.input}
     for side, known in (("output", model.outputs), ("input", inputs)):
@@ -493,15 +563,17 @@ def assign_signals(model: Model, record: FrequencyData) -> FrequencyData:
     return replace(record, output=out["output"], input=out["input"])
 
 
-def model_response(model: Model, record: FrequencyData, omega: Floats | None = None) -> Complex:
+def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats | None = None) -> Complex:
     """Return the model response at the frequencies of a record, or at `omega`."""
+    if isinstance(model, Circuit):
+        return model.impedance(record.frequency if omega is None else omega)
     response = frequency_response(model, record.frequency if omega is None else omega)
     inputs = response_inputs(model, coupled=True)
     values: Complex = response[model.outputs.index(record.output), inputs.index(record.input)]
     return values
 
 
-def error_of(model: Model, record: FrequencyData) -> ResponseError:
+def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
     """Return the error of a model on one record."""
     size = np.abs(record.response)
     missed = np.abs(model_response(model, record) - record.response) / np.where(size > 0, size, np.max(size) or 1.0)

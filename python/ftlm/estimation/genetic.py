@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
+from ftlm.estimation.coefficient_bounds import check_intervals
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction, make_model
 from ftlm.estimation.model_checks import coefficient_law_findings
 from ftlm.estimation.result import Task
@@ -519,11 +520,7 @@ class GeneticAlgorithm:
             raise ModelError(
                 f"{setting('seeds')} {short_repr(self.seeds)}: give 1 to {MAX_SEEDS} whole numbers from 0 to 4294967295"
             )
-        if not isinstance(self.bounds, Mapping):
-            raise ModelError(f"bounds = {self.bounds!r} is no mapping; write {{name: (low, high)}}")
-        for name, pair in self.bounds.items():
-            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and -math.inf < pair[0] < pair[1] < math.inf):
-                raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
+        check_intervals(self.bounds, finite=True)
 
     def fit(
         self,

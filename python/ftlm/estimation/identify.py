@@ -18,10 +18,11 @@ from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.alternative_assumptions import intersample_findings, undetermined_start_findings
 from ftlm.estimation.closed_loop import run_with_inputs
+from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.methods import EstimationMethod, resolve_method
+from ftlm.estimation.methods import EstimationMethod, method_with_options, resolve_method
 from ftlm.estimation.model_checks import (
     dead_channel_findings,
     discretization_findings,
@@ -213,6 +214,7 @@ def identify(
     *,
     method: str | EstimationMethod = "output-error",
     offset: Offset | None = None,
+    bounds: Bounds | None = None,
     m: int | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -242,6 +244,8 @@ def identify(
         changes has a level by default. ``"auto"``: a constant if it is significant at 99 %, with the statistic in
         ``.settings["offset_test"]``; it fits once with the constant and, if it is not significant, once without.
         Default that of the structure. A finding reports a missing constant that would explain much.
+    bounds
+        (lower, upper) of parameters by name, in place of those of the method, such as ``{"a": (0, 10)}``.
     m
         Block pulses per run; default 2 048, or what the runs carry (a power of two for Haar rows). Without `m`,
         instrumental variables search on these and estimate on all samples (at most 16 384 pulses).
@@ -267,6 +271,8 @@ def identify(
     """
     several = as_runs(runs)
     chosen = resolve_method(method)
+    if bounds is not None:
+        chosen = method_with_options(chosen.name, {**vars(chosen), "bounds": bounds})
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
     check_threads(threads)
@@ -368,7 +374,7 @@ def assess_fit(fit: Fit) -> Identification:
 def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
     """Return what computes the sensitivities of a joint fit of a linear structure, or None."""
     joint, structure = fit.joint, fit.task.structure
-    if joint is None or structure.has_friction:
+    if joint is None or not joint.names or structure.has_friction:
         return None
     asked = replace(structure, initial=joint.initial)
     return lambda: output_sensitivities(fit.task.runs, asked, joint.values_by_name, max(joint.refinement, 1))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Protocol, cast, get_args
 
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.closed_loop import instrument_runs, mark_reference_fit
+from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.confidence_intervals import Intervals
 from ftlm.estimation.estimators import estimate_order_search, estimate_output_error
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction
@@ -77,6 +78,9 @@ class OutputError:
         prediction-error method. It is consistent in a closed loop if A(q) can describe the noise and the loop has a
         delay (Ljung, chapter 13). It takes one output, a linear model and uniform samples, and gives intervals of
         ± 1.96 standard errors.
+    bounds
+        (lower, upper) of coefficients and orders by name; infinite for an open side. A coefficient that ends on a bound
+        is fixed there and has no interval, and a finding names it.
 
     Raises
     ------
@@ -91,11 +95,13 @@ class OutputError:
     start: Identification | Model | Mapping[str, float] | None = None
     reference: str | None = None
     noise: Noise = "white"
+    bounds: Bounds | None = None
 
     def __post_init__(self) -> None:
         check_choice("loss", self.loss, get_args(Loss))
         check_choice("intervals", self.intervals, get_args(Intervals))
         check_choice("noise", self.noise, get_args(Noise))
+        check_intervals(self.bounds or {})
         if not (self.start is None or isinstance(self.start, (Identification, Model, Mapping))):
             raise ModelError(
                 f"start is {type(self.start).__name__}; give an identification, a model, or values by name"
@@ -137,16 +143,31 @@ class OutputError:
         begin = self.start.model if isinstance(self.start, Identification) else self.start
         values = self.start.parameters.items() if isinstance(self.start, Identification) else ()
         more = {n: p.value for n, p in values if not p.fixed}
-        task = Task(tuple(runs), structure)
+        structure, bounds = check_bounds(structure, self.bounds, begin)
         if self.noise == "ar":
             check_noise_model(runs, structure)
-            return fit_noise_model(
-                estimate_output_error(task, m, workers, progress, None, self.loss, "quadratic", begin, more),
-                lambda white, joint: estimate_output_error(
-                    white, m, workers, None, None, self.loss, "quadratic", joint.values_by_name, alone=True
-                ),
-            )
-        fit = estimate_output_error(task, m, workers, progress, answers, self.loss, self.intervals, begin, more)
+
+        def estimate(asked: Structure, only: Mapping[str, float] | None) -> tuple[Fit, Mapping[str, float]]:
+            fixed = set(structure.coefficient_names) - set(asked.coefficient_names)
+            given = {n: v for n, v in begin.items() if n not in fixed} or None if isinstance(begin, Mapping) else begin
+            task, first, alone = Task(tuple(runs), asked), given if only is None else only, only is not None
+            if self.noise == "ar":
+                fit = fit_noise_model(
+                    estimate_output_error(
+                        task, m, workers, progress, None, self.loss, "quadratic", first, more, alone=alone
+                    ),
+                    lambda white, joint: estimate_output_error(
+                        white, m, workers, None, None, self.loss, "quadratic", joint.values_by_name, alone=True
+                    ),
+                )
+            else:
+                fit = estimate_output_error(
+                    task, m, workers, progress, answers, self.loss, self.intervals, first, more, alone=alone
+                )
+            return fit, {} if fit.joint is None else fit.joint.values_by_name
+
+        fit, found = fit_within_bounds(structure, bounds, estimate)
+        fit = replace(fit, findings=[*fit.findings, *found])
         return fit if self.reference is None else mark_reference_fit(fit, self.reference, weak)
 
 

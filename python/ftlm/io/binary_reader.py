@@ -205,6 +205,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
     told = (table.schema.metadata or {}).get(b"ftlm-run")
     if told is not None:
         header["ftlm-run"] = told.decode("utf-8", errors="replace")
+    units = _arrow_units(table.schema)
     arrays = []
     made = hashlib.sha256(told or b"")
     for name, column in zip(table.column_names, table.columns, strict=True):
@@ -221,7 +222,9 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
             continue
         values = compute.cast(column, "float64").combine_chunks().to_numpy(zero_copy_only=False)
         single = "single" if types.is_float32(kind) else "double"
-        header["arrays"].append({"name": name, "rows": len(values), "columns": 1, "type": single})
+        header["arrays"].append(
+            {"name": name, "rows": len(values), "columns": 1, "type": single, **units.get(name, {})}
+        )
         arrays.append(numpy.asarray(values, dtype=numpy.float64))
         made.update(f"\0{name}\0{len(values)}\0".encode())
         made.update(numpy.ascontiguousarray(arrays[-1], dtype="<f8").tobytes())
@@ -233,6 +236,21 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
             f"the file is damaged: {table.num_rows} rows were read where it says {said}, or their checksum is another"
         )
     return header, arrays
+
+
+def _arrow_units(schema: Any) -> dict[str, dict[str, str]]:
+    """Return the units of columns, as fields or the attributes of a pandas frame state them."""
+    try:
+        whole = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
+        told = {str(name): str(unit) for name, unit in whole.items()}
+    except (ValueError, AttributeError, RecursionError):
+        told = {}
+    for item in schema:
+        own = item.metadata or {}
+        unit = own.get(b"units", own.get(b"unit"))
+        if unit is not None:
+            told[item.name] = unit.decode("utf-8", errors="replace")
+    return {name: {"unit": unit[:40]} for name, unit in told.items()}
 
 
 class Arrays:

@@ -87,11 +87,11 @@ def load(
     inputs, outputs : mapping of str to column, or list of str, optional
         Columns by signal name; a list names columns that keep their names; at least one output. The unit in a name
         such as ``I (A)`` may be omitted. If neither is given here, by `columns` or by an ftlm header, both are guessed
-        from words in the column names as by :func:`ftlm.open_file`, with the units of the file; the guess is listed in
+        from words in the column names as by :func:`ftlm.open_file`; the guess is listed in
         the `warnings` of the run, and ambiguous names raise an error.
     units : mapping of str to str, optional
-        Units of signals, converted to SI. Units that the file states are not applied to columns that are named here;
-        :func:`ftlm.open_file` shows them.
+        Units of signals, converted to SI, in place of those that the file states in names such as ``y [deg]``, a line
+        of units or attributes; "" takes numbers as they are. Signals without a unit are taken as they are, too.
     columns : mapping or path of a TOML file, optional
         Keys ``time`` or ``step``, tables ``inputs``, ``outputs``, ``units``, ``intersample``, ``layout``; the arguments
         of the same name override or extend it.
@@ -190,6 +190,8 @@ def run_from_tables(
             f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}, or in a file for "
             f"{parameter('columns')}; {pool.describe()}"
         )
+    if header is None:
+        add_file_units(wanted, pool)
     labels: dict[str, str] = {}
     used: list[Column] = []
 
@@ -275,16 +277,14 @@ def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: Loa
 
 
 def _assume_roles(wanted: ColumnSelection, pool: Pool, signals: Signals | None) -> tuple[Assumption, ...]:
-    """Choose inputs and outputs by column names if none are named, with the units of the file."""
+    """Choose inputs and outputs by column names if none are named."""
     if wanted.inputs or wanted.outputs:
         return ()
     matrices = list(dict.fromkeys(c.matrix for c in pool.columns if c.matrix is not None))
     clock = None
     if wanted.step is None:
         clock, _ = pool.time(wanted.time, matrices if len(matrices) == 1 else [], set())
-    assumed = assume_roles(wanted, [c for c in pool.columns if c is not clock], signals)
-    add_file_units(wanted, pool)
-    return assumed
+    return assume_roles(wanted, [c for c in pool.columns if c is not clock], signals)
 
 
 def base_name(path: Path) -> str:

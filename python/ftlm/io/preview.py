@@ -38,7 +38,7 @@ from ftlm.utils.validation import CSV_TIME, join_names
 
 _MAX_LISTED_COLUMNS = 40
 #: Equation of a resistor in series with a resistor beside a constant-phase element.
-_ARC_WORDS = "D^alpha U = a U + r D^alpha I + b I"
+_ARC_CIRCUIT = "R0-p(R1,CPE1)"
 #: Names of time columns that imply seconds.
 _SECONDS_COLUMN_NAMES = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
 #: Part of a column's error message about its first bad cell.
@@ -305,14 +305,14 @@ class _FilePreview:
         except DataError as error:
             if is_response(self.pool):
                 path = shlex.quote(os.fspath(self.table.path))
-                command = f"ftlm identify-frequency {path} {parameter('structure', _ARC_WORDS)}"
-                how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_WORDS!r})", command)
+                command = f"ftlm identify-frequency {path} {parameter('circuit', _ARC_CIRCUIT)}"
+                how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_CIRCUIT!r})", command)
                 return (
                     None,
                     (),
                     f"the columns are those of a frequency response or an impedance spectrum, and none is a "
                     f"time; {how} "
-                    "fits a first model, of an impedance a resistor before a depressed arc",
+                    "fits a first model, of an impedance the circuit of a resistor before a depressed arc",
                 )
             return None, (), str(error)
         if assumed is not None:

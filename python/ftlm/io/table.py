@@ -210,7 +210,10 @@ class Pool:
         """Candidate time columns of a file by the most reliable criterion, and the reason if it is an assumption."""
         others = [c for c in self._columns.values() if c.source == table.path and c.name not in signals]
         own = [c for c in others if c.matrix is None]
-        sure = [c for c in own if is_time_name(c.variable)]
+        groups = {name.rpartition("/")[0] for name in signals}
+        # A group of an HDF5 file is a run of its own.
+        own = [c for c in own if {c.name.rpartition("/")[0]} == groups] or own
+        sure = [c for c in own if is_time_name(c.variable.rpartition("/")[2])]
         if sure:
             return sure, ""
         named = [c for c in own if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]

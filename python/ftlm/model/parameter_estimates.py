@@ -9,6 +9,7 @@ from typing import Any
 
 from ftlm.data.units import coefficient_unit, nonlinear_coefficient_unit
 from ftlm.model.model import Model
+from ftlm.structure.circuit import Circuit
 from ftlm.utils.files import to_frame
 
 
@@ -54,7 +55,7 @@ class Parameter:
 
 
 def parameter_estimates(
-    model: Model,
+    model: Model | Circuit,
     values: Mapping[str, float],
     *,
     errors: Mapping[str, float],
@@ -66,13 +67,13 @@ def parameter_estimates(
     Parameters
     ----------
     model
-        Model, for the units.
+        Model or circuit, for the units.
     values, errors, intervals
         Values, and standard errors and 95 % intervals of those that have them.
     free
         Names of the estimated parameters; the others are fixed.
     """
-    units = parameter_units(model)
+    units = model.units if isinstance(model, Circuit) else parameter_units(model)
     none = (math.nan, math.nan)
     return {
         n: Parameter(n, v, errors.get(n, math.nan), intervals.get(n, none), units.get(n, ""), n not in free)

@@ -29,6 +29,7 @@ from ftlm.model.model import Model
 from ftlm.order_search.search import landscape as scores_of
 from ftlm.plot.comparison_charts import pulse_times, with_unit
 from ftlm.plot.model_charts import TimeResponse, bode_curves, pole_points, response_frequencies
+from ftlm.structure.circuit import Circuit
 from ftlm.svg.heat_map import Landscape
 from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.arguments import check_arguments
@@ -800,12 +801,12 @@ def nyquist(
 
 def _model_and_data(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None
-) -> tuple[Model, list[FrequencyData]]:
+) -> tuple[Model | Circuit, list[FrequencyData]]:
     """Return the model and the frequency data of the arguments."""
     if not isinstance(result, (FrequencyIdentification, Model)):
         raise ModelError(f"result is {type(result).__name__}; give what identify_frequency returns, or a model")
     if isinstance(result, FrequencyIdentification):
-        model, records = result.model, list(result.data)
+        model, records = result.source, list(result.data)
     else:
         model, records = result, []
     if isinstance(data, FrequencyValidation):

@@ -1,0 +1,173 @@
+"""Residuals of measured impedances of a circuit in logarithms of its parameters, and initial guesses."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ftlm.data.frequency_data import FrequencyData
+from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseProblem, ResponseRecord, halton
+from ftlm.structure.circuit import Circuit, impedance_with_slopes
+from ftlm.utils.validation import Complex, Floats
+
+#: Points of time constants and ratios at which initial guesses are tried, and decades of ratios within a group.
+START_POINTS, RATIO_DECADES = 400, 2.0
+#: Range of an exponent, of which the lower end keeps elements apart from resistors; range of exponents of the guesses.
+MIN_EXPONENT, START_EXPONENTS = 0.05, (0.6, 1.0)
+#: Smallest and largest parameter in SI units.
+PARAMETER_RANGE = (1e-18, 1e18)
+
+
+class CircuitProblem(ResponseProblem):
+    """Circuit and measured impedances.
+
+    Parameters are logarithms, which keeps resistances above 0, but exponents themselves.
+    """
+
+    def __init__(
+        self,
+        circuit: Circuit,
+        records: Sequence[FrequencyData],
+        weights: Sequence[Floats],
+        bounds: Mapping[str, tuple[float, float]],
+    ) -> None:
+        self.circuit, self.bounds, self.names = circuit, bounds, circuit.free_names
+        self.exponents = ()
+        self.orders = tuple(n for n in self.names if n.endswith("_alpha"))
+        self.is_log = np.array([n not in self.orders for n in self.names], dtype=bool)
+        self.records = [
+            ResponseRecord(0, r.input, r.frequency, r.response, w) for r, w in zip(records, weights, strict=True)
+        ]
+
+    def with_records(self, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> CircuitProblem:
+        """Return the problem of other records."""
+        return CircuitProblem(self.circuit, records, weights, self.bounds)
+
+    def in_seconds(self, values: Floats) -> Floats:
+        """Return parameters from their logarithms."""
+        return np.where(self.is_log, np.exp(np.where(self.is_log, values, 0.0)), values)
+
+    def in_problem_units(self, values: Floats) -> Floats:
+        """Return logarithms of parameters; NaN for those that are not above 0."""
+        safe = np.where(values > 0, values, np.nan)
+        return np.where(self.is_log, np.log(np.where(self.is_log, safe, 1.0)), values)
+
+    def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
+        """Convert a Jacobian by logarithms to one by the parameters."""
+        return slopes / np.where(self.is_log, self.in_seconds(values), 1.0)
+
+    def responses(self, values: Floats, *, slopes: bool = True) -> list[tuple[Complex, Complex | None]]:
+        """Return the impedance at every record, and its derivatives by all parameters (one column each)."""
+        named = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
+        out: list[tuple[Complex, Complex | None]] = []
+        for record in self.records:
+            z, by_name = impedance_with_slopes(self.circuit, record.frequency, named)
+            z = z + np.zeros(record.frequency.size)
+            columns = [by_name[n] + np.zeros_like(z) for n in self.names] if slopes else None
+            out.append((z, None if columns is None else np.stack(columns, axis=1)))
+        return out
+
+    def constraints(self) -> tuple[Floats, Floats, list[str]]:
+        """Return the constraints ``rows @ values <= limits`` of exponents and bounds, with descriptions."""
+        rows, limits, words = [], [], []
+        for k, name in enumerate(self.names):
+            low, high = self.bounds.get(name, (-math.inf, math.inf))
+            least, most = PARAMETER_RANGE if self.is_log[k] else (MIN_EXPONENT, MAX_EXPONENT)
+            for sign, end in ((1.0, min(high, most)), (-1.0, max(low, least))):
+                rows.append(sign * (np.arange(len(self.names)) == k))
+                limits.append(sign * (math.log(end) if self.is_log[k] else end))
+                words.append(f"{name} is at {'most' if sign > 0 else 'least'} {end:g}")
+        return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), words
+
+    def default_start(self) -> dict[str, float]:
+        """Return the best initial guess by name."""
+        return dict(zip(self.names, self.in_seconds(self.initial_guesses()[0]).tolist(), strict=True))
+
+    def sort_groups(self, values: Floats) -> Floats:
+        """Return values with equal parallel groups in series from the fastest to the slowest."""
+        kind, rest = self.circuit.tree
+        if kind != "series" or self.circuit.values or self.bounds:
+            return values
+        out = values.copy()
+        named = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
+        every = np.concatenate([r.frequency for r in self.records])
+        w = np.geomspace(every.min() / 1e3, every.max() * 1e3, 2000)
+        alike: dict[str, list[tuple[float, list[int]]]] = {}
+        for part in (p for p in rest if p[0] == "parallel"):
+            z, slopes = impedance_with_slopes(self.circuit, w, named, part)
+            places = [self.names.index(n) for n in slopes]
+            shape = re.sub(r"_?\d+'", "'", repr(part))
+            alike.setdefault(shape, []).append((-float(w[np.argmin(z.imag)]), places))
+        for group in alike.values():
+            for (_, source), (_, target) in zip(sorted(group), group, strict=True):
+                out[target] = values[source]
+        return out
+
+    def initial_guesses(self) -> list[Floats]:
+        """Return feasible initial guesses, most promising first.
+
+        At time constants over the measured band, the sizes of the parts in series are least squares.
+        """
+        every = np.concatenate([r.frequency for r in self.records])
+        slow, fast = -math.log10(float(every.min())), -math.log10(float(every.max()))
+        kind, rest = self.circuit.tree
+        parts = rest if kind == "series" else [self.circuit.tree]
+        weight = np.concatenate([r.weight for r in self.records])
+        goal = np.concatenate([r.response for r in self.records]) * weight
+        _, limits, _ = self.constraints()
+        found = []
+        for point in halton(START_POINTS, 2 * len(self.circuit.elements)):
+            unit: dict[str, float] = {}
+            for k, (letters, name) in enumerate(self.circuit.elements):
+                tau = 10.0 ** (fast + (slow - fast) * point[2 * k])
+                size, alpha = (
+                    10.0 ** (RATIO_DECADES * (point[2 * k + 1] - 0.5)),
+                    float(np.interp(point[2 * k + 1], (0, 1), START_EXPONENTS)),
+                )
+                unit |= {
+                    "R": {name: size},
+                    "C": {name: tau},
+                    "L": {name: tau},
+                    "CPE": {f"{name}_Q": tau**alpha, f"{name}_alpha": alpha},
+                    "W": {f"{name}_sigma": (2.0 * tau) ** -0.5},
+                }.get(letters, {f"{name}_R": size, f"{name}_tau": tau})
+            shapes = []
+            for part in parts:
+                z, slopes = impedance_with_slopes(self.circuit, every, unit, part)
+                shapes.append((z + np.zeros(every.size), list(slopes)))
+            table = np.stack([z * weight for z, _ in shapes], axis=1)
+            sizes = _positive_least_squares(
+                np.concatenate([table.real, table.imag]), np.concatenate([goal.real, goal.imag])
+            )
+            for (_, names), scale in zip(shapes, sizes, strict=True):
+                for n in names:
+                    # Q and C divide an impedance; exponents and times leave its size.
+                    unit[n] *= 1.0 if n.endswith(("_alpha", "_tau")) else 1.0 / scale if n[0] == "C" else scale
+            values = self.in_problem_units(np.array([unit[n] for n in self.names]))
+            # Each constraint is an end of one parameter: its largest value, then its smallest.
+            inside = np.clip(values, -limits[1::2], limits[0::2])
+            left, _ = self.residuals(inside, slopes=False)
+            cost = float(left @ left)
+            if math.isfinite(cost):
+                found.append((cost, inside))
+        found.sort(key=lambda pair: pair[0])
+        return [values for _, values in found[:MAX_STARTS]]
+
+
+def _positive_least_squares(table: Floats, goal: Floats) -> Floats:
+    """Return least-squares sizes above 0; those that would not be are small."""
+    lengths = np.linalg.norm(table, axis=0)
+    scaled = table / lengths
+    kept = np.ones(lengths.size, dtype=bool)
+    sizes = np.zeros(lengths.size)
+    while np.any(kept):
+        sizes[:] = 0.0
+        sizes[kept] = np.linalg.lstsq(scaled[:, kept], goal, rcond=None)[0]
+        if np.all(sizes[kept] > 0):
+            break
+        kept &= sizes > 0
+    least = 1e-3 * max(float(np.max(sizes)), 1e-30)
+    return np.asarray(np.maximum(sizes, least) / lengths)

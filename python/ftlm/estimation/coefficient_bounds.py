@@ -1,0 +1,92 @@
+"""Bounds of coefficients by an active set: a coefficient beyond its bound is fixed there, and the others refitted."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+from ftlm.errors import ConvergenceError, ModelError
+from ftlm.findings import Finding, make_finding
+from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import check_known, real_number
+
+Bounds = Mapping[str, tuple[float, float]]
+
+FitType = TypeVar("FitType")
+
+
+def check_intervals(bounds: object, *, finite: bool = False) -> None:
+    """Raise ModelError unless each bound is a pair of rising numbers by name; only finite ones if `finite`."""
+    if not isinstance(bounds, Mapping):
+        raise ModelError(f"bounds = {bounds!r} is no mapping; write {{name: (low, high)}}")
+    for name, pair in bounds.items():
+        ends = [real_number(f"bound of {name}", v) for v in pair] if isinstance(pair, (tuple, list)) else []
+        if not (len(ends) == 2 and ends[0] < ends[1]) or (finite and not all(map(math.isfinite, ends))):
+            raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
+
+
+def check_bounds(structure: Structure, bounds: Bounds | None, start: object = None) -> tuple[Structure, Bounds]:
+    """Return the structure with the bounds of its orders, and the bounds of its coefficients.
+
+    Raises
+    ------
+    ModelError
+        A name that is no free order or coefficient, no rising pair of numbers, or a start out of its bounds.
+    """
+    check_intervals(bounds or {})
+    out, given = {}, bounds or {}
+    inputs = {item.name: item for item in structure.free_inputs}
+    # A coefficient that follows from a law is no free parameter.
+    free = [n for n in structure.coefficient_names if n not in {law[0] for law in structure.coefficient_law}]
+    check_known("bound of", given, [*free, *structure.order_names, *inputs])
+    for name, pair in given.items():
+        if name in inputs:
+            item = inputs[name]
+            raise ModelError(
+                f"{parameter('bounds')} has {name}, and the {item.words} has its bounds {item.bounds[0]:g} to "
+                f"{item.bounds[1]:g} where it is freed; change them there"
+            )
+        low, high = map(float, pair)
+        value = start.get(name) if isinstance(start, Mapping) else None
+        if value is not None and not low <= real_number(f"start value of {name}", value) <= high:
+            raise ModelError(
+                f"{parameter('start')} has {name} = {value:g}, out of its bounds {low:g} to {high:g}; choose one within"
+            )
+        out[name] = (low, high)
+    orders = {n: list(out.pop(n)) for n in structure.order_names if n in out}
+    return structure.with_orders(orders), out
+
+
+def fit_within_bounds(
+    structure: Structure,
+    bounds: Bounds,
+    fit: Callable[[Structure, Mapping[str, float] | None], tuple[FitType, Mapping[str, float]]],
+) -> tuple[FitType, list[Finding]]:
+    """Return the fit of a structure with its coefficients within bounds, and findings on those on a bound.
+
+    An active set: coefficients beyond their bounds are fixed there. One of them is freed again if the cost falls
+    inwards. `fit` takes a structure and the only initial guess, or None for automatic ones, and returns a fit and its
+    estimates by name.
+    """
+
+    def violations(values: Mapping[str, float]) -> dict[str, float]:
+        ends = {n: (values[n], min(max(values[n], low), high)) for n, (low, high) in bounds.items() if n in values}
+        return {n: end for n, (value, end) in ends.items() if value != end}
+
+    found, values = fit(structure, None)
+    fixed, outside = dict[str, float](), dict[str, float]()
+    while out := violations(values):
+        fixed |= out
+        outside |= {n: values[n] for n in out}
+        found, values = fit(structure.with_coefficients(fixed), None)
+    for name in list(fixed):
+        others = {n: v for n, v in fixed.items() if n != name}
+        with contextlib.suppress(ConvergenceError):
+            inner, there = fit(structure.with_coefficients(others), {**values, name: fixed[name]})
+            if not violations(there):
+                found, values, fixed = inner, there, others
+    on = [make_finding("coefficient_on_bound", parameter=n, value=v, outside=outside[n]) for n, v in fixed.items()]
+    return found, on

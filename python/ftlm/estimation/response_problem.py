@@ -1,0 +1,524 @@
+"""Residuals of measured frequency responses with exact derivatives by orders, coefficients and delays, and starts."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftlm.data.frequency_data import FrequencyData
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.order import MAX_DEFAULT_SEARCH_ORDER, MAX_IMPROPER_ORDER, MAX_ORDER, MIN_INPUT_ORDER, Order
+from ftlm.structure.structure import Structure
+from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import Complex, Floats
+
+#: Smallest highest order of an equation, and smallest gap between it and the order of an own term.
+MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
+
+
+#: Largest exponent of a constant-phase element: that of a capacitor.
+MAX_EXPONENT = 1.0
+
+
+def exponent_bound(name: str) -> str:
+    """Description of the upper bound of an exponent in an impedance."""
+    return f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
+
+
+def _is_impedance(records: Sequence[FrequencyData]) -> bool:
+    return all(record.unit.endswith("Ω") for record in records)
+
+
+@dataclass(frozen=True)
+class ResponseRecord:
+    """One measured frequency response in scaled time, with its weights."""
+
+    output: int
+    input: str
+    frequency: Floats
+    response: Complex
+    weight: Floats
+
+
+class ResponseProblem:
+    """Structure and measured responses in scaled time, so that the parameters are near 1.
+
+    Time is counted in 1/`unit` of a second. Parameters have the order of `names`: free orders, free coefficients, free
+    delays.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        records: Sequence[FrequencyData],
+        weights: Sequence[Floats],
+        *,
+        bound_exponents: bool = True,
+    ) -> None:
+        self.structure = structure
+        self.orders = structure.order_names
+        self.coefficients = tuple(dict.fromkeys(structure.coefficient_names))
+        self.delays = tuple(item.signal for item in structure.free_inputs)
+        self.names = (*self.orders, *self.coefficients, *(item.name for item in structure.free_inputs))
+        #: Free orders of an impedance that the user gives no values. As exponents of constant-phase elements they are
+        #: at most 1; an order such as alpha + 0.5 may exceed it.
+        self.exponents = tuple(
+            n for n in self.orders if bound_exponents and n not in structure.order_values and _is_impedance(records)
+        )
+        every = np.concatenate([r.frequency for r in records])
+        self.unit = float(np.exp(np.mean(np.log(every))))
+        self.records = [
+            ResponseRecord(structure.outputs.index(r.output), r.input, r.frequency / self.unit, r.response, w)
+            for r, w in zip(records, weights, strict=True)
+        ]
+        self.known_delays = {name: value * self.unit for name, value in structure.delay.items()}
+        self._place = {name: k for k, name in enumerate(self.orders)}
+        at = len(self.orders)
+        self._coefficient = {name: at + k for k, name in enumerate(self.coefficients)}
+        self._delay = {name: at + len(self.coefficients) + k for k, name in enumerate(self.delays)}
+        #: Of each free coefficient, its term with its equation.
+        self.term_of = {t.coefficient: (e, t) for e in structure.equations for t in e.terms}
+
+    def with_records(self, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> ResponseProblem:
+        """Return the problem of other records."""
+        return ResponseProblem(self.structure, records, weights)
+
+    def default_start(self) -> dict[str, float]:
+        """Return values of orders and coefficients for an initial guess that does not name them."""
+        usual = dict.fromkeys(self.coefficients, 1.0)
+        for name in self.orders:
+            grid = self.structure.order_values.get(name, (1.0,))
+            usual[name] = min(max(1.0, grid[0]), grid[-1])
+        return usual
+
+    def sort_groups(self, values: Floats) -> Floats:
+        """Return values in which exchangeable parts have a fixed order; equations have none."""
+        return values
+
+    def initial_guesses(self) -> list[Floats]:
+        """Return feasible initial guesses, most promising first."""
+        return initial_guesses(self)
+
+    def order_at(self, order: Order, values: Floats) -> float:
+        """Return the value of an order."""
+        return order.constant + math.fsum(w * float(values[self._place[n]]) for n, w in order.weights)
+
+    def in_problem_units(self, values: Floats) -> Floats:
+        """Convert parameters from seconds to the time unit of this problem."""
+        return self._convert_time_unit(values, -1.0)
+
+    def in_seconds(self, values: Floats) -> Floats:
+        """Convert parameters from the time unit of this problem to seconds."""
+        return self._convert_time_unit(values, 1.0)
+
+    def _convert_time_unit(self, values: Floats, way: float) -> Floats:
+        out = values.astype(np.float64).copy()
+        for name, at in self._coefficient.items():
+            item, term = self.term_of[name]
+            power = self.order_at(item.order, values) - self.order_at(term.order, values)
+            out[at] *= self.unit ** (way * power)
+        for at in self._delay.values():
+            out[at] *= self.unit**-way
+        return out
+
+    def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
+        """Convert a Jacobian by scaled parameters to one by parameters in seconds."""
+        out = slopes.copy()
+        log = np.log(self.unit)
+        for name, at in self._coefficient.items():
+            item, term = self.term_of[name]
+            power = self.order_at(item.order, values) - self.order_at(term.order, values)
+            # c' = c unit^-(alpha - order): by c itself, and by each order at a fixed c.
+            for order, sign in ((item.order, -1.0), (term.order, 1.0)):
+                for n, w in order.weights:
+                    out[:, self._place[n]] += sign * w * log * float(values[at]) * slopes[:, at]
+            out[:, at] *= self.unit**-power
+        for at in self._delay.values():
+            out[:, at] *= self.unit
+        return out
+
+    def coefficient(self, term: Term, item: Equation, values: Floats) -> float:
+        """Return the coefficient of a term in scaled time."""
+        if isinstance(term.coefficient, str):
+            return term.factor * float(values[self._coefficient[term.coefficient]])
+        power = self.order_at(item.order, values) - self.order_at(term.order, values)
+        return float(term.fixed or 0.0) * math.pow(self.unit, -power)
+
+    def shift(self, signal: str, values: Floats) -> float:
+        """Return the delay of an input in scaled time."""
+        at = self._delay.get(signal)
+        return self.known_delays.get(signal, 0.0) if at is None else float(values[at])
+
+    def responses(self, values: Floats, *, slopes: bool = True) -> list[tuple[Complex, Complex | None]]:
+        """Return the model response at every record, and its derivatives by all parameters (one column each)."""
+        return [self._response(record, values, slopes) for record in self.records]
+
+    def _response(self, record: ResponseRecord, values: Floats, slopes: bool) -> tuple[Complex, Complex | None]:
+        s = 1j * record.frequency
+        log = np.log(s)
+        items, names = self.structure.equations, self.structure.outputs
+        matrix = np.zeros((s.size, len(items), len(items)), dtype=np.complex128)
+        right = np.zeros((s.size, len(items)), dtype=np.complex128)
+        powers: dict[tuple[int, int], Complex] = {}
+        for i, item in enumerate(items):
+            powers[i, -1] = np.exp(self.order_at(item.order, values) * log)
+            matrix[:, i, i] += powers[i, -1]
+            for k, term in enumerate(item.terms):
+                if term.signal not in names and term.signal != record.input:
+                    continue
+                powers[i, k] = np.exp(self.order_at(term.order, values) * log)
+                part = self.coefficient(term, item, values) * powers[i, k]
+                if term.signal in names:
+                    matrix[:, i, names.index(term.signal)] -= part
+                else:
+                    right[:, i] += part
+        late = np.exp(-s * self.shift(record.input, values))
+        try:
+            whole = np.linalg.solve(matrix, (right * late[:, None])[..., None])[..., 0]
+            unit = np.zeros((s.size, len(items), 1), dtype=np.complex128)
+            unit[:, record.output] = 1.0
+            ahead = np.linalg.solve(matrix.transpose(0, 2, 1), unit)[..., 0] if slopes else None
+        except np.linalg.LinAlgError:
+            nothing = np.full(s.size, np.nan, dtype=np.complex128)
+            return nothing, np.full((s.size, len(self.names)), np.nan, dtype=np.complex128) if slopes else None
+        response = np.asarray(whole[:, record.output], dtype=np.complex128)
+        if ahead is None:
+            return response, None
+        out = np.zeros((s.size, len(self.names)), dtype=np.complex128)
+        for i, item in enumerate(items):
+            for n, w in item.order.weights:
+                out[:, self._place[n]] -= w * log * ahead[:, i] * powers[i, -1] * whole[:, i]
+            for k, term in enumerate(item.terms):
+                if (i, k) not in powers:
+                    continue
+                signal = whole[:, names.index(term.signal)] if term.signal in names else late
+                size = self.coefficient(term, item, values)
+                moved = ahead[:, i] * powers[i, k] * signal
+                for n, w in term.order.weights:
+                    out[:, self._place[n]] += w * size * log * moved
+                if not isinstance(term.coefficient, str):
+                    # A known coefficient is one in seconds: in this unit it follows the orders.
+                    for its, sign in ((item.order, -1.0), (term.order, 1.0)):
+                        for n, w in its.weights:
+                            out[:, self._place[n]] += sign * w * np.log(self.unit) * size * moved
+                else:
+                    out[:, self._coefficient[term.coefficient]] += term.factor * moved
+        if record.input in self._delay:
+            out[:, self._delay[record.input]] = -s * response
+        return response, out
+
+    def residuals(self, values: Floats, *, slopes: bool = True) -> tuple[Floats, Floats]:
+        """Return the residuals times weights, real parts before imaginary parts, and their Jacobian."""
+        left, steep = [], []
+        with np.errstate(all="ignore"):
+            for record, (response, moved) in zip(self.records, self.responses(values, slopes=slopes), strict=True):
+                left.append((response - record.response) * record.weight)
+                if moved is not None:
+                    steep.append(moved * record.weight[:, None])
+        flat = np.concatenate(left)
+        jacobian = np.concatenate(steep) if steep else np.zeros((flat.size, 0), dtype=np.complex128)
+        return np.concatenate([flat.real, flat.imag]), np.concatenate([jacobian.real, jacobian.imag])
+
+    def constraints(self) -> tuple[Floats, Floats, list[str]]:
+        """Return the constraints ``rows @ values <= limits`` of orders and delays, with descriptions."""
+        rows: list[Floats] = []
+        limits: list[float] = []
+        words: list[str] = []
+
+        def keep(order: Order, most: float, text: str, sign: float = 1.0) -> None:
+            row = np.zeros(len(self.names))
+            for n, w in order.weights:
+                row[self._place[n]] += sign * w
+            if np.any(row):
+                rows.append(row)
+                limits.append(most - sign * order.constant)
+                words.append(text)
+
+        for item in self.structure.equations:
+            keep(item.order, MAX_ORDER, f"the highest order of {item.output} is at most 10")
+            keep(item.order, -MIN_HIGHEST_ORDER, f"the highest order of {item.output} is above 0", -1.0)
+            for term in item.terms:
+                own = term.signal == item.output
+                name = str(term.order)
+                low, above = (0.0, -MIN_ORDER_GAP) if own else (MIN_INPUT_ORDER, MAX_IMPROPER_ORDER - MIN_ORDER_GAP)
+                keep(term.order, -low, f"order {name} is from {low:g} on", -1.0)
+                both = dict(term.order.weights)
+                for n, w in item.order.weights:
+                    both[n] = both.get(n, 0.0) - w
+                over = tuple(sorted((n, w) for n, w in both.items() if w))
+                gap = Order(term.order.constant - item.order.constant, over)
+                keep(gap, above, f"order {name} stays below {item.order} of {item.output}{'' if own else ' + 1'}")
+        for name, values in self.structure.order_values.items():
+            if name in self._place:
+                keep(Order(0.0, ((name, 1.0),)), values[-1], f"{name} is at most {values[-1]:g}")
+                keep(Order(0.0, ((name, 1.0),)), -values[0], f"{name} is from {values[0]:g} on", -1.0)
+        for name in self.exponents:
+            keep(Order(0.0, ((name, 1.0),)), MAX_EXPONENT, exponent_bound(name))
+        for free in self.structure.free_inputs:
+            for sign, end in ((1.0, free.bounds[1]), (-1.0, free.bounds[0])):
+                row = np.zeros(len(self.names))
+                row[self._delay[free.signal]] = sign
+                rows.append(row)
+                limits.append(sign * end * self.unit)
+                words.append(f"{free.words} is {'at most' if sign > 0 else 'at least'} {end:g} s")
+        table = np.array(rows) if rows else np.zeros((0, len(self.names)))
+        return table, np.array(limits), words
+
+    def search_ranges(self) -> dict[str, tuple[float, ...] | tuple[float, float]]:
+        """Return the grid values of each free order, or the interval of its default search."""
+        out: dict[str, tuple[float, ...] | tuple[float, float]] = {}
+        for name in self.orders:
+            if name in self.structure.order_values:
+                out[name] = tuple(self.structure.order_values[name])
+                continue
+            own = [e.order for e in self.structure.equations if name in e.order.names]
+            highest = MAX_EXPONENT if name in self.exponents else self._highest()
+            out[name] = (0.1, highest) if own else (0.0, highest)
+        return out
+
+    def _highest(self) -> float:
+        """Return the highest order of the default search."""
+        orders = [o for e in self.structure.equations for o in (e.order, *(t.order for t in e.terms))]
+        return max([MAX_DEFAULT_SEARCH_ORDER, *(o.constant for o in orders if not o.names)])
+
+
+#: Largest number of grid points, of frequencies, of reweighting iterations, and of initial guesses returned.
+MAX_GRID_POINTS, MAX_START_FREQUENCIES, REWEIGHTING_ITERATIONS, MAX_STARTS = 3000, 160, 4, 8
+#: Points whose exact cost is computed, corner frequencies tried for one own term, and points at which they are tried.
+MAX_EVALUATED_POINTS, CORNERS_PER_POINT, MAX_CORNER_POINTS = 60, 14, 120
+
+
+def initial_guesses(problem: ResponseProblem) -> list[Floats]:
+    """Return feasible initial guesses, most promising first."""
+    points = _points(problem)
+    found = _linear_coefficients(problem, points) if problem.coefficients else list(points)
+    judged = []
+    for values in found:
+        left, _ = problem.residuals(values, slopes=False)
+        cost = float(left @ left)
+        if np.isfinite(cost):
+            judged.append((cost, values))
+    judged.sort(key=lambda pair: pair[0])
+    kept: list[Floats] = []
+    first, last = len(problem.orders), len(problem.orders) + len(problem.coefficients)
+    free = [k for k in range(len(problem.names)) if not first <= k < last]
+    for _, values in judged:
+        if all(np.max(np.abs(values[free] - other[free]), initial=0.0) > 0.1 for other in kept) or not kept:
+            kept.append(values)
+        if len(kept) == MAX_STARTS:
+            break
+    return kept
+
+
+def _points(problem: ResponseProblem) -> Floats:
+    """Return the grid points of orders and delays, one row each, with coefficients 0."""
+    axes = list(problem.search_ranges().values())
+    given = [n in problem.structure.order_values for n in problem.orders]
+    delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
+    # A delay that is off by a third of a period at the highest frequency still leads downhill.
+    fastest = max(float(r.frequency.max()) for r in problem.records)
+    fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
+    room = max(MAX_GRID_POINTS // int(np.prod(fine, initial=1)), 60)
+    count = len(axes)
+    lattice = int(np.prod([len(a) if g else 1 for a, g in zip(axes, given, strict=True)], initial=1))
+    free = count - sum(given)
+    each = int(np.floor((room / max(lattice, 1)) ** (1.0 / free))) if free and lattice <= room else 0
+    if (free and each < 4) or (not free and lattice > room):
+        # Too many axes for a lattice: points that fill the box evenly, the same every time.
+        spread = halton(room, count)
+        columns = [
+            np.asarray(a)[(spread[:, k] * len(a)).astype(int)] if g else a[0] + spread[:, k] * (a[1] - a[0])
+            for k, (a, g) in enumerate(zip(axes, given, strict=True))
+        ]
+        orders = np.stack(columns, axis=1)
+    else:
+        sides = [a if g else np.linspace(a[0], a[1], min(each, 31)) for a, g in zip(axes, given, strict=True)]
+        orders = _product(sides)
+    late = _product([np.linspace(a, b, n) for (a, b), n in zip(delays, fine, strict=True)])
+    table = np.zeros((len(orders) * len(late), len(problem.names)))
+    table[:, :count] = np.repeat(orders, len(late), axis=0)
+    table[:, len(problem.names) - len(delays) :] = np.tile(late, (len(orders), 1))
+    rows, limits, _ = problem.constraints()
+    inside = np.all(table @ rows.T <= limits + 1e-12, axis=1)
+    kept: Floats = table[inside]
+    return kept
+
+
+def _product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
+    """Return every point of a grid, one row each; a grid without axes has one point."""
+    rows = list(itertools.product(*sides))
+    return np.array(rows, dtype=np.float64).reshape(len(rows), len(sides))
+
+
+def halton(count: int, width: int) -> Floats:
+    """Return a Halton sequence in the unit box: radical inverses in the first primes."""
+    primes = [p for p in range(2, 300) if all(p % q for q in range(2, int(p**0.5) + 1))][:width]
+    out = np.zeros((count, width))
+    for k, base in enumerate(primes):
+        index, share = np.arange(1, count + 1), 1.0
+        while np.any(index):
+            share /= base
+            out[:, k] += share * (index % base)
+            index = index // base
+    return out
+
+
+def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Floats]:
+    """Return the coefficients at the most promising points, one equation after the other."""
+    slow = points[np.unique(np.linspace(0, len(points) - 1, min(MAX_CORNER_POINTS, len(points))).astype(int))]
+    points, corners = (
+        np.concatenate([points, np.repeat(slow, CORNERS_PER_POINT, axis=0)]),
+        _corner_frequencies(problem, len(points), slow),
+    )
+    table = points.copy()
+    total = np.zeros(len(points))
+    for i, item in enumerate(problem.structure.equations):
+        names = [n for n in item.coefficient_names if n in problem.coefficients]
+        records = [r for r in problem.records if r.output == i]
+        if not records:
+            continue
+        answers, cost = _equation(problem, i, names, [_subsample_record(r) for r in records], points, corners)
+        for k, name in enumerate(names):
+            table[:, problem.names.index(name)] = answers[:, k]
+        total += np.where(np.isfinite(cost), cost, np.inf)
+    best = np.argsort(total, kind="stable")[:MAX_EVALUATED_POINTS]
+    return [table[k] for k in best if np.isfinite(total[k])]
+
+
+def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
+    """Return corner frequencies imposed on the slowest own term, for points after the first; else NaN.
+
+    If noise hides a small arc, reweighted least squares are biased and own terms are far too small or too large. With
+    the slowest own term fixed, the remaining bias is small.
+    """
+    every = np.concatenate([r.frequency for r in problem.records])
+    tried = np.geomspace(every.min(), every.max(), CORNERS_PER_POINT)
+    return np.concatenate([np.full(first, np.nan), np.tile(tried, len(slow))])
+
+
+def _subsample_record(record: ResponseRecord) -> ResponseRecord:
+    """Return a record subsampled to the number of frequencies that an initial guess needs."""
+    order = np.argsort(record.frequency, kind="stable")
+    if order.size > MAX_START_FREQUENCIES:
+        order = order[np.linspace(0, order.size - 1, MAX_START_FREQUENCIES).astype(int)]
+    return ResponseRecord(
+        record.output, record.input, record.frequency[order], record.response[order], record.weight[order]
+    )
+
+
+def _equation(
+    problem: ResponseProblem,
+    place: int,
+    names: Sequence[str],
+    records: Sequence[ResponseRecord],
+    points: Floats,
+    corners: Floats,
+) -> tuple[Floats, Floats]:
+    """Return the coefficients of one equation at every point, and their cost."""
+    item = problem.structure.equations[place]
+    alpha = _orders(problem, item.order.constant, item.order.weights, points)
+    columns: dict[str, list[Complex]] = {n: [] for n in names}
+    own: dict[str, list[Complex]] = {}
+    wanted, below = [], []
+    for record in records:
+        log = np.log(1j * record.frequency)
+        late = np.exp(-1j * record.frequency * _shifts(problem, record.input, points)[:, None])
+        known = np.exp(alpha[:, None] * log)
+        below.append(known)
+        goal = known * record.response
+        for term in item.terms:
+            signal = _signal(problem, record, term.signal, late)
+            power = np.exp(_orders(problem, term.order.constant, term.order.weights, points)[:, None] * log)
+            if isinstance(term.coefficient, str):
+                columns[term.coefficient].append(term.factor * power * signal)
+                if term.signal == item.output:
+                    own.setdefault(term.coefficient, []).append(term.factor * power)
+            else:
+                gap = alpha - _orders(problem, term.order.constant, term.order.weights, points)
+                size = float(term.fixed or 0.0) * problem.unit ** -gap[:, None]
+                goal = goal - size * power * signal
+                if term.signal == item.output:
+                    below[-1] = below[-1] - size * power
+        wanted.append(goal)
+    weight = np.concatenate([r.weight for r in records])
+    goal, known = np.concatenate(wanted, axis=1), np.concatenate(below, axis=1)
+    left = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
+    ours = {n: np.concatenate(parts, axis=1) for n, parts in own.items()}
+    slowest = _slowest(problem, item, points)
+    bottom = 1.0 + np.abs(known) + 0j
+    answers = np.zeros((len(points), len(names)))
+    cost = np.full(len(points), np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(REWEIGHTING_ITERATIONS):
+            scaled = weight / np.abs(bottom)
+            if left is not None:
+                answers = _least_squares(left * scaled[..., None], goal * scaled)
+                if slowest is not None:
+                    k, power = names.index(slowest[0]), slowest[1]
+                    given = np.isfinite(corners)
+                    held = -(corners[given] ** power[given])
+                    rest = goal[given] - left[given][:, :, k] * held[:, None]
+                    others = np.delete(left[given], k, axis=2)
+                    solved = _least_squares(others * scaled[given][..., None], rest * scaled[given])
+                    answers[given] = np.insert(solved, k, held, axis=1)
+            bottom = known - sum((answers[:, [names.index(n)]] * part for n, part in ours.items()), 0.0 * known)
+            missed = goal if left is None else goal - np.einsum("bnp,bp->bn", left, answers)
+            cost = np.sum(np.abs(missed / bottom * weight) ** 2, axis=1)
+    return answers, cost
+
+
+def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[str, Floats] | None:
+    """Return the free own term that acts at the lowest frequencies, and its order gap."""
+    own = [t for t in item.terms if t.signal == item.output and isinstance(t.coefficient, str) and t.factor == 1]
+    if not own:
+        return None
+    alpha = _orders(problem, item.order.constant, item.order.weights, points)
+    gaps = [alpha - _orders(problem, t.order.constant, t.order.weights, points) for t in own]
+    at = int(np.argmax([float(np.mean(g)) for g in gaps]))
+    return str(own[at].coefficient), gaps[at]
+
+
+def _least_squares(left: Complex, right: Complex) -> Floats:
+    """Return real least-squares solutions of complex equations; undetermined directions are 0."""
+    lengths = np.sqrt(np.sum(np.abs(left) ** 2, axis=1))
+    unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
+    scaled = np.nan_to_num(left / unit[:, None, :])
+    normal = np.einsum("bnp,bnq->bpq", scaled.conj(), scaled).real
+    moment = np.einsum("bnp,bn->bp", scaled.conj(), np.nan_to_num(right)).real
+    inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)
+    answers: Floats = np.einsum("bpq,bq->bp", inverse, moment) / unit
+    return answers
+
+
+def _orders(problem: ResponseProblem, constant: float, weights: Sequence[tuple[str, float]], points: Floats) -> Floats:
+    total = np.full(len(points), constant)
+    for name, weight in weights:
+        total = total + weight * points[:, problem.orders.index(name)]
+    return total
+
+
+def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
+    if signal in problem.delays:
+        return np.asarray(points[:, len(problem.orders) + len(problem.coefficients) + problem.delays.index(signal)])
+    return np.full(len(points), problem.known_delays.get(signal, 0.0))
+
+
+def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, late: Complex) -> Complex | float:
+    """Return the factor of a term: a measured response, the delayed input, or 0."""
+    outputs = problem.structure.outputs
+    if name not in outputs:
+        return late if name == record.input else 0.0
+    if outputs.index(name) == record.output:
+        return record.response
+    other = next((r for r in problem.records if r.output == outputs.index(name) and r.input == record.input), None)
+    if other is None:
+        return 0.0
+    # Between measured frequencies, where there are other ones; a start needs no more.
+    order = np.argsort(other.frequency, kind="stable")
+    at, x = np.log(record.frequency), np.log(other.frequency[order])
+    values = other.response[order]
+    return np.interp(at, x, values.real) + 1j * np.interp(at, x, values.imag)

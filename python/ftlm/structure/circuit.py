@@ -1,0 +1,291 @@
+"""Equivalent circuits of impedances, such as ``R0-p(R1,CPE1)-W1``: notation, impedance, derivatives, polynomials."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.errors import ModelError
+from ftlm.utils.arguments import check_arguments
+from ftlm.utils.validation import Complex, Floats, as_floats, check_known
+
+#: Element with its parameters: (letters, name). Group: ("series" or "parallel", parts).
+Node: TypeAlias = tuple[str, Any]
+#: Impedance, and its derivatives by the parameters.
+Response: TypeAlias = tuple[Any, list[Any]]
+#: Sum of coefficients by power of s.
+Polynomial: TypeAlias = dict[float, float]
+#: Real part of sqrt(s tau) from which on its hyperbolic functions are 1 to rounding; they overflow at 700.
+MAX_DIFFUSION_ARGUMENT = 40.0
+_TOKEN_PATTERN = re.compile(r"p\(|[(),-]|[A-Za-z]+_?\d*")
+
+
+def _diffusion(s: Complex, p: Sequence[float], *, blocked: bool) -> Response:
+    """Return the impedance of a finite diffusion layer, with derivatives by the logarithms of R and tau."""
+    x = np.sqrt(s * p[1])
+    x = np.where(x.real > MAX_DIFFUSION_ARGUMENT, MAX_DIFFUSION_ARGUMENT * (1 + 1j), x)
+    tanh, root = np.tanh(x), np.sqrt(s * p[1])
+    z = p[0] / (root * tanh) if blocked else p[0] * tanh / root
+    bend = x / np.sinh(2 * x)
+    return z, [z, z * ((-bend if blocked else bend) - 0.5)]
+
+
+@dataclass(frozen=True)
+class Element:
+    """Element of circuits.
+
+    Parameters
+    ----------
+    meaning
+        Name of the element in words.
+    parameters
+        Suffix and unit of each parameter; the suffix is empty if the name of the element is that of the parameter.
+    impedance
+        Impedance at s, and its derivatives: by logarithms of parameters, by an exponent itself.
+    ratio
+        Numerator and denominator of the impedance as polynomials; None for a function of s that is no ratio of powers.
+    """
+
+    meaning: str
+    parameters: tuple[tuple[str, str], ...]
+    impedance: Callable[[Complex, Sequence[float]], Response]
+    ratio: Callable[[Sequence[float]], tuple[Polynomial, Polynomial]] | None = None
+
+
+def _power(sign: float, order: float) -> Callable[[Complex, Sequence[float]], Response]:
+    """Return the impedance (p s^order)^sign with its derivative."""
+    return lambda s, p: (z := (p[0] * s**order) ** sign, [sign * z])
+
+
+def _constant_phase(s: Complex, p: Sequence[float]) -> Response:
+    z = 1.0 / (p[0] * s ** p[1])
+    return z, [-z, -np.log(s) * z]
+
+
+def _gerischer(s: Complex, p: Sequence[float]) -> Response:
+    z = p[0] / np.sqrt(1.0 + s * p[1])
+    return z, [z, -0.5 * z * s * p[1] / (1.0 + s * p[1])]
+
+
+SQUARE_ROOT_OF_2 = math.sqrt(2.0)
+#: Elements by letters. Parameters as in impedance.py (doi:10.21105/joss.02349).
+CIRCUIT_ELEMENTS = {
+    "R": Element("resistor", (("", "Ω"),), _power(1.0, 0.0), lambda p: ({0.0: p[0]}, {0.0: 1.0})),
+    "C": Element("capacitor", (("", "F"),), _power(-1.0, 1.0), lambda p: ({0.0: 1.0}, {1.0: p[0]})),
+    "L": Element("inductor", (("", "H"),), _power(1.0, 1.0), lambda p: ({1.0: p[0]}, {0.0: 1.0})),
+    "CPE": Element(
+        "constant-phase element",
+        (("_Q", "S s^alpha"), ("_alpha", "")),
+        _constant_phase,
+        lambda p: ({0.0: 1.0}, {p[1]: p[0]}),
+    ),
+    "W": Element(
+        "Warburg diffusion",
+        (("_sigma", "Ω s^-0.5"),),
+        lambda s, p: (z := SQUARE_ROOT_OF_2 * p[0] / np.sqrt(s), [z]),
+        lambda p: ({0.0: SQUARE_ROOT_OF_2 * p[0]}, {0.5: 1.0}),
+    ),
+    "Wo": Element(
+        "diffusion to a blocked end", (("_R", "Ω"), ("_tau", "s")), lambda s, p: _diffusion(s, p, blocked=True)
+    ),
+    "Ws": Element(
+        "diffusion to an open end", (("_R", "Ω"), ("_tau", "s")), lambda s, p: _diffusion(s, p, blocked=False)
+    ),
+    "G": Element("Gerischer element", (("_R", "Ω"), ("_tau", "s")), _gerischer),
+}
+
+
+def _letters(name: str) -> str:
+    return name.rstrip("0123456789").rstrip("_")
+
+
+@check_arguments
+@dataclass(frozen=True)
+class Circuit:
+    """Equivalent circuit of an impedance.
+
+    Parameters
+    ----------
+    text
+        Elements in series joined by ``-``, in parallel in ``p(…, …)``: ``R0-p(R1,CPE1)-W1``. Elements are R, C, L, CPE
+        (Q, alpha), W (sigma: half-infinite diffusion), Wo and Ws (R, tau: diffusion to a blocked or an open end) and G
+        (R, tau: Gerischer), each with a number of its own.
+    values
+        Known values by name: ``R0``, ``CPE1_Q``, ``CPE1_alpha``, ``W1_sigma``, in Ω, F, H, s.
+
+    Raises
+    ------
+    ModelError
+        An unknown element, two of one name, a parenthesis that is not closed, or an unknown name of a value.
+    """
+
+    text: str
+    values: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_known("value of the circuit", self.values, self.names)
+
+    @cached_property
+    def tree(self) -> Node:
+        """Circuit as nested groups."""
+        text = re.sub(r"\s", "", self.text)
+        tokens = _TOKEN_PATTERN.findall(text)
+        if "".join(tokens) != text:
+            raise ModelError(f"circuit {self.text!r} is not understood; write it as in 'R0-p(R1,CPE1)-W1'")
+        seen: set[str] = set()
+
+        def group(kind: str, parts: list[Node]) -> Node:
+            return parts[0] if len(parts) == 1 else (kind, parts)
+
+        def series() -> Node:
+            parts = [single()]
+            while tokens and tokens[0] == "-":
+                tokens.pop(0)
+                parts.append(single())
+            return group("series", parts)
+
+        def single() -> Node:
+            token = tokens.pop(0) if tokens else "the end"
+            if token == "p(":
+                parts = [series()]
+                while tokens and tokens[0] == ",":
+                    tokens.pop(0)
+                    parts.append(series())
+                if not tokens or tokens.pop(0) != ")":
+                    raise ModelError(f"circuit {self.text!r}: a parenthesis is not closed; write p(R1,C1)")
+                return group("parallel", parts)
+            if _letters(token) not in CIRCUIT_ELEMENTS:
+                known = ", ".join(f"{n} ({e.meaning})" for n, e in CIRCUIT_ELEMENTS.items())
+                raise ModelError(
+                    f"circuit {self.text!r}: {token!r} is no element; known: {known}, and p(…,…); an equation has '='"
+                )
+            if token in seen:
+                raise ModelError(f"circuit {self.text!r}: two elements are {token}; number them, such as R0 and R1")
+            seen.add(token)
+            return _letters(token), token
+
+        tree = series()
+        if tokens:
+            raise ModelError(f"circuit {self.text!r}: {tokens[0]!r} is out of place; join elements by - or p(…,…)")
+        return tree
+
+    @cached_property
+    def elements(self) -> list[tuple[str, str]]:
+        """Letters and name of every element, from left to right."""
+
+        def walk(node: Node) -> list[tuple[str, str]]:
+            kind, rest = node
+            return [item for part in rest for item in walk(part)] if kind in ("series", "parallel") else [(kind, rest)]
+
+        return walk(self.tree)
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        """Unit of every parameter by name."""
+        units = {
+            name + suffix: unit for kind, name in self.elements for suffix, unit in CIRCUIT_ELEMENTS[kind].parameters
+        }
+        exponents = {n: self.values.get(n.replace("_Q", "_alpha")) for n in units if n.endswith("_Q")}
+        return units | {n: f"S s^{v:.4g}" for n, v in exponents.items() if v is not None}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters."""
+        return tuple(n + suffix for kind, n in self.elements for suffix, _ in CIRCUIT_ELEMENTS[kind].parameters)
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the parameters without a value."""
+        return tuple(n for n in self.names if n not in self.values)
+
+    @check_arguments
+    def with_values(self, values: Mapping[str, float]) -> Circuit:
+        """Return the circuit with more values."""
+        return replace(self, values={**self.values, **values})
+
+    @check_arguments
+    def impedance(self, w: ArrayLike) -> Complex:
+        """Return the impedance [Ω] at angular frequencies [rad/s], finite, above 0."""
+        return impedance_with_slopes(self, as_floats("w", w), {})[0]
+
+    def polynomials(self) -> tuple[Polynomial, Polynomial]:
+        """Return numerator and denominator of the impedance as coefficients by power of s.
+
+        Raises
+        ------
+        ModelError
+            An element whose impedance is no ratio of powers of s.
+        """
+
+        def product(one: Polynomial, other: Polynomial) -> Polynomial:
+            out: Polynomial = {}
+            for a, x in one.items():
+                for b, y in other.items():
+                    out[round(a + b, 9)] = out.get(round(a + b, 9), 0.0) + x * y
+            return out
+
+        def add_ratios(parts: Sequence[tuple[Polynomial, Polynomial]]) -> tuple[Polynomial, Polynomial]:
+            (top, bottom), *others = parts
+            for above, below in others:
+                one, two = product(top, below), product(above, bottom)
+                top = {p: one.get(p, 0.0) + two.get(p, 0.0) for p in [*one, *(p for p in two if p not in one)]}
+                bottom = product(bottom, below)
+            return top, bottom
+
+        def ratio(node: Node) -> tuple[Polynomial, Polynomial]:
+            kind, rest = node
+            if kind in ("series", "parallel"):
+                parts = [ratio(part) for part in rest]
+                return add_ratios(parts) if kind == "series" else add_ratios([(b, a) for a, b in parts])[::-1]
+            element = CIRCUIT_ELEMENTS[kind]
+            if element.ratio is None:
+                raise ModelError(
+                    f"{rest} ({element.meaning}) has no equation with powers of s; use .circuit.impedance(w) for the "
+                    "response, or approximate it by p(R,CPE) for a model over time"
+                )
+            return element.ratio([self.values[rest + suffix] for suffix, _ in element.parameters])
+
+        top, bottom = ratio(self.tree)
+        return top, bottom
+
+    def __str__(self) -> str:
+        return re.sub(r"\s", "", self.text)
+
+
+def impedance_with_slopes(
+    circuit: Circuit, w: Floats, more: Mapping[str, float], node: Node | None = None
+) -> tuple[Complex, dict[str, Complex]]:
+    """Return the impedance of a part, and its derivatives by ln of every parameter, by an exponent itcircuit.
+
+    Parameters
+    ----------
+    circuit
+        Circuit with values.
+    w
+        Angular frequencies [rad/s].
+    more
+        Values by name besides those of the circuit.
+    node
+        Part of the circuit's tree; None for all of it.
+    """
+    kind, rest = node or circuit.tree
+    if kind not in ("series", "parallel"):
+        names = [rest + suffix for suffix, _ in CIRCUIT_ELEMENTS[kind].parameters]
+        values = {**circuit.values, **more}
+        z, slopes = CIRCUIT_ELEMENTS[kind].impedance(
+            np.asarray(1j * w, dtype=np.complex128), [values[n] for n in names]
+        )
+        return z, dict(zip(names, slopes, strict=True))
+    parts = [impedance_with_slopes(circuit, w, more, part) for part in rest]
+    if kind == "series":
+        total = np.asarray(np.sum([z for z, _ in parts], axis=0), dtype=np.complex128)
+        return total, {n: slope for _, slopes in parts for n, slope in slopes.items()}
+    beside = np.asarray(1.0 / np.sum([1.0 / z for z, _ in parts], axis=0), dtype=np.complex128)
+    return beside, {n: (beside / z) ** 2 * slope for z, slopes in parts for n, slope in slopes.items()}
