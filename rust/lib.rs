@@ -38,8 +38,8 @@
 //! # }
 //! ```
 //!
-//! A [`recording::Recording`] holds samples, a [`regressors::Record`] holds means over pulses. Samples in place of means
-//! would bias every estimate.
+//! A [`recording::Recording`] holds samples, a [`regressors::Record`] holds [`signal::block_pulse::PulseMeans`]. Samples
+//! in place of means would bias every estimate.
 //!
 //! # Features
 //!
@@ -87,7 +87,7 @@ pub mod prelude {
     pub use crate::estimation::joint_fit::structure::{Equation, Order};
     pub use crate::estimation::joint_fit::{fit_equations, EquationFit};
     pub use crate::recording::{Channel, Recording, Role};
-    pub use crate::signal::block_pulse::Intersample;
+    pub use crate::signal::block_pulse::{Intersample, PulseMeans};
 }
 
 #[cfg(feature = "python")]

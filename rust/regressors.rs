@@ -12,7 +12,7 @@ use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::fractional::kernels::{kernel, power_means, power_pulses};
 use crate::parallel::{self, Stop};
 use crate::series::{self, Buffers, Kernel};
-use crate::signal::block_pulse::{pulse_means, Intersample};
+use crate::signal::block_pulse::{pulse_means, Intersample, PulseMeans};
 
 /// Memory limit of a single bank, and default limit of a search, in bytes.
 pub const BANK_LIMIT: u64 = 2 << 30;
@@ -39,7 +39,12 @@ impl Record {
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::NotFinite`] naming the signal by number, [`Error::OutOfRange`] for the step.
-    pub fn new(step: f64, signals: Vec<Vec<f64>>, filter: Option<Vec<f64>>) -> Result<Self> {
+    pub fn new(step: f64, signals: Vec<PulseMeans>, filter: Option<Vec<f64>>) -> Result<Self> {
+        Self::from_rows(step, signals.into_iter().map(PulseMeans::into_vec).collect(), filter)
+    }
+
+    /// Record of the values of pulse means.
+    pub(crate) fn from_rows(step: f64, signals: Vec<Vec<f64>>, filter: Option<Vec<f64>>) -> Result<Self> {
         check_step(step)?;
         let m = signals.first().map_or(0, Vec::len);
         if m == 0 {
@@ -89,7 +94,8 @@ impl Record {
     ///
     /// # Errors
     /// [`Error::Length`] for another number of substitutes than signals, and as [`Record::new`].
-    pub fn with_clean(mut self, clean: Vec<Vec<f64>>) -> Result<Self> {
+    pub fn with_clean(mut self, clean: Vec<PulseMeans>) -> Result<Self> {
+        let clean: Vec<_> = clean.into_iter().map(PulseMeans::into_vec).collect();
         check_length("clean signals", self.signals.len(), clean.len())?;
         for (i, signal) in clean.iter().enumerate() {
             let name = format!("clean signal {i}");
@@ -133,8 +139,9 @@ impl Record {
     /// [`Error::Length`], [`Error::NotFinite`] if the filter overflows.
     ///
     /// ```
+    /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0, 2.0, 3.0]]), None)?;
     /// assert_eq!(record.with_filter(&[0.0, 1.0, 0.0])?.signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
@@ -143,7 +150,7 @@ impl Record {
         check_length("filter", m, filter.len())?;
         let filtered = |series: &Vec<f64>| series::multiply(filter, series, m);
         let known = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
-        let mut through = Self::new(self.step, self.signals.iter().map(filtered).collect(), Some(known))?;
+        let mut through = Self::from_rows(self.step, self.signals.iter().map(filtered).collect(), Some(known))?;
         through.filter_transients.clone_from(&self.filter_transients);
         through.deviations = self.deviations.iter().map(|moving| moving.as_ref().map(filtered)).collect();
         Ok(through)
@@ -163,8 +170,9 @@ impl Record {
     /// [`Error::NotFinite`] for a level or a response.
     ///
     /// ```
+    /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0, 2.0, 3.0]]), None)?;
     /// let record = record.with_initial_state(vec![false], &[1.0], Vec::new())?;
     /// assert_eq!(record.deviation_signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
@@ -260,8 +268,9 @@ impl Record {
     /// If the signal does not exist.
     ///
     /// ```
+    /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, vec![vec![1.0; 4]], None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0; 4]]), None)?;
     /// let ramp = record.integral(0, 1.0);
     /// assert!(ramp.iter().zip([0.25, 0.75, 1.25, 1.75]).all(|(a, b)| (a - b).abs() < 1e-12));
     /// # Ok::<(), ftlm::error::Error>(())
@@ -279,8 +288,9 @@ impl Record {
     /// Exponents −1, −2, … are an impulse and its derivatives.
     ///
     /// ```
+    /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, vec![vec![1.0; 4]], None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0; 4]]), None)?;
     /// assert!(record.initial_term(0.0).iter().all(|v| (v - 1.0).abs() < 1e-12));
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
@@ -439,8 +449,9 @@ impl Bank {
     /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record does not have.
     ///
     /// ```
+    /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::{Bank, Index, Key, Record};
-    /// let record = Record::new(0.5, vec![vec![1.0; 4], vec![2.0; 4]], None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0; 4], vec![2.0; 4]]), None)?;
     /// let mut index = Index::default();
     /// let input = index.insert(Key::integral(1, 0.0));
     /// let own = index.insert(Key::integral(0, 0.8));

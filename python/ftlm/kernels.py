@@ -144,6 +144,7 @@ def integrate(x: ArrayLike, order: ArrayLike, *, step: float) -> NDArray[np.floa
     Notes
     -----
     O(m log m) an integral. Signals of one order share their kernel and its spectrum.
+    Memory beyond the result is about one byte a value, and once more the result's if ``x`` is broadcast.
     """
     values, orders = _finite("x", x), _finite("order", order)
     m = _length("x", values)

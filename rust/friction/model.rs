@@ -227,7 +227,7 @@ impl FrictionModel {
             signals[input.signal] = means;
             bent.push(slope);
         }
-        Ok((Some(Record::new(record.step(), signals, None)?), bent))
+        Ok((Some(Record::from_rows(record.step(), signals, None)?), bent))
     }
 
     fn simulate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation<Part>> {

@@ -164,7 +164,7 @@ impl NonlinearModel {
             signals[input.signal] = means;
             slopes.push(slope);
         }
-        Ok((Some(Record::new(record.step(), signals, None)?), slopes))
+        Ok((Some(Record::from_rows(record.step(), signals, None)?), slopes))
     }
 }
 

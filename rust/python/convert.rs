@@ -92,7 +92,7 @@ pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
         RecordArg::Plain(step, signals, filter) => (step, signals, filter, None),
     };
     let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
-    let record = Record::new(*step, rows(signals)?, filter)?;
+    let record = Record::from_rows(*step, rows(signals)?, filter)?;
     Ok(match begun {
         Some((held, levels, answers)) => {
             let answers = answers.as_ref().map(rows).transpose()?.unwrap_or_default();

@@ -178,7 +178,7 @@ pub fn pulse_mean_rows<'py>(
         let mut values = Vec::with_capacity(m * count);
         for row in batch.values.chunks_exact(batch.width.max(1)) {
             stop.check()?;
-            values.extend(block_pulse::pulse_means(row, m, between)?);
+            values.extend(block_pulse::pulse_means(row, m, between)?.into_vec());
         }
         Ok(values)
     })?;

@@ -12,7 +12,7 @@ use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{self, InputLaw};
 use crate::python::order_search::watch::run_interruptible;
 use crate::recording::{self, Channel, Recordings, Role, Sampling};
-use crate::signal::block_pulse::Intersample;
+use crate::signal::block_pulse::{Intersample, PulseMeans};
 use crate::signal::nonuniform::NonuniformSignal;
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
@@ -130,10 +130,11 @@ impl Recording {
         let run = Arc::clone(&self.inner);
         let points = m.saturating_mul(run.channels().len());
         let found = run_interruptible(py, points, None, move |_| run.pulses(m, filtered))?;
+        let means: Vec<_> = found.means.into_iter().map(PulseMeans::into_vec).collect();
         let responses = &found.impulse_responses;
         let responses = if responses.is_empty() { None } else { Some(stack_rows(py, responses)?) };
         let series = found.filter.map(|series| PyArray1::from_vec(py, series));
-        Ok((found.step, stack_rows(py, &found.means)?, series, (found.has_transient, found.initial_levels, responses)))
+        Ok((found.step, stack_rows(py, &means)?, series, (found.has_transient, found.initial_levels, responses)))
     }
 
     /// Experiment with `every` pulses a sampling interval of each `decimation`-th sample, weights of the outputs, and
@@ -227,7 +228,7 @@ pub fn nonuniform_means<'py>(
     let (times, samples) = (vector("times", &times)?, vector("samples", &samples)?);
     let between = if hold { Intersample::Hold } else { Intersample::Linear };
     let means = run_detached(py, || NonuniformSignal::new(&times, &samples, between)?.means(m, step))?;
-    Ok(PyArray1::from_vec(py, means))
+    Ok(PyArray1::from_vec(py, means.into_vec()))
 }
 
 /// Runs of a fit of so many signals and free inputs, with these outputs.

@@ -11,7 +11,7 @@ use crate::estimation::output_error::{Experiment, InputLaw, NonuniformSamples, P
 use crate::regressors::Record;
 use crate::series;
 use crate::signal::block_pulse::{
-    check_pulses, delay_samples, point_samples, pulse_means, Intersample, SampleInterpolation,
+    check_pulses, delay_samples, point_samples, pulse_means, Intersample, PulseMeans, SampleInterpolation,
 };
 use crate::signal::nonuniform::{check_times, interpolate, interpolate_gaps, NonuniformSignal, TIME_TOLERANCE};
 
@@ -71,7 +71,7 @@ impl Default for Sampling {
 /// let y = Channel::new("y", vec![0.0, 1.0, f64::NAN, 9.0], Role::Output);
 /// let u = Channel { delay: Some(0.1), ..Channel::new("u", vec![1.0, 2.0, 3.0, 4.0], Role::Input(Intersample::Hold)) };
 /// let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
-/// assert_eq!(run.pulses(3, false)?.means[1], [0.0, 1.0, 2.0]);
+/// assert_eq!(run.pulses(3, false)?.means[1].values(), [0.0, 1.0, 2.0]);
 /// assert_eq!(run.experiment(Default::default())?.sample_weights, [[1.0, 0.0]]);
 /// # Ok(())
 /// # }
@@ -103,7 +103,7 @@ pub struct Pulses {
     /// Pulse width \[s\].
     pub step: f64,
     /// Means of each signal.
-    pub means: Vec<Vec<f64>>,
+    pub means: Vec<PulseMeans>,
     /// Series of the sensor filter, if all signals have passed it.
     pub filter: Option<Vec<f64>>,
     /// Signals that may contain an initial transient of their sensor filter.
@@ -323,7 +323,7 @@ impl Recording {
     /// use ftlm::estimation::output_error::InputLaw;
     /// let mut run = run;
     /// run.free_inputs = vec![(1, InputLaw::Delay)];
-    /// assert_eq!(run.with_free_inputs(&[0.1])?.pulse_means(1, 3)?, [0.0, 1.0, 2.0]);
+    /// assert_eq!(run.with_free_inputs(&[0.1])?.pulse_means(1, 3)?.values(), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn with_free_inputs(&self, values: &[f64]) -> Result<Self> {
@@ -475,11 +475,11 @@ impl Recording {
     /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
     /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
     /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
-    /// assert_eq!(run.pulse_means(1, 3)?, [1.0, 2.0, 2.0]);
+    /// assert_eq!(run.pulse_means(1, 3)?.values(), [1.0, 2.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     #[allow(clippy::cast_precision_loss)]
-    pub fn pulse_means(&self, signal: usize, m: usize) -> Result<Vec<f64>> {
+    pub fn pulse_means(&self, signal: usize, m: usize) -> Result<PulseMeans> {
         check_pulses(m)?;
         let channel = &self.channels[signal];
         let held = channel.intersample();
@@ -523,7 +523,7 @@ impl Recording {
     /// # let y = Channel::new("y", vec![0.0, 1.0, 4.0, 9.0], Role::Output);
     /// # let u = Channel::new("u", vec![1.0, 2.0, 2.0, 3.0], Role::Input(Intersample::Hold));
     /// # let run = Recording::new("run", 0.1, None, vec![y, u], vec![0])?;
-    /// assert_eq!(run.pulses(3, false)?.means[1], [1.0, 2.0, 2.0]);
+    /// assert_eq!(run.pulses(3, false)?.means[1].values(), [1.0, 2.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     #[allow(clippy::cast_precision_loss)]
@@ -534,7 +534,7 @@ impl Recording {
         let series = filter.map(|filter| filter.series(m, step)).transpose()?;
         let mut means = Vec::with_capacity(self.channels.len());
         for (signal, channel) in self.channels.iter().enumerate() {
-            let mut row = self.pulse_means(signal, m)?;
+            let mut row = self.pulse_means(signal, m)?.into_vec();
             if let Some(series) = series.as_ref().filter(|_| !channel.is_filtered) {
                 row = series::multiply(series, &row, m);
             }
@@ -549,7 +549,7 @@ impl Recording {
                 );
                 return Err(Error::Recording { what, remedy: "scale the signal".into() });
             }
-            means.push(row);
+            means.push(PulseMeans::new(row));
         }
         let impulse_responses = match filter.and_then(FilterStates::of) {
             Some(states) => states.impulse_responses(self.filter_states, m, step)?,
@@ -608,7 +608,7 @@ impl Recording {
         let run = run.leading_part(intervals * decimation + 1)?;
         let filtered = run.is_all_filtered();
         let pulses = run.pulses(intervals.saturating_mul(every), filtered)?;
-        let (m, step) = (pulses.means[0].len(), pulses.step);
+        let (m, step) = (pulses.means[0].values().len(), pulses.step);
         let filter = if filtered { None } else { run.filter.as_ref() };
         let filter = filter.map(|filter| filter.series(m, step)).transpose()?;
         let weights = vec![1.0; run.outputs.len()];
@@ -730,7 +730,7 @@ impl Recording {
         if pulses.filter.is_none() || channel.is_filtered {
             return channel.samples.iter().copied().step_by(decimation).collect();
         }
-        point_samples(&pulses.means[output]).into_iter().step_by(every).collect()
+        point_samples(pulses.means[output].values()).into_iter().step_by(every).collect()
     }
 
     /// Values of a signal at the samples, after any jump there.
@@ -748,7 +748,7 @@ impl Recording {
         let is_zero_order_hold = channel.is_held_input();
         if channel.lag() != 0.0 && is_zero_order_hold {
             // A command switches between samples after a delay: what it is then is the pulse that follows.
-            let mut values: Vec<f64> = pulses.means[signal].iter().copied().step_by(every).collect();
+            let mut values: Vec<f64> = pulses.means[signal].values().iter().copied().step_by(every).collect();
             values.extend(values.last().copied());
             return Ok(PointValues { values: Some(values), is_zero_order_hold });
         }
@@ -772,7 +772,7 @@ impl Recording {
         let kept: Vec<usize> =
             (0..times.len()).filter(|&row| times[row] > 0.0 && times[row] <= last).step_by(decimation).collect();
         let at: Vec<f64> = kept.iter().map(|&row| times[row]).collect();
-        let (m, step) = (pulses.means[0].len(), pulses.step);
+        let (m, step) = (pulses.means[0].values().len(), pulses.step);
         let readings = SampleInterpolation::new(at.iter().map(|time| (time / step).min(m as f64)).collect(), m)?;
         let of = |&output: &usize| {
             let read = self.channels[output].nonuniform.as_deref().unwrap_or_default();

@@ -20,6 +20,54 @@ pub enum Intersample {
     Linear,
 }
 
+/// Means of one signal over equal pulses. No conversion from or to samples is implicit.
+///
+/// ```compile_fail,E0308
+/// use ftlm::regressors::Record;
+/// let samples: Vec<f64> = vec![0.0, 1.0, 3.0];
+/// let record = Record::new(0.1, vec![samples], None);
+/// ```
+///
+/// ```compile_fail,E0308
+/// use ftlm::prelude::*;
+/// use ftlm::signal::block_pulse::pulse_means;
+/// let means = pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Linear).unwrap();
+/// let channel = Channel::new("y", means, Role::Output);
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub struct PulseMeans(Vec<f64>);
+
+impl PulseMeans {
+    /// Pulse means with these values, which are not checked. [`pulse_means`] computes them from samples.
+    ///
+    /// ```
+    /// use ftlm::signal::block_pulse::PulseMeans;
+    /// assert_eq!(PulseMeans::new(vec![0.5, 2.0]).values(), [0.5, 2.0]);
+    /// ```
+    #[must_use]
+    pub fn new(values: Vec<f64>) -> Self {
+        Self(values)
+    }
+
+    /// Pulse means of several signals.
+    #[must_use]
+    pub fn from_rows(rows: Vec<Vec<f64>>) -> Vec<Self> {
+        rows.into_iter().map(Self).collect()
+    }
+
+    /// Mean of every pulse.
+    #[must_use]
+    pub fn values(&self) -> &[f64] {
+        &self.0
+    }
+
+    /// Mean of every pulse, without a copy.
+    #[must_use]
+    pub fn into_vec(self) -> Vec<f64> {
+        self.0
+    }
+}
+
 /// Means over `m` equal pulses of [0, (N−1)h] of a signal with N samples. O(N + m).
 ///
 /// `m` is arbitrary: N−1 is the grid of the record, a multiple of it refines the grid with the same inter-sample
@@ -31,13 +79,13 @@ pub enum Intersample {
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::signal::block_pulse::{pulse_means, Intersample};
-/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Linear)?, [0.5, 2.0]);
-/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Hold)?, [0.0, 1.0]);
+/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Linear)?.values(), [0.5, 2.0]);
+/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Hold)?.values(), [0.0, 1.0]);
 /// # Ok(())
 /// # }
 /// ```
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Vec<f64>> {
+pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<PulseMeans> {
     let Some(intervals) = samples.len().checked_sub(1).filter(|&n| n > 0) else {
         return Err(Error::Length { name: "samples".into(), expected: 2, found: samples.len() });
     };
@@ -75,7 +123,7 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Ve
         means.push(if m == intervals { integral } else { integral * per_pulse });
         (j, x) = (next_j, next_x);
     }
-    Ok(means)
+    Ok(PulseMeans(means))
 }
 
 /// Return an error for no pulse or too many.

@@ -5,7 +5,7 @@
 
 use std::borrow::Cow;
 
-use super::block_pulse::{check_pulses, Intersample};
+use super::block_pulse::{check_pulses, Intersample, PulseMeans};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 
 /// Largest distance of a sample from an edge of a pulse, in pulses, at which both coincide.
@@ -64,19 +64,19 @@ impl<'a> NonuniformSignal<'a> {
     /// ```
     /// # use ftlm::signal::{block_pulse::Intersample, nonuniform::NonuniformSignal};
     /// let held = NonuniformSignal::new(&[0.0, 0.5, 1.25], &[1.0, 3.0, 0.0], Intersample::Hold)?;
-    /// assert_eq!(held.means(2, 1.0)?, [2.0, 0.75]);
+    /// assert_eq!(held.means(2, 1.0)?.values(), [2.0, 0.75]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     #[allow(clippy::cast_precision_loss)]
-    pub fn means(&self, m: usize, step: f64) -> Result<Vec<f64>> {
+    pub fn means(&self, m: usize, step: f64) -> Result<PulseMeans> {
         check_pulses(m)?;
         check_step(step)?;
         check_finite("samples", &self.values)?;
         let edges: Vec<f64> = (0..=m).map(|k| k as f64 * step).collect();
-        Ok(match self.intersample {
+        Ok(PulseMeans::new(match self.intersample {
             Intersample::Hold => self.hold_means(&edges, step),
             Intersample::Linear => self.linear_means(&edges, step),
-        })
+        }))
     }
 
     /// Means of a hold: bit-exact where the value is constant within a pulse.

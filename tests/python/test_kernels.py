@@ -1,5 +1,6 @@
 """`ftlm.kernels` against dense matrices, SciPy and the recursion as published; broadcasting, and arguments refused."""
 
+import sys
 import threading
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import ftlm
-from ftlm import kernels
+from ftlm import _core, kernels
 
 STEP = 0.1
 PAIR = kernels.Candidates(np.ones((2, 4)), [1], step=STEP)
@@ -126,18 +127,46 @@ def test_arguments_of_any_strides_stay_as_they_are():
     assert kernels.multi_innovation(np.zeros((0, 5, 2)), np.zeros((0, 5)), prior_covariance=1.0).shape == (0, 2)
 
 
-def test_two_threads_compute_what_one_does():
-    x, found = noise(64, 4096), {}
+@pytest.mark.parametrize(
+    ("name", "work"),
+    [
+        ("toeplitz_apply", lambda x: kernels.integrate(x, 0.3, step=STEP)),
+        ("toeplitz_solve", lambda x: kernels.toeplitz_solve(np.r_[2.0, x[0, 1:]], x[:16])),
+        ("pulse_mean_rows", lambda x: kernels.pulse_means(x, 30_000)),
+        ("multi_innovation_rows", lambda x: kernels.multi_innovation(x[:8].T, x[8], 7, prior_covariance=1.0)),
+    ],
+)
+def test_two_threads_compute_at_once_what_one_does(monkeypatch, name, work):
+    """No thread is made to give up the interpreter, so that the second call begins only if the first one lets go."""
+    x, found, inside, most, begun = 0.01 * noise(256, 16384), {}, [0], [0], threading.Barrier(2)
+    call, alone = getattr(_core, name), work(x)
 
-    def work(name):
-        found[name] = kernels.integrate(x, 0.3, step=STEP)
+    def watched(*arguments):
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        try:
+            return call(*arguments)
+        finally:
+            inside[0] -= 1
 
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    np.testing.assert_array_equal(found[0], found[1])
+    def run(key):
+        begun.wait()
+        found[key] = work(x)
+
+    monkeypatch.setattr(_core, name, watched)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(60.0)
+    try:
+        threads = [threading.Thread(target=run, args=(key,)) for key in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert most == [2]
+    for one in found.values():
+        np.testing.assert_array_equal(one, alone)
 
 
 def candidates(m=64, seed=4):
@@ -194,15 +223,17 @@ def test_scores_of_candidates_are_errors_of_their_simulations(norm):
     assert same is numbers or np.array_equal(same, numbers)
 
 
-def test_candidates_agree_with_identify(small_run):
+@pytest.mark.parametrize("p", [1, 3, 5, 7])
+@pytest.mark.parametrize("prior", [1.0, 1e6])
+def test_candidates_agree_with_identify(small_run, p, prior):
     structure = ftlm.equation("D^alpha y = a1 D^beta y + a0 y + b u", initial="rest")
     structure = structure.with_orders({"alpha": [1.7, 1.8], "beta": [0.5, 0.6]})
-    method = ftlm.MultiInnovation(innovation_length=7, prior_covariance=1e6)
+    method = ftlm.MultiInnovation(innovation_length=p, prior_covariance=prior)
     found = ftlm.identify(small_run, structure, method=method, m=256)
     y, u = (kernels.pulse_means(small_run[n], 256, hold=n == "u") for n in "yu")
     model = kernels.Candidates([y, u], [0, 0, 1], step=small_run.duration / 256)
     orders = [[alpha, beta, 0.0, 0.0] for alpha in (1.7, 1.8) for beta in (0.5, 0.6)]
-    scores, coefficients = model.score(orders, p=7, prior_covariance=1e6)
+    scores, coefficients = model.score(orders, p=p, prior_covariance=prior)
     best = int(scores.argmin())
     assert orders[best][:2] == pytest.approx([found.orders["alpha"], found.orders["beta"]])
     np.testing.assert_allclose(coefficients[best], [found.coefficients[n] for n in ("a1", "a0", "b")], rtol=1e-9)
@@ -232,6 +263,14 @@ def test_candidates_without_an_estimate_are_marked():
         (lambda: kernels.integrate(1.0, 0.5, step=STEP), "no axis of time"),
         (lambda: kernels.toeplitz_apply(np.ones(3), np.ones(4)), "3 terms and x 4"),
         (lambda: kernels.toeplitz_solve([0.0, 1.0], [1.0, 1.0]), "kernel 0 of 1 begins with 0"),
+        (lambda: kernels.block_pulse_kernel([0.5, -0.1], 4, step=STEP), r"order = -0.1"),
+        (lambda: kernels.block_pulse_kernel([0.5, np.inf], 4, step=STEP), r"order is not finite at index \[1\]"),
+        (lambda: kernels.toeplitz_apply([1.0, np.inf], np.ones(2)), r"kernel is not finite at index \[1\] \(1 such"),
+        (lambda: kernels.toeplitz_solve(np.ones(2), [np.nan] * 2), r"b is not finite at index \[0\] \(2 such"),
+        (lambda: kernels.toeplitz_apply(np.ones((2, 3)), np.ones((4, 3))), r"kernel \(2,\) and x \(4,\) do not"),
+        (lambda: kernels.pulse_means(np.ma.masked_array([1.0, 2.0], [0, 1])), "masked"),
+        (lambda: kernels.multi_innovation(np.ones((4, 2)) * 1j, np.ones(4), prior_covariance=1.0), "complex"),
+        (lambda: kernels.errors([1.0, np.nan], np.ones(2)), r"measured is not finite at index \[1\]"),
         (lambda: kernels.haar(np.ones(6)), "power of two"),
         (lambda: kernels.pulse_means([1.0]), "samples|pulse"),
         (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(5), prior_covariance=1.0), r"\(4, 2\), m \(5,\)"),

@@ -244,6 +244,27 @@ def test_a_long_record_is_fitted_in_little_memory(tmp_path):
     assert peak * 1024 < 150e6
 
 
+INTEGRATE = """
+import resource
+import numpy as np
+from ftlm import kernels
+def held():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+x = np.ones((10_000, 2048))
+kernels.integrate(x[:64], 0.5, step=0.1)
+before = held()
+out = kernels.integrate(x, 0.5, step=0.1)
+print(held() - before - out.nbytes)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peaks are counted in kB on Linux")
+def test_integrals_of_a_batch_need_little_more_than_their_result():
+    done = subprocess.run([sys.executable, "-c", INTEGRATE], capture_output=True, text=True, check=True, timeout=120)
+    # A byte a value is taken by the check that all are finite.
+    assert int(done.stdout) < 10_000 * 2048 + 10e6
+
+
 def long_run(rows):
     t = 0.1 * np.arange(rows)
     return ftlm.Run.from_arrays(step=0.1, inputs={"u": np.sin(t)}, outputs={"y": np.cos(t)}, name="long")

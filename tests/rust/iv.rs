@@ -15,6 +15,7 @@ use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::parallel::Stop;
 use ftlm::regressors::Record;
 use ftlm::series::{divide_naive, multiply_naive, Kernel};
+use ftlm::signal::block_pulse::PulseMeans;
 use ftlm::simulate;
 
 use crate::common::{
@@ -40,7 +41,7 @@ fn measured(model: &Equation, m: usize, initial: &[(f64, f64)], noise: f64, seed
 fn with_clean(record: &Record, output: usize, inputs: &[usize]) -> Record {
     let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
     signals[output] = project(record, output, inputs, true).unwrap();
-    record.clone().with_clean(signals).unwrap()
+    record.clone().with_clean(PulseMeans::from_rows(signals)).unwrap()
 }
 
 fn run(records: &[Record], model: &Equation, fixed: &[Option<f64>], initial: &Initial) -> Vec<f64> {
@@ -179,7 +180,7 @@ fn coupled_equations_are_simulated_from_the_input_alone() {
         noisy = with_signal(&noisy, i, output.iter().map(|v| v + sigma * random.normal()).collect());
     }
     let clean = (0..3).map(|s| if s < 2 { project(&noisy, s, &[2], true).unwrap() } else { noisy.signal(s).to_vec() });
-    let noisy = noisy.clone().with_clean(clean.collect()).unwrap();
+    let noisy = noisy.clone().with_clean(clean.map(PulseMeans::new).collect()).unwrap();
     let structures = [first.structure.clone(), second.structure.clone()];
     let found =
         fit(&[noisy], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, Settings::default()).unwrap();

@@ -5,6 +5,7 @@ use ftlm::estimation::instrumental_variables::coupled::Problem;
 use ftlm::estimation::instrumental_variables::{fit, project, Settings};
 use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
+use ftlm::signal::block_pulse::PulseMeans;
 use ftlm::simulate;
 
 use crate::common::{check, dense_solve, deviation, equation, record, relative_distance, with_signal, Random};
@@ -34,7 +35,7 @@ fn measured(m: usize, noise: f64, initial: &[Vec<(f64, f64)>], seed: u64) -> (Re
 fn projected(noisy: &Record, at_rest: bool) -> Record {
     let substitutes =
         (0..3).map(|s| if s < 2 { project(noisy, s, &[2], at_rest).unwrap() } else { noisy.signal(s).to_vec() });
-    noisy.clone().with_clean(substitutes.collect()).unwrap()
+    noisy.clone().with_clean(substitutes.map(PulseMeans::new).collect()).unwrap()
 }
 
 /// One step from `start` by full matrices: the 2m equations E(x) = Y − Φx, filtered by the inverse of the 2m × 2m

@@ -41,7 +41,7 @@ fn simulated(plant: &Value, derived: bool, every: usize) -> Vec<Vec<f64>> {
     let current: Vec<f64> =
         (0..SAMPLES).map(|j| if (j / half).is_multiple_of(2) { amplitude } else { -amplitude }).collect();
     let m = (SAMPLES - 1) * every;
-    let held = pulse_means(&current, m, Intersample::Hold).unwrap();
+    let held = pulse_means(&current, m, Intersample::Hold).unwrap().into_vec();
     let record = record(step / every as f64, vec![vec![0.0; m], vec![0.0; m], held]);
     respond(&stage(plant, derived), &record, &[])
         .unwrap()

@@ -6,6 +6,7 @@ use ftlm::estimation::least_squares;
 use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::series;
+use ftlm::signal::block_pulse::PulseMeans;
 use ftlm::simulate::{
     equation_error, explicit_euler, nyquist_margin, respond, respond_and_units, respond_with_initial, trace_errors,
     unit_responses, OutputFilter,
@@ -460,9 +461,13 @@ fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
     for own in [-9.0, 25.0] {
         let model = [equation(0, [own, -1.0, 0.5, 1.0]), equation(1, [-16.0, -2.0, -0.5, 0.0])];
         for filter in [None, Some(filter.clone())] {
-            let driven =
-                Record::new(0.01, vec![vec![0.3; 500], vec![0.1; 500], vec![1.0; 500]], filter.clone()).unwrap();
-            let still = Record::new(0.01, vec![vec![0.0; 500]; 3], filter).unwrap();
+            let driven = Record::new(
+                0.01,
+                PulseMeans::from_rows(vec![vec![0.3; 500], vec![0.1; 500], vec![1.0; 500]]),
+                filter.clone(),
+            )
+            .unwrap();
+            let still = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 500]; 3]), filter).unwrap();
             let found = unit_responses(&model, &driven, &units).unwrap();
             let (rest, same) = respond_and_units(&model, &driven, &units).unwrap();
             assert_eq!(same, found);
@@ -481,7 +486,7 @@ fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
             }
         }
     }
-    let still = Record::new(0.01, vec![vec![0.0; 50]; 3], None).unwrap();
+    let still = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 50]; 3]), None).unwrap();
     let model = [equation(0, [-9.0, -1.0, 0.5, 1.0])];
     assert!(matches!(unit_responses(&model, &still, &[(1, 0.0)]), Err(Error::Structure { .. })));
     assert!(unit_responses(&model, &still, &[(0, f64::NAN)]).is_err());
@@ -507,7 +512,9 @@ fn singular_powers_drive_filtered_equations_to_second_order() {
         };
         let missed = |m: usize| {
             let step = 1.0 / m as f64;
-            let still = Record::new(step, vec![vec![0.0; m]], Some(lag.series(m, step).unwrap())).unwrap();
+            let still =
+                Record::new(step, PulseMeans::from_rows(vec![vec![0.0; m]]), Some(lag.series(m, step).unwrap()))
+                    .unwrap();
             let found = unit_responses(&plant, &still, &[(0, exponent)]).unwrap();
             let truth = (integral(1.0) - integral(1.0 - step)) / step;
             assert!(truth.abs() > 0.01);

@@ -13,7 +13,7 @@ use ftlm::estimation::output_error::{FreeInput, InputLaw};
 use ftlm::parallel::Stop;
 use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
 use ftlm::regressors::{Record, BANK_LIMIT};
-use ftlm::signal::block_pulse::{point_samples, Intersample};
+use ftlm::signal::block_pulse::{point_samples, Intersample, PulseMeans};
 use ftlm::simulate::respond;
 use ftlm::state_space;
 
@@ -31,7 +31,7 @@ fn plant() -> Recording {
     let terms = vec![term(0, NU), term(0, 0.0), term(1, 0.0)];
     let known = equation::Structure { output: 0, order: ALPHA, terms };
     let truth = equation::Equation::new(known, vec![-3.0, -20.0, 5.0]).unwrap();
-    let rest = Record::new(STEP, vec![vec![0.0; 800], input.clone()], None).unwrap();
+    let rest = Record::new(STEP, PulseMeans::from_rows(vec![vec![0.0; 800], input.clone()]), None).unwrap();
     let mut y = point_samples(&respond(&[truth], &rest, &[]).unwrap()[0]);
     let size = 0.01 * deviation(&y);
     y.iter_mut().for_each(|v| *v += size * random.normal());

@@ -185,7 +185,7 @@ impl Problem<'_> {
                 Some(i) => point.responses[r][i].clone(),
                 None => self.clean[r].signal(s).to_vec(),
             });
-            let simulated = Record::new(record.step(), simulated.collect(), None)?;
+            let simulated = Record::from_rows(record.step(), simulated.collect(), None)?;
             let mut buffers = Buffers::default();
             // Response of every output in sequence, in units of the noise standard deviation of the output.
             let mut through = |i: usize, signal: &[f64]| -> Vec<f64> {

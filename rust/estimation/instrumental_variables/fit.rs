@@ -68,6 +68,7 @@ pub struct Fit {
 /// [`Error::Length`].
 ///
 /// ```
+/// # use ftlm::signal::block_pulse::PulseMeans;
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::{Equation, Initial, Structure, Term};
 /// use ftlm::estimation::instrumental_variables as iv;
@@ -77,9 +78,9 @@ pub struct Fit {
 /// let terms = vec![Term { signal: 0, order: 0.5 }, Term { signal: 1, order: 0.0 }];
 /// let plant = Equation::new(Structure { output: 0, order: 1.5, terms }, vec![-4.0, 2.0])?;
 /// let input: Vec<f64> = (0..400).map(|k| if k % 100 < 50 { 1.0 } else { -1.0 }).collect();
-/// let driven = Record::new(0.02, vec![vec![0.0; 400], input.clone()], None)?;
+/// let driven = Record::new(0.02, PulseMeans::from_rows(vec![vec![0.0; 400], input.clone()]), None)?;
 /// let output = simulate::respond(std::slice::from_ref(&plant), &driven, &[])?.remove(0);
-/// let measured = Record::new(0.02, vec![output, input], None)?;
+/// let measured = Record::new(0.02, PulseMeans::from_rows(vec![output, input]), None)?;
 /// let run = iv::with_projections(measured, &[false, true], true, &Stop::default())?;
 /// let structures = [plant.structure.clone()];
 /// let found = iv::fit(&[run], &structures, &[vec![None, None]], &Initial::Rest, iv::Settings::default())?;
@@ -299,7 +300,7 @@ impl<'a> Problem<'a> {
                     Some(i) => outputs[i].clone(),
                     None => record.signal(s).to_vec(),
                 });
-                Record::new(record.step(), replaced.collect(), None)
+                Record::from_rows(record.step(), replaced.collect(), None)
             })
             .collect::<Result<Vec<_>>>()?;
         let mut out = (Vec::new(), Vec::new());

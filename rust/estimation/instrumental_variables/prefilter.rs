@@ -9,6 +9,7 @@ use crate::linalg::orthogonal::orthonormal_basis;
 use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{self, reciprocal, Buffers, Kernel};
+use crate::signal::block_pulse::PulseMeans;
 
 /// Ratio of the peaks of the second and first half above which a response counts as unstable.
 const INSTABILITY_PEAK_RATIO: f64 = 2.0;
@@ -141,11 +142,7 @@ pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &S
         if known.len() < record.len() { input_response_basis(&record, &known, at_rest, stop)? } else { Vec::new() };
     let clean = (0..record.len()).map(|s| {
         let signal = record.signal(s);
-        if known.contains(&s) {
-            signal.to_vec()
-        } else {
-            project_on_basis(&basis, signal)
-        }
+        PulseMeans::new(if known.contains(&s) { signal.to_vec() } else { project_on_basis(&basis, signal) })
     });
     let clean = clean.collect();
     record.with_clean(clean)

@@ -84,8 +84,11 @@ impl EvaluationCache {
                 Some(known) => known.clone(),
                 None => {
                     let record = &experiments[k].record;
-                    let bare =
-                        Record::new(record.step(), vec![vec![0.0; record.m()]], record.filter().map(<[f64]>::to_vec))?;
+                    let bare = Record::from_rows(
+                        record.step(),
+                        vec![vec![0.0; record.m()]],
+                        record.filter().map(<[f64]>::to_vec),
+                    )?;
                     let filter = record.filter().map(|series| Rc::new(SeriesFilter::new(series)));
                     let (operators, powers) = (HashMap::new(), HashMap::new());
                     let grid =

@@ -236,6 +236,7 @@ fn step_within_bounds(model: &FreeModel, clock: &TimeUnit, point: &Point, deltas
 /// coordinates; a model that does not match the experiments ([`FreeModel::check`]).
 ///
 /// ```
+/// # use ftlm::signal::block_pulse::PulseMeans;
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::{AffineOrder, Initial};
 /// use ftlm::estimation::output_error::*;
@@ -243,7 +244,7 @@ fn step_within_bounds(model: &FreeModel, clock: &TimeUnit, point: &Point, deltas
 /// use ftlm::regressors::Record;
 /// // D^a y = c u with the truth a = 0.8, c = 3.
 /// let input: Vec<f64> = (0..100).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
-/// let run = Record::new(0.05, vec![vec![0.0; 100], input], None)?;
+/// let run = Record::new(0.05, PulseMeans::from_rows(vec![vec![0.0; 100], input]), None)?;
 /// let output: Vec<f64> = run.integral(1, 0.8).iter().map(|v| 3.0 * v).collect();
 /// let experiment = Experiment::new(run, 1, vec![point_samples(&output)], vec![1.0])?;
 /// let model = FreeModel {

@@ -320,9 +320,9 @@ mod tests {
     #[test]
     fn boxes_are_used_where_they_exclude_candidates_and_nowhere_else() -> Result<()> {
         let input: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -0.5 }).collect();
-        let answer = Record::new(0.05, vec![input.clone()], None)?.integral(0, 0.8);
+        let answer = Record::from_rows(0.05, vec![input.clone()], None)?.integral(0, 0.8);
         let size: f64 = answer.iter().map(|y| y.abs()).sum();
-        let record = Record::new(0.05, vec![answer, input], None)?;
+        let record = Record::from_rows(0.05, vec![answer, input], None)?;
         let axis = |signal: usize, from: f64| {
             let values = (0..40).map(|i| from + 0.01 * f64::from(i)).collect();
             TermAxis { signal, values, interchangeable: false }

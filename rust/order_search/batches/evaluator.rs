@@ -39,15 +39,16 @@ use crate::regressors::Record;
 /// [`crate::error::Error::Interrupted`].
 ///
 /// ```
+/// # use ftlm::signal::block_pulse::PulseMeans;
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::order_search::batches::search;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
 /// // y is the integral of order 0.8 of u: D^0.8 y = u.
-/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
 /// let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
 /// let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
 /// let found = search(&[record], &lattice, &[None], &Options::default(), &Control::default())?;
@@ -168,6 +169,7 @@ impl<'a> BatchEvaluator<'a> {
     /// [`crate::error::Error::Interrupted`], or batches, seed or checkpoint of another search.
     ///
     /// ```
+    /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use std::borrow::Cow;
     /// # use ftlm::order_search::control::Control;
     /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
@@ -177,8 +179,8 @@ impl<'a> BatchEvaluator<'a> {
     /// # use ftlm::parallel::pool;
     /// # use ftlm::regressors::Record;
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-    /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
-    /// # let record = Record::new(0.1, vec![output, input], None)?;
+    /// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
+    /// # let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
     /// # let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
     /// # let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
     /// let (options, control, pool) = (Options::default(), Control::default(), pool(1)?);

@@ -270,13 +270,14 @@ pub struct BoxBound {
 /// As [`crate::order_search::batches::search`].
 ///
 /// ```
+/// # use ftlm::signal::block_pulse::PulseMeans;
 /// # use ftlm::order_search::branch_and_bound::box_bounds;
 /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
-/// let record = Record::new(0.1, vec![output, input], None)?;
+/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
 /// let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
 /// let lattice = OrderGrid::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
 /// let boxes = box_bounds(&[record], &lattice, &Options::default(), 0)?;
@@ -391,7 +392,7 @@ mod tests {
             2 => axes = vec![axis(0, vec![0.3]), axis(1, some(0.2, 9)), axis(2, some(0.1, 6))],
             _ => axes.push(axis(2, vec![0.4])),
         }
-        Ok((Record::new(0.03, signals, None)?, OrderGrid::new(0, &[1.7], &axes, |s| s == 2)?))
+        Ok((Record::from_rows(0.03, signals, None)?, OrderGrid::new(0, &[1.7], &axes, |s| s == 2)?))
     }
 
     /// Bilinear function with these corner values at −1 ≤ s, t ≤ 1.

@@ -31,13 +31,14 @@ const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 /// Orders or signals that make no equation, coefficients that are not one a term, other orders of the output.
 ///
 /// ```
+/// # use ftlm::signal::block_pulse::PulseMeans;
 /// # use ftlm::equation::{Equation, Structure, Term};
 /// # use ftlm::order_search::dual_bound::excluded_by_linearized_vector;
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
-/// let record = Record::new(0.1, vec![output, input], None)?;
+/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let structure = Structure { output: 0, order: 0.8, terms };
 /// let equation = |a: f64, b: f64| Equation { structure: structure.clone(), coefficients: vec![a, b] };

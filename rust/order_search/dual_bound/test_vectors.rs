@@ -503,7 +503,7 @@ mod tests {
     fn a_few_at_a_time_are_what_each_is_alone() -> crate::error::Result<()> {
         // Long enough for three batches of sixteen vectors.
         let (m, count) = (VECTOR_SPECTRA_BYTES / 32 / 6, 2 * LANE_COUNT);
-        let record = Record::new(1e-3, vec![(0..m).map(|k| libm::sin(k as f64 * 0.01)).collect()], None)?;
+        let record = Record::from_rows(1e-3, vec![(0..m).map(|k| libm::sin(k as f64 * 0.01)).collect()], None)?;
         let mut index = Index::default();
         let own: Vec<usize> = [0.4, 1.1, 1.9].map(|eta| index.insert(Key::integral(0, eta))).into();
         let bank = Bank::new(&index, &record, 0)?;
@@ -542,7 +542,7 @@ mod tests {
     #[test]
     fn who_was_told_to_stop_makes_no_more_columns_and_holds_no_more_vectors() -> crate::error::Result<()> {
         let m = 64;
-        let record = Record::new(0.1, vec![vec![1.0; m]], None)?;
+        let record = Record::from_rows(0.1, vec![vec![1.0; m]], None)?;
         let mut index = Index::default();
         let own: Vec<usize> = [0.4, 1.1].map(|eta| index.insert(Key::integral(0, eta))).into();
         let (going, told) = (Stop::default(), Stop::default());
@@ -567,7 +567,7 @@ mod tests {
     #[test]
     fn ways_are_no_shorter_than_what_lies_between() -> crate::error::Result<()> {
         let (m, count) = (96, LANE_COUNT);
-        let record = Record::new(0.05, vec![(0..m).map(|k| libm::sin(f64::from(k) * 0.3)).collect()], None)?;
+        let record = Record::from_rows(0.05, vec![(0..m).map(|k| libm::sin(f64::from(k) * 0.3)).collect()], None)?;
         let mut index = Index::default();
         let orders: Vec<f64> = (1..40).map(|i| 0.05 * f64::from(i)).collect();
         let own: Vec<usize> = orders.iter().map(|&eta| index.insert(Key::integral(0, eta))).collect();

@@ -39,12 +39,13 @@ const MAX_RECORD_SAMPLES: usize = 1 << 14;
 /// Orders or signals that make no equation, coefficients that are not one a term.
 ///
 /// ```
+/// # use ftlm::signal::block_pulse::PulseMeans;
 /// # use ftlm::equation::{Equation, Structure, Term};
 /// # use ftlm::order_search::dual_bound::has_unstable_zeros;
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..256).map(|k| if k % 64 < 32 { 1.0 } else { -0.5 }).collect();
-/// let record = Record::new(0.1, vec![vec![0.0; 256], input], None)?;
+/// let record = Record::new(0.1, PulseMeans::from_rows(vec![vec![0.0; 256], input]), None)?;
 /// // D y = c y + u grows as exp(c t) for 25.6 time units, or decays.
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let structure = Structure { output: 0, order: 1.0, terms };

@@ -28,10 +28,14 @@ impl LowPassCache {
         let signals = (0..record.len()).map(|i| record.signal(i));
         let Some(low_pass) = low_pass else {
             // Without a cutoff frequency the record is copied.
-            return Record::new(record.step(), signals.map(<[f64]>::to_vec).collect(), record.filter().map(Into::into));
+            return Record::from_rows(
+                record.step(),
+                signals.map(<[f64]>::to_vec).collect(),
+                record.filter().map(Into::into),
+            );
         };
         let filter = record.filter().map_or_else(|| low_pass.to_vec(), |f| series::multiply(&low_pass, f, m));
-        Record::new(record.step(), signals.map(|s| series::multiply(&low_pass, s, m)).collect(), Some(filter))
+        Record::from_rows(record.step(), signals.map(|s| series::multiply(&low_pass, s, m)).collect(), Some(filter))
     }
 
     /// Series of a second-order low-pass of cutoff frequency `omega` \[rad/s\].

@@ -176,7 +176,7 @@ mod tests {
         let terms = vec![equation::Term { signal: 0, order: 1.0 }, equation::Term { signal: 1, order: 0.0 }];
         let linear = equation::Structure { output: 0, order: 2.0, terms };
         let body = Body::single(equation::Equation::new(linear, vec![-2.0, 3.0])?, FrictionLaw::coulomb(0.5));
-        let record = Record::new(step, vec![vec![0.0; rows - 1], u[..rows - 1].to_vec()], None)?;
+        let record = Record::from_rows(step, vec![vec![0.0; rows - 1], u[..rows - 1].to_vec()], None)?;
         let means = body.run(&record, &[Vec::new()])?.outputs.remove(0);
         let y: Vec<f64> = std::iter::once(0.0).chain(means.windows(2).map(|w| 0.5 * (w[0] + w[1]))).collect();
         let y = [y.as_slice(), &means[rows - 2..]].concat();
