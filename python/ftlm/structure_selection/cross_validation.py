@@ -25,7 +25,7 @@ from ftlm.validation.comparison import compare
 
 #: Number of blocks of a run, and minimum number of samples of a block.
 BLOCKS_PER_RUN = 4
-MIN_BLOCK_SAMPLES = 50
+MIN_BLOCK_SAMPLES = 15
 #: Relative tolerance of simulations on a block.
 SIMULATION_TOLERANCE = 1e-4
 #: Lower limit of the fit [%] in scores; diverging candidates are not distinguished.
