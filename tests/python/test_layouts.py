@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ftlm
-import strangers
+import unknown_files
 from ftlm.io import binary_reader as reader
 from ftlm.io import delimited_text as text
 from ftlm.io import dialect
@@ -372,7 +372,7 @@ def test_bytes_behind_an_array_of_numpy_are_refused(tmp_path):
 
 
 def test_arrays_of_numpy(tmp_path):
-    t, u, y = strangers.record()
+    t, u, y = unknown_files.record()
     np.savez(
         tmp_path / "x.npz",
         t=t,
@@ -388,7 +388,7 @@ def test_arrays_of_numpy(tmp_path):
         lambda: ftlm.load(tmp_path / "x.npz", outputs=["q"]),
     )
     np.save(tmp_path / "a.npy", np.column_stack([t, u, y]))
-    assert ftlm.load(tmp_path / "a.npy", time=0, inputs={"u": 1}, outputs={"y": "c3"}).length == strangers.ROWS
+    assert ftlm.load(tmp_path / "a.npy", time=0, inputs={"u": 1}, outputs={"y": "c3"}).length == unknown_files.ROWS
     table = np.zeros(9, [("time", "f8"), ("y", "f4"), ("word", "U3")])
     table["time"] = np.arange(9)
     np.save(tmp_path / "b.npy", table)
@@ -406,7 +406,7 @@ def test_arrays_of_numpy(tmp_path):
 
 def test_matrices_of_hdf5(tmp_path):
     h5py = pytest.importorskip("h5py")
-    t, u, y = strangers.record()
+    t, u, y = unknown_files.record()
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:
         file["bench/time"], file["bench/V"] = t, np.column_stack([u, y])
@@ -433,7 +433,7 @@ def test_matrices_of_hdf5(tmp_path):
 
 def test_mat_of_version_4_is_read(tmp_path):
     scipy_io = pytest.importorskip("scipy.io")
-    t, u, y = strangers.record()
+    t, u, y = unknown_files.record()
     scipy_io.savemat(tmp_path / "x.mat", {"t": t, "u": u, "y": y, "word": "a"}, format="4")
     np.testing.assert_array_equal(ftlm.load(tmp_path / "x.mat", inputs=["u"], outputs=["y"])["y"], y)
     whole = (tmp_path / "x.mat").read_bytes()

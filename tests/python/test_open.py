@@ -11,7 +11,7 @@ from ftlm.data.units import SIGNAL_UNITS, parse_unit
 from ftlm.io.cell_parsing import split_unit
 from ftlm.io.column_roles import guess_roles, known_unit, signal_names
 from test_files import messages, rows, write
-from test_strangers import command
+from test_unknown_files import command
 
 
 @pytest.mark.parametrize(

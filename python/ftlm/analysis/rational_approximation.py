@@ -20,7 +20,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, as_floats, check_vector, real_number, short_repr, whole_number
+from ftlm.utils.validation import Floats, as_floats, check_vector, frequency_pair, short_repr, whole_number
 
 #: Maximum errors of the approximation without a warning.
 MAX_GAIN_ERROR_DB, MAX_PHASE_ERROR_DEGREES = 1.0, 5.0
@@ -223,12 +223,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     Filters extend two decades beyond the band on both sides, since Oustaloup's phase is poor near its ends. Integer
     orders are exact. Delays have Padé's approximation of order 4. The sensor filter is excluded.
     """
-    try:
-        low, high = (real_number("band", b) for b in band)
-    except (TypeError, ValueError):
-        raise ModelError(
-            f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
-        ) from None
+    low, high = frequency_pair(band)
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval; give 0 < low < high")
     count = whole_number(order)

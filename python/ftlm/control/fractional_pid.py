@@ -23,6 +23,7 @@ from ftlm.utils.validation import (
     Floats,
     as_complex,
     check_vector,
+    frequency_pair,
     nearest,
     real_number,
     short_repr,
@@ -147,12 +148,7 @@ class DiscretePid:
         half = math.pi * value
         if band is None:
             band = (half / 1000.0, half / 8.0)
-        try:
-            low, high = (real_number("band", b) for b in band)
-        except (TypeError, ValueError):
-            raise ModelError(
-                f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
-            ) from None
+        low, high = frequency_pair(band)
         if not (0 < low < high <= half and high <= MAX_BAND_RATIO * low):
             raise ModelError(
                 f"band = ({low:g}, {high:g}) rad/s is no interval up to half the rate, {half:g} rad/s, whose upper end "

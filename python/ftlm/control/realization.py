@@ -23,7 +23,7 @@ from ftlm.utils.validation import (
     as_floats,
     check_vector,
     error_text,
-    real_number,
+    frequency_pair,
     short_repr,
     whole_number,
 )
@@ -185,12 +185,7 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     half = math.pi * rate
     if band is None:
         return half / 5000.0, half / 8.0
-    try:
-        low, high = (real_number("band", b) for b in band)
-    except (TypeError, ValueError):
-        raise ModelError(
-            f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
-        ) from None
+    low, high = frequency_pair(band)
     if not (math.isfinite(low) and 0 < low < high <= half / 2):
         raise ModelError(
             f"band = ({low:g}, {high:g}) rad/s is no interval up to a quarter of the rate, {half / 2:g} rad/s"

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -35,23 +35,20 @@ from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
-if TYPE_CHECKING:
-    pass
-
 DECIBELS_PER_NEPER = 20.0 / np.log(10.0)
 #: Points of a smooth curve over the measured band.
 CURVE_POINTS = 160
 
 
-def curve_frequencies(record: FrequencyData) -> tuple[Floats, Floats]:
-    """Return the frequencies of a smooth curve, and those of a record among them.
+def curve_frequencies(record: FrequencyData) -> Floats:
+    """Return the frequencies of a smooth curve with those of a record among them.
 
     One frequency lies between each two measured ones, so that every measured point is drawn as a separate dot.
     """
     measured = np.unique(record.frequency)
     between = np.sqrt(measured[1:] * measured[:-1])
     smooth = np.geomspace(measured[0], measured[-1], CURVE_POINTS) if measured.size > 1 else measured
-    return np.unique(np.concatenate([measured, between, smooth])), measured
+    return np.unique(np.concatenate([measured, between, smooth]))
 
 
 def model_curve(
@@ -68,61 +65,74 @@ def model_curve(
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
-def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
-    """Return gain and phase charts of a record and the model with its 95 % band."""
-    omega, _ = curve_frequencies(record)
+class ResponseCurve(NamedTuple):
+    """Gain or phase of a model with the half-width of its 95 % band, and the measured points by frequency [rad/s]."""
+
+    kind: str
+    label: str
+    omega: Floats
+    values: Floats
+    half_width: Floats | None
+    measured_omega: Floats
+    measured: Floats
+
+
+def bode_curves(model: Model | Circuit, record: FrequencyData) -> tuple[ResponseCurve, ResponseCurve]:
+    """Return gain and phase of a record and the model."""
+    omega = curve_frequencies(record)
     response, wide, turned = model_curve(model, record, omega)
     phase = np.degrees(np.unwrap(np.angle(response)))
     order = np.argsort(record.frequency, kind="stable")
-    place = np.searchsorted(omega, record.frequency[order])
-    title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
-    shade = "" if wide is None else "Shade: 95 % band, from the covariance of the fit."
-    angles = record.phase[order]
+    at, angles = record.frequency[order], record.phase[order]
     # Whole turns are no difference.
-    angles = angles - 360.0 * np.round(np.median(angles - phase[place]) / 360.0)
+    angles = angles - 360.0 * np.round(np.median(angles - phase[np.searchsorted(omega, at)]) / 360.0)
     size = f"gain [dB of {record.unit}]" if record.unit else "gain [dB]"
+    gain = DECIBELS_PER_NEPER * np.log(np.abs(response))
+    return (
+        ResponseCurve("gain", size, omega, gain, wide, at, record.gain[order]),
+        ResponseCurve("phase", "phase [degrees]", omega, phase, turned, at, angles),
+    )
+
+
+def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
+    """Return gain and phase charts of a record and the model with its 95 % band."""
+    title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
     figures = []
-    for kind, label, ours, theirs, half in (
-        ("gain", size, DECIBELS_PER_NEPER * np.log(np.abs(response)), record.gain[order], wide),
-        ("phase", "phase [degrees]", phase, angles, turned),
-    ):
-        dots = np.full(omega.size, np.nan)
-        dots[place] = theirs
-        bands = [] if half is None else [(ours - half, ours + half)]
+    for curve in bode_curves(model, record):
+        dots, half = np.full(curve.omega.size, np.nan), curve.half_width
+        dots[np.searchsorted(curve.omega, curve.measured_omega)] = curve.measured
         figures.append(
             line_chart(
-                omega,
-                [("model", ours), ("measured", dots)],
+                curve.omega,
+                [("model", curve.values), ("measured", dots)],
                 log_x=True,
-                bands=bands,
-                title=f"{title}: {kind}",
+                bands=[] if half is None else [(curve.values - half, curve.values + half)],
+                title=f"{title}: {curve.kind}",
                 dots=("measured",),
                 width=SMALL_WIDTH_PX,
                 height=220,
                 x_label="frequency [rad/s]",
-                y_label=label,
-                caption=shade,
+                y_label=curve.label,
+                caption="" if half is None else "Shade: 95 % band, from the covariance of the fit.",
             )
         )
     return figures
 
 
-def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
-    """Return the Nyquist chart of a record and the model; impedances with -Im upwards."""
-    omega, _ = curve_frequencies(record)
-    response, _, _ = model_curve(model, record, omega)
-    impedance = record.unit.endswith("Ω")
+def nyquist_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Complex, Complex, str, str]:
+    """Return the responses of the model and a record and both axis labels; impedances have -Im upwards."""
+    response, _, _ = model_curve(model, record, curve_frequencies(record))
     unit = f" [{record.unit}]" if record.unit else ""
-    upward = -1.0 if impedance else 1.0
+    if record.unit.endswith("Ω"):
+        return response.conj(), record.response.conj(), f"Re Z{unit}", f"−Im Z{unit}"
+    return response, record.response, f"real part{unit}", f"imaginary part{unit}"
+
+
+def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
+    """Return the Nyquist chart of a record and the model."""
+    curve, points, x_label, y_label = nyquist_curves(model, record)
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: Nyquist"
-    words = ("Re Z", "−Im Z") if impedance else ("real part", "imaginary part")
-    return locus_chart(
-        response.real + 1j * upward * response.imag,
-        record.response.real + 1j * upward * record.response.imag,
-        title=title,
-        x_label=words[0] + unit,
-        y_label=words[1] + unit,
-    )
+    return locus_chart(curve, points, title=title, x_label=x_label, y_label=y_label)
 
 
 def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -490,8 +490,3 @@ def _compare(found: Mapping[str, _ResponseColumn], response: Complex, notes: lis
             f"column {item.column.name!r} is not the size of real and imaginary part, first at row "
             f"{int(np.argmax(off))}, {int(off.sum())} in all; real and imaginary part were used"
         )
-
-
-def fill_signal_names(data: FrequencyData, output: str, source: str) -> FrequencyData:
-    """Fill in output and input names of frequency data that has none."""
-    return replace(data, output=data.output or output, input=data.input or source)

@@ -16,13 +16,12 @@ from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.frequency_result import (
-    DECIBELS_PER_NEPER,
     FrequencyIdentification,
     FrequencyValidation,
     assign_signals,
-    curve_frequencies,
-    model_curve,
+    nyquist_curves,
 )
+from ftlm.estimation.frequency_result import bode_curves as frequency_curves
 from ftlm.estimation.result import Identification
 from ftlm.experiment_design.result import DesignedInput
 from ftlm.model.model import Model
@@ -36,7 +35,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import as_array, as_floats
+from ftlm.utils.validation import Floats, as_array, as_floats
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
@@ -89,6 +88,25 @@ def escape_math(text: str) -> str:
 def label_of(name: str, units: Mapping[str, str]) -> str:
     """Return a signal's symbol with its unit."""
     return escape_math(with_unit(symbol(name), units, name))
+
+
+def draw_curve(axis: Any, x: Floats, y: Floats, half: Floats | None = None) -> None:
+    """Plot the curve of a model with its band."""
+    axis.plot(x, y, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
+    if half is not None:
+        axis.fill_between(x, y - half, y + half, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0)
+
+
+def draw_measured(axis: Any, x: Floats, y: Floats) -> None:
+    """Plot measured points as circles."""
+    axis.plot(x, y, "o", fillstyle="none", markersize=4, color=LINE_STYLES[0][0], label="measured")
+
+
+def label_axes(axis: Any, title: str, **labels: Any) -> None:
+    """Set title, labels and grid of one of several axes."""
+    axis.set(**labels)
+    axis.set_title(escape_math(title), fontsize="small")
+    axis.grid(visible=True, alpha=0.3)
 
 
 #: Height of a residual plot relative to the fit plot above it.
@@ -359,23 +377,16 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     DataError
         Frequencies that are not finite numbers from 0.
     """
-    found = model.model if isinstance(model, Identification) else model
-    if not isinstance(found, Model):
-        raise ModelError(f"model is {type(found).__name__}; give a model or an identification")
+    found = _model_of(model)
     omega = response_frequencies(found) if w is None else as_floats("w", w)
     curves = bode_curves(found, omega)
     figure, axes = axes_for(ax, max(len(curves), 1), 2)
     for i, curve in enumerate(curves):
         sides = ((curve.gain, curve.gain_spread, "gain [dB]"), (curve.phase, curve.phase_spread, "phase [degrees]"))
+        title = f"{symbol(curve.output)} from {symbol(curve.input)}"
         for axis, (values, spread, label) in zip(axes[i], sides, strict=True):
-            axis.semilogx(omega, values, color=LINE_STYLES[1][0], linewidth=1.2)
-            if spread is not None:
-                axis.fill_between(
-                    omega, values - spread, values + spread, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0
-                )
-            axis.set(ylabel=label, xlabel="frequency [rad/s]")
-            axis.grid(visible=True, alpha=0.3)
-            axis.set_title(escape_math(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
+            draw_curve(axis, omega, values, spread)
+            label_axes(axis, title, xscale="log", xlabel="frequency [rad/s]", ylabel=label)
     return figure
 
 
@@ -466,16 +477,10 @@ def _response_figure(found: TimeResponse, ax: Any) -> Any:
     figure, axes = axes_for(ax, len(found.outputs), max(len(found.inputs), 1))
     for i, output in enumerate(found.outputs):
         for j, signal in enumerate(found.inputs):
-            axis, values = axes[i, j], found.values[i, j]
-            axis.plot(found.time, values, color=LINE_STYLES[1][0], linewidth=1.2)
-            if found.deviation is not None:
-                half = NORMAL_95 * found.deviation[i, j]
-                axis.fill_between(
-                    found.time, values - half, values + half, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0
-                )
-            axis.set(xlabel="time [s]", ylabel=label_of(output, found.units))
-            axis.set_title(escape_math(f"{found.kind} of {symbol(signal)}"), fontsize="small")
-            axis.grid(visible=True, alpha=0.3)
+            half = None if found.deviation is None else NORMAL_95 * found.deviation[i, j]
+            draw_curve(axes[i, j], found.time, found.values[i, j], half)
+            title = f"{found.kind} of {symbol(signal)}"
+            label_axes(axes[i, j], title, xlabel="time [s]", ylabel=label_of(output, found.units))
     return figure
 
 
@@ -717,36 +722,13 @@ def response(
     """
     model, records = _model_and_data(result, data)
     figure, axes = axes_for(ax, len(records), 2)
-    for (left, right), record in zip(axes, records, strict=True):
-        omega, _ = curve_frequencies(record)
-        ours, wide, turned = model_curve(model, record, omega)
-        phase = np.degrees(np.unwrap(np.angle(ours)))
-        order = np.argsort(record.frequency, kind="stable")
-        near = phase[np.searchsorted(omega, record.frequency[order])]
-        angles = record.phase[order]
-        angles = angles - 360.0 * np.round(np.median(angles - near) / 360.0)
-        gain = DECIBELS_PER_NEPER * np.log(np.abs(ours))
-        unit = f" of {record.unit}" if record.unit else ""
-        for axis, curve, dots, half, label in (
-            (left, gain, record.gain[order], wide, f"gain [dB{unit}]"),
-            (right, phase, angles, turned, "phase [degrees]"),
-        ):
-            axis.semilogx(
-                record.frequency[order],
-                dots,
-                "o",
-                fillstyle="none",
-                markersize=4,
-                color=LINE_STYLES[0][0],
-                label="measured",
-            )
-            axis.semilogx(omega, curve, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
-            if half is not None:
-                axis.fill_between(omega, curve - half, curve + half, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0)
-            axis.set(xlabel="frequency [rad/s]", ylabel=label)
-            axis.set_title(escape_math(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
-            axis.grid(visible=True, alpha=0.3)
-        left.legend(fontsize="small")
+    for row, record in zip(axes, records, strict=True):
+        for axis, curve in zip(row, frequency_curves(model, record), strict=True):
+            draw_measured(axis, curve.measured_omega, curve.measured)
+            draw_curve(axis, curve.omega, curve.values, curve.half_width)
+            title = f"{symbol(record.output)} from {symbol(record.input)}"
+            label_axes(axis, title, xscale="log", xlabel="frequency [rad/s]", ylabel=curve.label)
+        row[0].legend(fontsize="small")
     return figure
 
 
@@ -776,25 +758,11 @@ def nyquist(
     model, records = _model_and_data(result, data)
     figure, axes = axes_for(ax, len(records), row=3.4)
     for axis, record in zip(axes[:, 0], records, strict=True):
-        curve, _, _ = model_curve(model, record, curve_frequencies(record)[0])
-        impedance = record.unit.endswith("Ω")
-        upward = -1.0 if impedance else 1.0
-        axis.plot(
-            record.response.real,
-            upward * record.response.imag,
-            "o",
-            fillstyle="none",
-            markersize=4,
-            color=LINE_STYLES[0][0],
-            label="measured",
-        )
-        axis.plot(curve.real, upward * curve.imag, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
-        unit = f" [{record.unit}]" if record.unit else ""
-        words = ("Re Z", "−Im Z") if impedance else ("real part", "imaginary part")
-        axis.set(xlabel=words[0] + unit, ylabel=words[1] + unit)
+        curve, points, x_label, y_label = nyquist_curves(model, record)
+        draw_measured(axis, points.real, points.imag)
+        draw_curve(axis, curve.real, curve.imag)
         axis.set_aspect("equal", adjustable="datalim")
-        axis.set_title(escape_math(f"{symbol(record.output)} from {symbol(record.input)}"), fontsize="small")
-        axis.grid(visible=True, alpha=0.3)
+        label_axes(axis, f"{symbol(record.output)} from {symbol(record.input)}", xlabel=x_label, ylabel=y_label)
         axis.legend(fontsize="small")
     return figure
 

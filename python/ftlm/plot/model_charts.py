@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs, transfer_functions
 from ftlm.analysis.poles import modes
 from ftlm.analysis.time_response import Response, response
+from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import COULOMB_PREFIX
 from ftlm.svg.complex_plane import plane_chart
@@ -21,9 +22,6 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats, as_floats
-
-#: Decibels per unit of the natural logarithm of a gain.
-DECIBELS_PER_NEPER = 20.0 / math.log(10.0)
 
 
 def response_frequencies(model: Model, step: float | None = None, duration: float | None = None) -> Floats:

@@ -10,8 +10,19 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
-from ftlm.svg.figure import MIN_DIFFERENCE, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
-from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.svg.figure import (
+    MIN_DIFFERENCE,
+    NARROW_WIDTH_PX,
+    SMALL_WIDTH_PX,
+    TEXT_GROUP,
+    Figure,
+    PlotArea,
+    svg,
+    svg_text,
+    text_width,
+    ticks,
+)
+from ftlm.svg.line_chart import LINE_STYLES, stroke_path
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, truncate_text
 from ftlm.utils.validation import Floats, as_floats
@@ -75,55 +86,24 @@ def _normal(x: Floats, mean: float, deviation: float) -> Floats:
 
 
 def _histogram(
-    edges: Floats,
-    counts: Floats,
-    at: Floats,
-    curve: Floats,
-    words: tuple[str, str, str],
-    *,
-    narrow: bool,
+    edges: Floats, counts: Floats, at: Floats, curve: Floats, words: tuple[str, str, str], *, narrow: bool
 ) -> Markup:
     title, described, x_label = words
     width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
     highest = 1.05 * max(float(counts.max()), float(curve.max()))
-    low, high = float(edges[0]), float(edges[-1])
-    upward, across = ticks(0.0, highest, 4), ticks(low, high, 4 if narrow else 6)
-    left, top, h = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0, HISTOGRAM_HEIGHT_PX - 66
-    w = width - left - 14.0
-
-    def place(x: float, y: float) -> tuple[float, float]:
-        return left + w * (x - low) / (high - low), top + h * (1 - y / highest)
-
-    out = [Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">')]
-    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, place(low, v)[1], w) for v in upward.values]
-    out.append(Markup("</g>"))
+    upward, across = ticks(0.0, highest, 4), ticks(float(edges[0]), float(edges[-1]), 4 if narrow else 6)
+    left = max(30.0, 10 + max(map(text_width, upward.labels)))
+    frame = float(edges[0]), float(edges[-1]), 0.0, highest
+    plot = PlotArea(left, 26.0, width - left - 14.0, HISTOGRAM_HEIGHT_PX - 66, frame)
+    out = plot.grid(across, upward)
     bar = Markup(
         '<rect class="shade2" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}" fill-opacity=".55"/>'
     )
-    for a, b, count in zip(edges[:-1], edges[1:], counts.tolist(), strict=True):
-        (x, y), (right, bottom) = place(float(a), count), place(float(b), 0.0)
-        out.append(bar.format(x, y, max(right - x - 0.8, 0.4), bottom - y, LINE_STYLES[2][0]))
-    path = "M" + "L".join("{:.1f} {:.1f}".format(*place(float(x), float(y))) for x, y in zip(at, curve, strict=True))
-    out.append(
-        Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.6" d="{}"/>').format(
-            LINE_STYLES[1][0], path
-        )
-    )
-    out.append(
-        Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}h{:.1f}"/>').format(
-            left, top + h, w
-        )
-    )
-    out.append(Markup('<g font-size="12" fill="currentColor">'))
-    out += [
-        svg_text(left - 6, place(low, v)[1] + 4, t, "end") for v, t in zip(upward.values, upward.labels, strict=True)
-    ]
-    out += [
-        svg_text(place(v, 0)[0], top + h + 16, t, "middle") for v, t in zip(across.values, across.labels, strict=True)
-    ]
-    factor = f" ({across.factor})" if across.factor else ""
-    out += [svg_text(4, top - 12, "samples", "start"), svg_text(left + w, top + h + 34, x_label + factor, "end")]
-    out.append(Markup("</g>"))
+    places, tops = plot.across(edges).tolist(), plot.down(counts).tolist()
+    for x, right, y in zip(places[:-1], places[1:], tops, strict=True):
+        out.append(bar.format(x, y, max(right - x - 0.8, 0.4), plot.top + plot.height - y, LINE_STYLES[2][0]))
+    out += [stroke_path(1, zip(plot.across(at), plot.down(curve), strict=True)), TEXT_GROUP]
+    out += [*plot.labels((across, upward), (x_label, "samples"), width), Markup("</g>")]
     return svg(width, round(HISTOGRAM_HEIGHT_PX), title, described, out, narrow=narrow)
 
 
@@ -223,7 +203,7 @@ def _bars(
             text = number(v, 4) if math.isfinite(v) else "–"
             texts.append(svg_text(left + length + 5, y + BAR_HEIGHT_PX - 5, text, "start"))
     axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}"/>')
-    out += [axis.format(left, top, h), Markup('<g font-size="12" fill="currentColor">'), *texts]
+    out += [axis.format(left, top, h), TEXT_GROUP, *texts]
     place = left
     for k, (name, _) in enumerate(tables if len(tables) > 1 else ()):
         out.append(

@@ -10,8 +10,19 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
-from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width, ticks
-from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.svg.figure import (
+    NARROW_WIDTH_PX,
+    SMALL_WIDTH_PX,
+    TEXT_GROUP,
+    Figure,
+    PlotArea,
+    Ticks,
+    svg,
+    svg_text,
+    text_width,
+    ticks,
+)
+from ftlm.svg.line_chart import LINE_STYLES, path_data, stroke_path
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number
 from ftlm.utils.validation import Complex, as_complex
@@ -58,7 +69,7 @@ def plane_chart(
         raise DataError(f"sector = {sector!r} is no angle between 0 and pi")
     inside = int(np.sum(np.abs(np.angle(values)) < sector))
     far = float(np.max(np.abs(values), initial=0.0)) or 1.0
-    listed = ", ".join(f"{number(v.real, 3)} {'−' if v.imag < 0 else '+'} {number(abs(v.imag), 3)}j" for v in values)
+    listed = ", ".join(map(_complex_text, values.tolist()))
     described = f"{values.size} points in the plane: {listed or 'none'}. {inside} in the shaded sector."
     wide, small = (
         _draw_plane(values, far, sector, (title, described, x_label, y_label), narrow=narrow)
@@ -70,55 +81,54 @@ def plane_chart(
 def _draw_plane(
     values: Complex, far: float, sector: float, words: tuple[str, str, str, str], *, narrow: bool
 ) -> Markup:
-    title, described, x_label, y_label = words
-    width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
-    upward = ticks(-far * PLANE_MARGIN_FACTOR, far * PLANE_MARGIN_FACTOR, 5)
-    left, top = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0
+    width, reach = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX, far * PLANE_MARGIN_FACTOR
+    upward = ticks(-reach, reach, 5)
+    left = max(30.0, 10 + max(map(text_width, upward.labels)))
     w, h = width - left - 14.0, PLANE_HEIGHT_PX
     # As many pixels a unit in both directions: far fits in the shorter one.
-    scale = min(w, h) / (2 * far * PLANE_MARGIN_FACTOR)
-    x0, y0 = left + w / 2, top + h / 2
-    across = ticks(-w / 2 / scale, w / 2 / scale, 4 if narrow else 8)
-    out = [Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">')]
-    out += [Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(x0 + v * scale, top, h) for v in across.values]
-    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, y0 - v * scale, w) for v in upward.values]
-    out.append(Markup("</g>"))
-    inner = Markup('<svg x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" viewBox="{:.1f} {:.1f} {:.1f} {:.1f}">')
-    out.append(inner.format(left, top, w, h, -w / 2, -h / 2, w, h))
-    reach = 2 * (w + h)
-    x, y = reach * math.cos(sector), reach * math.sin(sector)
+    half_x, half_y = reach * max(w / h, 1.0), reach * max(h / w, 1.0)
+    plot = PlotArea(left, 26.0, w, h, (-half_x, half_x, -half_y, half_y))
     # Beyond a right angle the sector also covers what lies above and below its arms' ends.
-    arms = [(x, -y), (reach, -reach), (reach, reach), (x, y)]
-    path = "M0 0" + "".join(f"L{a:.1f} {b:.1f}" for a, b in arms) + "Z"
-    out.append(Markup('<path class="shade1" fill="{}" fill-opacity="0.16" d="{}"/>').format(LINE_STYLES[1][0], path))
-    edge = Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.2" stroke-dasharray="5 3" d="{}"/>')
-    out.append(edge.format(LINE_STYLES[1][0], f"M{x:.1f} {-y:.1f}L0 0L{x:.1f} {y:.1f}"))
-    axes = Markup(
-        '<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} 0h{:.1f}M0 {:.1f}v{:.1f}"/>'
-    )
-    out.append(axes.format(-w / 2, w, -h / 2, h))
-    for value in values.tolist():
-        a, b = value.real * scale, -value.imag * scale
-        c = CROSS_HALF_SIZE_PX
-        cross = f"M{a - c:.1f} {b - c:.1f}l{2 * c} {2 * c}m0 {-2 * c}l{-2 * c} {2 * c}"
-        out.append(
-            Markup('<path class="line2" fill="none" stroke="{}" stroke-width="2.2" d="{}"/>').format(
-                LINE_STYLES[2][0], cross
-            )
-        )
-    out.append(Markup('</svg><g font-size="12" fill="currentColor">'))
-    for v, label in zip(upward.values, upward.labels, strict=True):
-        out.append(svg_text(left - 6, y0 - v * scale + 4, label, "end"))
-    for v, label in zip(across.values, across.labels, strict=True):
-        # A label at the edge would be cut off.
-        place = min(
-            max(x0 + v * scale, left + LETTER_WIDTH_PX * len(label) / 2), width - LETTER_WIDTH_PX * len(label) / 2 - 2
-        )
-        out.append(svg_text(place, top + h + 16, label, "middle"))
-    factor = f" ({upward.factor})" if upward.factor else ""
-    out += [svg_text(4, top - 12, y_label + factor, "start"), svg_text(left + w, top + h + 34, x_label + factor, "end")]
-    out.append(Markup("</g>"))
-    return svg(width, round(top + h + 44), title, described, out, narrow=narrow)
+    edge = 4 * (half_x + half_y)
+    arm = edge * complex(math.cos(sector), math.sin(sector))
+    outline = [0, arm.conjugate(), edge * (1 - 1j), edge * (1 + 1j), arm]
+    shade = Markup('<path class="shade1" fill="{}" fill-opacity="0.16" d="{}"/>')
+    curves = [shade.format(LINE_STYLES[1][0], path_data(_places(plot, outline)) + "Z")]
+    curves.append(stroke_path(1, _places(plot, [arm.conjugate(), 0, arm]), 1.2, dashes="5 3"))
+    c = CROSS_HALF_SIZE_PX
+    cross = Markup('<path class="line2" fill="none" stroke="{}" stroke-width="2.2" d="M{:.1f} {:.1f}{}"/>')
+    strokes = f"l{2 * c} {2 * c}m0 {-2 * c}l{-2 * c} {2 * c}"
+    curves += [cross.format(LINE_STYLES[2][0], x - c, y - c, strokes) for x, y in _places(plot, values)]
+    return _draw_axes(plot, (ticks(-half_x, half_x, 4 if narrow else 8), upward), words, width, curves, narrow=narrow)
+
+
+def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
+    """Points of complex values [px]; far outside of the plot it no longer matters where."""
+    found = np.asarray(values, dtype=np.complex128)
+    xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.across(found.real), plot.down(found.imag)))
+    return list(zip(xs, ys, strict=True))
+
+
+def _draw_axes(
+    plot: PlotArea,
+    axes: tuple[Ticks, Ticks],
+    words: tuple[str, str, str, str],
+    width: int,
+    curves: list[Markup],
+    legend: Sequence[Markup] = (),
+    *,
+    narrow: bool,
+) -> Markup:
+    """Drawing of a complex plane: grid, the axes through zero, and clipped curves."""
+    title, described, x_label, y_label = words
+    inner = Markup('<svg x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" viewBox="{:.1f} {:.1f} {:.1f} {:.1f}">')
+    box = plot.left, plot.top, plot.width, plot.height
+    x, y = _places(plot, [0])[0]
+    zero = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="{}"/>')
+    through = zero.format(f"M{plot.left:.1f} {y:.1f}h{plot.width:.1f}M{x:.1f} {plot.top:.1f}v{plot.height:.1f}")
+    out = [*plot.grid(*axes), inner.format(*box, *box), through, *curves, Markup("</svg>"), TEXT_GROUP]
+    out += [*plot.labels(axes, (x_label, y_label), width), *legend, Markup("</g>")]
+    return svg(width, round(plot.top + plot.height + 44), title, described, out, narrow=narrow)
 
 
 #: Height of the plot and radius of a dot [px].
@@ -167,7 +177,6 @@ def _complex_text(value: complex) -> str:
 
 
 def _draw_locus(line: Complex, dots: Complex, words: tuple[str, str, str, str], *, narrow: bool) -> Markup:
-    title, described, x_label, y_label = words
     width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
     # Dots decide the frame; a curve that strays from them leaves it.
     low, high = complex(dots.real.min(), dots.imag.min()), complex(dots.real.max(), dots.imag.max())
@@ -182,51 +191,14 @@ def _draw_locus(line: Complex, dots: Complex, words: tuple[str, str, str, str], 
     x0, y0 = (low.real + high.real) / 2 - w / scale / 2, (low.imag + high.imag) / 2 - h / scale / 2
     upward, across = ticks(y0, y0 + h / scale, max(2, round(h / 48))), ticks(x0, x0 + w / scale, 4 if narrow else 8)
 
-    def right(v: float) -> float:
-        return left + (v - x0) * scale
-
-    def down(v: float) -> float:
-        return top + h - (v - y0) * scale
-
-    out = [Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">')]
-    out += [Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(right(v), top, h) for v in across.values]
-    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, down(v), w) for v in upward.values]
-    out.append(Markup("</g>"))
-    inner = Markup('<svg x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" viewBox="{:.1f} {:.1f} {:.1f} {:.1f}">')
-    out.append(inner.format(left, top, w, h, left, top, w, h))
-    zeros = [f"M{left:.1f} {down(0):.1f}h{w:.1f}"] if y0 < 0 < y0 + h / scale else []
-    zeros += [f"M{right(0):.1f} {top:.1f}v{h:.1f}"] if x0 < 0 < x0 + w / scale else []
-    if zeros:
-        axes = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="{}"/>')
-        out.append(axes.format("".join(zeros)))
-    # Far outside of the frame it no longer matters where, and the bound keeps numbers short.
-    places = [(float(np.clip(right(v.real), -1e4, 1e4)), float(np.clip(down(v.imag), -1e4, 1e4))) for v in line]
-    if places:
-        path = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
-        curve = Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.5" d="{}"/>')
-        out.append(curve.format(LINE_STYLES[1][0], path))
+    plot = PlotArea(left, top, w, h, (x0, x0 + w / scale, y0, y0 + h / scale))
+    curves = [stroke_path(1, _places(plot, line))] if line.size else []
     dot = Markup('<circle class="line0" fill="none" stroke="{}" stroke-width="1.6" cx="{:.1f}" cy="{:.1f}" r="{}"/>')
-    out += [dot.format(LINE_STYLES[0][0], right(v.real), down(v.imag), DOT_RADIUS_PX) for v in dots.tolist()]
-    out.append(Markup('</svg><g font-size="12" fill="currentColor">'))
-    for v, label in zip(upward.values, upward.labels, strict=True):
-        out.append(svg_text(left - 6, down(v) + 4, label, "end"))
-    for v, label in zip(across.values, across.labels, strict=True):
-        place = min(
-            max(right(v), left + LETTER_WIDTH_PX * len(label) / 2), width - LETTER_WIDTH_PX * len(label) / 2 - 2
-        )
-        out.append(svg_text(place, top + h + 16, label, "middle"))
-    ratios = [f" ({axis.factor})" if axis.factor else "" for axis in (upward, across)]
-    out += [
-        svg_text(4, top - 10, y_label + ratios[0], "start"),
-        svg_text(left + w, top + h + 34, x_label + ratios[1], "end"),
+    curves += [dot.format(LINE_STYLES[0][0], x, y, DOT_RADIUS_PX) for x, y in _places(plot, dots)]
+    legend = [
+        stroke_path(1, [(left, 12.0), (left + 20, 12.0)]),
+        svg_text(left + 26, 16, "model", "start"),
+        dot.format(LINE_STYLES[0][0], left + 90, 12, DOT_RADIUS_PX),
+        svg_text(left + 100, 16, "measured", "start"),
     ]
-    out.append(
-        Markup('<path class="line1" fill="none" stroke="{}" stroke-width="1.5" d="M{:.1f} 12h20"/>').format(
-            LINE_STYLES[1][0], left
-        )
-    )
-    out.append(svg_text(left + 26, 16, "model", "start"))
-    out.append(dot.format(LINE_STYLES[0][0], left + 90, 12, DOT_RADIUS_PX))
-    out.append(svg_text(left + 100, 16, "measured", "start"))
-    out.append(Markup("</g>"))
-    return svg(width, round(top + h + 44), title, described, out, narrow=narrow)
+    return _draw_axes(plot, (across, upward), words, width, curves, legend, narrow=narrow)

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
-from ftlm.utils.formatting import SUPERSCRIPT_DIGITS
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, truncate_text
 from ftlm.utils.validation import Floats, as_floats
 
 #: Width of the drawing for narrow screens; its text is as large as in the wide one.
@@ -115,6 +115,75 @@ class Ticks:
     labels: list[str]
     factor: str = ""
     power: int = 0
+
+
+#: Start of the text of a drawing.
+TEXT_GROUP = Markup('<g font-size="12" fill="currentColor">')  # our constant
+#: Coordinates of curves are integer tenths of a pixel.
+TENTHS_PER_PIXEL = 10
+
+
+@dataclass(frozen=True)
+class PlotArea:
+    """Plot area in the drawing [px] and its axis limits: left, right, bottom, top."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    frame: tuple[float, float, float, float]
+
+    def across(self, x: Floats | float) -> Floats:
+        """Return horizontal places [px]."""
+        low, high, _, _ = self.frame
+        return np.asarray(self.left + self.width * (np.asarray(x) - low) / (high - low))
+
+    def down(self, y: Floats | float) -> Floats:
+        """Return vertical places [px]."""
+        _, _, low, high = self.frame
+        return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
+
+    def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
+        """Coordinates in integer tenths of a pixel, clipped near the plot to keep them short."""
+        down = np.clip(self.down(y) - self.top, -self.height, 2 * self.height)
+        xs, ys = (
+            np.rint(places * TENTHS_PER_PIXEL).astype(np.int64).tolist()
+            for places in (self.across(x) - self.left, down)
+        )
+        return xs, ys
+
+    def grid(self, across: Ticks, upward: Ticks) -> list[Markup]:
+        """Grid lines, left and lower axis."""
+        along, up = Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>'), Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>')
+        axes = Markup(
+            '</g><path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>'
+        )
+        return [
+            Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
+            *(along.format(self.left, float(self.down(v)), self.width) for v in upward.values),
+            *(up.format(float(self.across(v)), self.top, self.height) for v in across.values),
+            axes.format(self.left, self.top, self.height, self.width),
+        ]
+
+    def labels(self, axes: tuple[Ticks, Ticks], names: tuple[str, str], width: int) -> list[Markup]:
+        """Tick labels and names of the horizontal and the vertical axis, in a drawing of this width."""
+        across, upward = axes
+        bottom = self.top + self.height
+        out = [Markup('<g class="ticks">')]
+        for v, label in zip(upward.values, upward.labels, strict=True):
+            out.append(svg_text(self.left - 6, float(self.down(v)) + 4, label, "end"))
+        for v, label in zip(across.values, across.labels, strict=True):
+            out.append(svg_text(float(self.across(v)), bottom + 16, label, "middle"))
+        out.append(Markup("</g>"))
+        x_text, y_text = (
+            truncate_text(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER_WIDTH_PX))
+            for label, axis in zip(names, axes, strict=True)
+        )
+        return [
+            *out,
+            svg_text(4, self.top - 12, y_text, "start"),
+            svg_text(self.left + self.width, bottom + 34, x_text, "end"),
+        ]
 
 
 def ticks(low: float, high: float, most: int = 6) -> Ticks:

@@ -12,7 +12,16 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.errors import DataError
-from ftlm.svg.figure import LETTER_WIDTH_PX, NARROW_WIDTH_PX, SMALL_WIDTH_PX, Figure, svg, svg_text, text_width
+from ftlm.svg.figure import (
+    LETTER_WIDTH_PX,
+    NARROW_WIDTH_PX,
+    SMALL_WIDTH_PX,
+    TEXT_GROUP,
+    Figure,
+    svg,
+    svg_text,
+    text_width,
+)
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol, truncate_text
 from ftlm.utils.validation import Floats, as_floats
@@ -128,7 +137,7 @@ def _heat_drawing(
     centre = left + (best[1] + 0.5) * cell_w, bottom - (best[0] + 0.5) * cell_h
     ring = Markup('<circle cx="{:.1f}" cy="{:.1f}" r="7" fill="none" stroke="{}" stroke-width="{}"/>')
     out += [ring.format(*centre, colour, thickness) for colour, thickness in (("#fff", 4), ("#d1480a", 2))]
-    out.append(Markup('<g font-size="12" fill="currentColor">'))
+    out.append(TEXT_GROUP)
     fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER_WIDTH_PX * longest + 14))))
     out += [
         svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in _label_indices(columns, fit)
@@ -220,7 +229,7 @@ def _draw_matrix(names: Sequence[str], matrix: Floats, title: str, described: st
                         '<text x="{:.1f}" y="{:.1f}" text-anchor="middle" fill="{}" font-size="11">{}</text>'
                     ).format(x + cell / 2 - 0.5, y + cell / 2 + 4, ink, text)
                 )
-    out.append(Markup('<g font-size="12" fill="currentColor">'))
+    out.append(TEXT_GROUP)
     for k, label in enumerate(labels):
         out.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
         x = left + (k + 0.5) * cell

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +13,14 @@ from numpy.typing import ArrayLike
 
 from ftlm.errors import DataError
 from ftlm.svg.figure import (
-    LETTER_WIDTH_PX,
     LINE_HEIGHT_PX,
     MAX_LINE_POINTS,
     MAX_STRAY_HEIGHTS,
     NARROW_WIDTH_PX,
+    TENTHS_PER_PIXEL,
+    TEXT_GROUP,
     Figure,
+    PlotArea,
     Ticks,
     decimate,
     limits,
@@ -106,8 +108,6 @@ def _scaled_integers(values: Floats) -> list[object]:
 
 #: Values beyond this are gaps, because their differences overflow.
 MAX_DRAWN_VALUE = 1e300
-#: Coordinates inside the plot are integer tenths of a pixel.
-TENTHS_PER_PIXEL = 10
 #: Diameter of a dot [px].
 DOT_DIAMETER_PX = 4.6
 #: Longest label beside a line [characters]; the legend of the narrow chart allows twice as many.
@@ -124,34 +124,6 @@ LINE_STYLES = (
 )
 #: Name prefixes of lines in the neutral style.
 NEUTRAL_PREFIXES = ("measured", "simulated arm")
-
-
-@dataclass(frozen=True)
-class _Plot:
-    """Plot area in the drawing [px] and its axis limits."""
-
-    left: float
-    top: float
-    width: float
-    height: float
-    frame: tuple[float, float, float, float]
-
-    def across(self, x: Floats | float) -> Floats:
-        low, high, _, _ = self.frame
-        return np.asarray(self.left + self.width * (np.asarray(x) - low) / (high - low))
-
-    def down(self, y: Floats | float) -> Floats:
-        _, _, low, high = self.frame
-        return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
-
-    def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
-        """Coordinates in integer tenths of a pixel, clipped near the plot to keep them short."""
-        down = np.clip(self.down(y) - self.top, -self.height, 2 * self.height)
-        xs, ys = (
-            np.rint(places * TENTHS_PER_PIXEL).astype(np.int64).tolist()
-            for places in (self.across(x) - self.left, down)
-        )
-        return xs, ys
 
 
 @dataclass(frozen=True)
@@ -370,9 +342,12 @@ def _draw_chart(chart: _Chart, width: int, height: int, points: int, *, narrow: 
     top = 26.0 + (LINE_HEIGHT_PX * (legend[-1][2] + 1) + 5 if legend else 0)
     if narrow:
         height += int(top - 26)
-    plot = _Plot(left, top, width - left - right, height - top - 40.0, chart.frame)
-    parts = [*_grid(plot, across, upward), *_curves(chart, plot, points)]
-    parts += [Markup('<g font-size="12" fill="currentColor">'), *_labels(chart, plot, across, upward, width)]
+    plot = PlotArea(left, top, width - left - right, height - top - 40.0, chart.frame)
+    parts = [*plot.grid(across, upward), *_curves(chart, plot, points), TEXT_GROUP]
+    parts += plot.labels((across, upward), (chart.x_label, chart.y_label), width)
+    if not any(np.isfinite(line.y).any() for line in chart.lines):
+        middle = plot.left + plot.width / 2, plot.top + plot.height / 2
+        parts.append(svg_text(*middle, "no finite value to draw", "middle"))
     if named:
         parts += _legend_marks(legend) if narrow else _end_labels(named, plot)
     parts.append(Markup("</g>"))
@@ -382,22 +357,7 @@ def _draw_chart(chart: _Chart, width: int, height: int, points: int, *, narrow: 
     return svg(width, height, chart.title, chart.described, parts, narrow=narrow, attributes=told)
 
 
-def _grid(plot: _Plot, across: Ticks, upward: Ticks) -> list[Markup]:
-    """Grid lines and both axes."""
-    left, top, w, h = plot.left, plot.top, plot.width, plot.height
-    along, up = Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>'), Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>')
-    axes = Markup(
-        '</g><path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>'
-    )
-    return [
-        Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
-        *(along.format(left, float(plot.down(v)), w) for v in upward.values),
-        *(up.format(float(plot.across(v)), top, h) for v in across.values),
-        axes.format(left, top, h, w),
-    ]
-
-
-def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
+def _curves(chart: _Chart, plot: PlotArea, points: int) -> list[Markup]:
     """Bands and lines in a nested drawing, which clips them and has integer coordinates."""
     out = [
         Markup(
@@ -423,26 +383,7 @@ def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
     return [*out, Markup("</svg>")]
 
 
-def _labels(chart: _Chart, plot: _Plot, across: Ticks, upward: Ticks, width: int) -> list[Markup]:
-    """Tick labels and names of both axes."""
-    left, bottom, w = plot.left, plot.top + plot.height, plot.width
-    out = [Markup('<g class="ticks">')]
-    for v, label in zip(upward.values, upward.labels, strict=True):
-        out.append(svg_text(left - 6, float(plot.down(v)) + 4, label, "end"))
-    for v, label in zip(across.values, across.labels, strict=True):
-        out.append(svg_text(float(plot.across(v)), bottom + 16, label, "middle"))
-    out.append(Markup("</g>"))
-    y_text, x_text = (
-        truncate_text(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER_WIDTH_PX))
-        for label, axis in ((chart.y_label, upward), (chart.x_label, across))
-    )
-    out += [svg_text(4, plot.top - 12, y_text, "start"), svg_text(left + w, bottom + 34, x_text, "end")]
-    if not any(np.isfinite(line.y).any() for line in chart.lines):
-        out.append(svg_text(left + w / 2, plot.top + plot.height / 2, "no finite value to draw", "middle"))
-    return out
-
-
-def _zoomable(plot: _Plot, across: Ticks, upward: Ticks) -> Markup:
+def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> Markup:
     """Attributes for the zoom script: axis limits, plot area, powers of ten of the labels."""
     frame = " ".join(repr(float(v)) for v in plot.frame)
     place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
@@ -451,7 +392,7 @@ def _zoomable(plot: _Plot, across: Ticks, upward: Ticks) -> Markup:
     )
 
 
-def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
+def _outline(shade: _Shade, plot: PlotArea, points: int) -> str:
     """Polygon of a band where both edges are finite."""
     good = np.flatnonzero(np.isfinite(shade.low) & np.isfinite(shade.high) & np.isfinite(shade.x))
     if good.size < 2:
@@ -464,7 +405,7 @@ def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
     return "M" + "L".join([*there, *back]) + "Z"
 
 
-def _stem_path(line: _Line, plot: _Plot) -> str:
+def _stem_path(line: _Line, plot: PlotArea) -> str:
     kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
     zero = round(float(plot.down(0.0) - plot.top) * TENTHS_PER_PIXEL)
     return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[kept], line.y[kept]), strict=True))
@@ -482,7 +423,19 @@ def _stroke(style: int, *, dots: bool = False) -> Markup:
     ).format(style, light, thickness, "butt" if dashes else "round", dash)
 
 
-def _path(line: _Line, plot: _Plot, points: int) -> str:
+def path_data(places: Iterable[tuple[float, float]]) -> str:
+    """Path data of straight lines through points [px]."""
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
+
+
+def stroke_path(style: int, places: Iterable[tuple[float, float]], width: float = 1.5, dashes: str = "") -> Markup:
+    """Path through points [px] in the color of a style."""
+    dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
+    path = Markup('<path class="line{}" fill="none" stroke="{}" stroke-width="{}"{} d="{}"/>')
+    return path.format(style, LINE_STYLES[style][0], width, dash, path_data(places))
+
+
+def _path(line: _Line, plot: PlotArea, points: int) -> str:
     """Path data in integer tenths of a pixel, relative to the previous point, restarted after every gap."""
     kept = decimate(line.y, points)
     if kept.size == 0:
@@ -503,7 +456,7 @@ def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
     return Markup('<path {} d="M{:.1f} {:.1f}h{}"/>').format(_stroke(line.style, dots=line.dots), at, y, reach)
 
 
-def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
+def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
     """Swatch and name at the end of every line, moved apart where lines end together."""
     x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
     ends = []

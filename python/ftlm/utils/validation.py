@@ -113,6 +113,17 @@ def real_number(name: str, value: object) -> float:
         raise ModelError(f"{setting(name)} {short_repr(value)} is not a number; give one") from None
 
 
+def frequency_pair(band: Iterable[object]) -> tuple[float, float]:
+    """Return both ends of a band [rad/s]; raise for anything that is no pair of numbers."""
+    try:
+        low, high = (real_number("band", b) for b in band)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
+        ) from None
+    return low, high
+
+
 def join_names(names: Iterable[object], most: int = 40) -> str:
     """Return quoted names joined by commas, at most ``most`` of them, for an error message."""
     every = [repr(name) for name in names]

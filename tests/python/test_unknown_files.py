@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
-import strangers
+import unknown_files
 from ftlm.cli.main import app
 
 
@@ -21,13 +21,13 @@ def command(*words):
 def files(tmp_path_factory):
     """Each stranger's file in a folder."""
     folder = tmp_path_factory.mktemp("strangers")
-    made = {name: strangers.made(name, folder) for name in strangers.MAKERS}
+    made = {name: unknown_files.made(name, folder) for name in unknown_files.MAKERS}
     for stranger in made.values():
         (folder / stranger.name).write_bytes(stranger.content)
     return folder, made
 
 
-@pytest.mark.parametrize("name", strangers.MAKERS)
+@pytest.mark.parametrize("name", unknown_files.MAKERS)
 def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
     folder, made = files
     path = folder / made[name].name
@@ -36,7 +36,7 @@ def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
         path,
         *made[name].words,
         "--structure",
-        strangers.EQUATION,
+        unknown_files.EQUATION,
         "--window",
         ":3.6",
         "--intervals",
@@ -47,7 +47,7 @@ def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
     )
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
-    for number, true in strangers.TRUTH.items():
+    for number, true in unknown_files.TRUTH.items():
         low, high = found["intervals"][number]
         assert low < true < high, number
         assert high - low < 0.2 * abs(true), number
@@ -56,10 +56,12 @@ def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
 
 def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
     """From a file that physics wrote, and no equation of ours, to a model that predicts another one."""
-    (tmp_path / "other.csv").write_bytes(strangers.rod([(20, 5), (120, 8), (260, -13), (330, 10)], 9))
+    (tmp_path / "other.csv").write_bytes(unknown_files.rod([(20, 5), (120, 8), (260, -13), (330, 10)], 9))
     within = []
     for seed in range(2):
-        (tmp_path / "rod.csv").write_bytes(strangers.rod([(10, 12), (150, -9), (230, 9), (290, -12), (350, 6)], seed))
+        (tmp_path / "rod.csv").write_bytes(
+            unknown_files.rod([(10, 12), (150, -9), (230, 9), (290, -12), (350, 6)], seed)
+        )
         done = command(
             "identify",
             tmp_path / "rod.csv",
@@ -77,7 +79,7 @@ def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
         )
         assert done.exit_code == 0, done.output
         found = json.loads(done.stdout)
-        for number, true in strangers.ROD.items():
+        for number, true in unknown_files.ROD.items():
             low, high = found["intervals"][number]
             assert high - low < 0.03 * abs(true), number
             within.append(low < true < high)
@@ -90,18 +92,18 @@ def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
     assert [(c.role, c.unit) for c in opened.columns] == [("time", "s"), ("input", "W"), ("output", "°C")]
 
 
-@pytest.mark.parametrize("name", strangers.MAKERS)
+@pytest.mark.parametrize("name", unknown_files.MAKERS)
 def test_the_record_is_the_one_that_was_written_and_open_says_all_that_was_assumed(files, name):
     folder, made = files
     path, stranger = folder / made[name].name, made[name]
     asked = {"inputs": {"u": stranger.words[1].partition("=")[2] or "u"}}
     asked["outputs"] = {"y": stranger.words[3].partition("=")[2] or "y"}
     opened = ftlm.open_file(path, **asked)
-    assert (opened.problem, opened.rows) == ("", strangers.ROWS)
+    assert (opened.problem, opened.rows) == ("", unknown_files.ROWS)
     run = opened.load()
-    _, u, y = strangers.record()
+    _, u, y = unknown_files.record()
     factor = np.pi / 180 if opened.options.get("units", {}).get("y") == "deg" else 1.0
-    assert (run.length, run.step) == (strangers.ROWS, pytest.approx(strangers.STEP, rel=1e-12))
+    assert (run.length, run.step) == (unknown_files.ROWS, pytest.approx(unknown_files.STEP, rel=1e-12))
     assert run.start == pytest.approx(stranger.start, abs=1e-12)
     np.testing.assert_allclose(run["u"], u, rtol=0, atol=1e-12)
     np.testing.assert_allclose(run["y"], factor * y, rtol=0, atol=1e-12)
@@ -136,6 +138,6 @@ def test_the_command_that_open_names_works(files, name):
     looked = command(*shlex.split(lines[0])[1:], "--json")
     assert looked.exit_code == 0, looked.output
     (figures,) = json.loads(looked.stdout)
-    assert (figures["rows"], figures["step"]) == (strangers.ROWS, pytest.approx(strangers.STEP))
+    assert (figures["rows"], figures["step"]) == (unknown_files.ROWS, pytest.approx(unknown_files.STEP))
     words = shlex.split(lines[1])[1:]
     assert words[words.index("--structure") + 1] == "auto"
