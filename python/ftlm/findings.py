@@ -356,8 +356,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "chaos",
         LEVEL_DO_NOT_USE,
         "a small change of a parameter moves the free run {growth:.2g} times as much in its second half as in its "
-        "first: the motion is chaotic or nearly so|. After {seconds:.3g} s the run depends on its parameters too "
-        "strongly for a fit, and intervals of a fit to all of it mean nothing; {remedy}",
+        "first|: the motion is chaotic or nearly so. After {seconds:.3g} s the run depends on its parameters too "
+        "strongly for a fit, and a fit to all of it has no intervals; {remedy}",
     ),
     "free_runs_of_some": FindingKind(
         "search",

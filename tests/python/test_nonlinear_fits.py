@@ -199,6 +199,19 @@ def test_a_run_that_forgets_its_parameters_is_said():
     assert "run_forgets" not in codes("D y = 0.1 y - 1e-9 y^3 + 0.1 u")
 
 
+def test_a_fit_to_chaotic_motion_has_no_intervals():
+    step, rows = 0.02, 3000
+    blank = ftlm.Run.from_arrays(
+        step=step, inputs={"u": np.cos(1.2 * step * np.arange(rows))}, outputs={"y": np.zeros(rows)}
+    )
+    clean = ftlm.Model(ftlm.equation("D^2 y = -0.3 D y + 1 y - 1 y^3 + 0.5 u")).simulate(blank)
+    run = clean.with_outputs({"y": clean["y"] + 0.005 * np.random.default_rng(0).standard_normal(rows)})
+    found = ftlm.identify(run, ftlm.equation("D^2 y = d D y + k y + c y^3 + b u"))
+    assert found.verdict.level == "do not use"
+    assert "chaotic" in str(found.verdict)
+    assert set(found.intervals.values()) == {(-np.inf, np.inf)}
+
+
 def test_from_the_command_line_to_a_page(runs, tmp_path):
     first, second = tmp_path / "first.csv", tmp_path / "second.csv"
     plant = PLANTS["rotor"]

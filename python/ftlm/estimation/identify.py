@@ -328,6 +328,10 @@ def assess_fit(fit: Fit) -> Identification:
         + stribeck_findings(model, runs, free)
         + nonlinear_findings(model, runs, free)
     )
+    if fit.joint is not None and any(f.code == "run_forgets" for f in findings):
+        # The cost is nowhere quadratic, and a profile follows one of its many minima.
+        unknown = np.diag(np.full(len(fit.joint.names), np.inf))
+        fit = replace(fit, joint=replace(fit.joint, covariance=unknown, profiles={}))
     tests, criteria = None, None
     try:
         tests = run_residual_tests(model, runs, free, lags=DEFAULT_LAGS, sensitivities=_sensitivities(fit))

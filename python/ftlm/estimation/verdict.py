@@ -41,7 +41,7 @@ UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 #: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by
 #: rounding alone, and a parameter may be uncertain, but not by much.
-RULED_TOPICS = ("residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
+RULED_TOPICS = ("chaos", "residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
 
 
 @dataclass(frozen=True)
@@ -210,8 +210,9 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     codes = {f.code for f in result.findings}
     yield from _free_runs(result)
     errors, joint = result.standard_errors, result.fit
+    yield from (f for f in result.findings if f.code == "run_forgets")
     unseen = [n for n, e in errors.items() if not math.isfinite(e)]
-    if unseen:
+    if unseen and "run_forgets" not in codes:
         yield make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen))
     yield from (f for f in result.findings if f.code == "equation_says_identity")
     yield from (f for f in result.findings if f.code == "offset_missing")
