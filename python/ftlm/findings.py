@@ -297,11 +297,11 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "other_intersample_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{input} was taken as {taken} between samples, but the runs favor {other}|: the sum of squared residuals falls "
-        "to {ratio:.3g} times its value, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
+        "{input} was taken as {taken} between samples, but {other} fits better|: the sum of squared residuals is "
+        "{ratio:.3g} times as large, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
         "{input} fits better as {other} between samples than as {taken}: {parameter} is {other_value:.4g}, not "
         "{value:.4g}",
-        "state {input}={kind} in {ask[intersample]} if that is how it acted",
+        "state {input}={kind} in {ask[intersample]} if that is true",
         prefix="{run}: ",
     ),
     "scheme_unstable": FindingKind(
@@ -340,9 +340,9 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "coefficient_on_bound": FindingKind(
         "edge",
         LEVEL_WITH_CARE,
-        "{parameter} = {value:.4g} is on its bound, beyond which the data are fitted better ({outside:.4g} without it)|"
-        "; it has no interval, and those of the others are for this value",
-        "{parameter} = {value:.4g} is on its bound, beyond which the data are fitted better",
+        "{parameter} = {value:.4g} is on its bound; without the bound the estimate is {outside:.4g}|. {parameter} has "
+        "no interval, and the intervals of the other parameters hold for this value",
+        "{parameter} = {value:.4g} is on its bound; without the bound the estimate is {outside:.4g}",
     ),
     "genetic_on_bound": FindingKind(
         "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"

@@ -177,11 +177,11 @@ def test_an_exponent_ends_at_1_and_bounds_are_kept():
 @pytest.mark.parametrize(
     ("circuit", "options", "words"),
     [
-        ("R0-p(R1,X1)", {}, r"'X1' is no element; known: R \(resistor\), C \(capacitor\), L \(inductor\), CPE"),
+        ("R0-p(R1,X1)", {}, r"'X1' is not an element; known: R \(resistor\), C \(capacitor\), L \(inductor\), CPE"),
         ("R0-p(R1,C1", {}, "a parenthesis is not closed"),
         ("R0-R0", {}, "two elements are R0; number them"),
         ("R0-p(R1,C1))", {}, r"'\)' is out of place"),
-        ("R0-", {}, "'the end' is no element"),
+        ("R0-", {}, "ends where an element is expected"),
         ("R0+C1", {}, "is not understood; write it as in"),
         ("R0-C1", {"fixed": {"R1": 1.0}}, "fixed parameter 'R1' does not occur"),
         ("R0-C1", {"fixed": {"R0": 1.0, "C1": 1.0}}, "no parameter of R0-C1 is free"),

@@ -453,7 +453,7 @@ def identify_frequency(
             "--circuit",
             metavar="EQUATION|CIRCUIT",
             rich_help_panel=STRUCTURE_PANEL,
-            help="Equation in words, or a circuit such as R0-p(R1,CPE1).",
+            help="Equation 'D y = a y + b u', or circuit 'R0-p(R1,CPE1)'.",
         ),
     ],
     weights: Annotated[

@@ -87,7 +87,7 @@ def _stated_units(frame: object, columns: Mapping[str, Hashable]) -> dict[str, s
     """Return the units that attributes of a frame or of its columns state, by signal; unknown ones are left out."""
     whole = getattr(frame, "attrs", {}).get("units")
     known = dict(whole) if isinstance(whole, Mapping) else {}
-    for column in columns.values():
+    for column in set(columns.values()).intersection(_columns_of(frame)):
         with contextlib.suppress(KeyError, TypeError, ValueError, IndexError):
             own = getattr(cast("Mapping[Any, object]", frame)[column], "attrs", {})
             stated = own.get("units", own.get("unit"))

@@ -67,9 +67,9 @@ def fit_within_bounds(
 ) -> tuple[FitType, list[Finding]]:
     """Return the fit of a structure with its coefficients within bounds, and findings on those on a bound.
 
-    An active set: coefficients beyond their bounds are fixed there. One of them is freed again if the cost falls
-    inwards. `fit` takes a structure and the only initial guess, or None for automatic ones, and returns a fit and its
-    estimates by name.
+    An active set: coefficients beyond their bounds are fixed there. Then each is released in turn and refitted from its
+    bound; the refit is kept if it satisfies all bounds. `fit` takes a structure and the only initial guess, or None for
+    automatic ones, and returns a fit and its estimates by name.
     """
 
     def violations(values: Mapping[str, float]) -> dict[str, float]:

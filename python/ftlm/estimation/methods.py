@@ -149,7 +149,9 @@ class OutputError:
 
         def estimate(asked: Structure, only: Mapping[str, float] | None) -> tuple[Fit, Mapping[str, float]]:
             fixed = set(structure.coefficient_names) - set(asked.coefficient_names)
-            given = {n: v for n, v in begin.items() if n not in fixed} or None if isinstance(begin, Mapping) else begin
+            given = begin
+            if fixed and isinstance(begin, Mapping):
+                given = {n: v for n, v in begin.items() if n not in fixed} or None
             task, first, alone = Task(tuple(runs), asked), given if only is None else only, only is not None
             if self.noise == "ar":
                 fit = fit_noise_model(

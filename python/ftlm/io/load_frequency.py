@@ -222,7 +222,7 @@ def load_frequency(
     label = base_name(table.path) if name is None else name
     rest = omega == 0.0
     if np.any(rest) and not np.all(rest):
-        # Instruments write a last row at rest, which has no place on a logarithmic axis.
+        # Some instruments append a row at 0 Hz, which has no place on a logarithmic axis.
         notes.append(f"{int(np.sum(rest))} of {omega.size} rows are at frequency 0 and left out")
         omega, response = omega[~rest], response[~rest]
         deviation = None if deviation is None else deviation[~rest]

@@ -37,7 +37,7 @@ from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, choose_text, flag_
 from ftlm.utils.validation import CSV_TIME, join_names
 
 _MAX_LISTED_COLUMNS = 40
-#: Equation of a resistor in series with a resistor beside a constant-phase element.
+#: Circuit of a resistor in series with a resistor parallel to a constant-phase element.
 _ARC_CIRCUIT = "R0-p(R1,CPE1)"
 #: Names of time columns that imply seconds.
 _SECONDS_COLUMN_NAMES = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
@@ -312,7 +312,7 @@ class _FilePreview:
                     (),
                     f"the columns are those of a frequency response or an impedance spectrum, and none is a "
                     f"time; {how} "
-                    "fits a first model, of an impedance the circuit of a resistor before a depressed arc",
+                    "fits a first model, for an impedance a resistor in series with a depressed semicircle",
                 )
             return None, (), str(error)
         if assumed is not None:

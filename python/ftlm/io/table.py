@@ -212,8 +212,9 @@ class Pool:
         own = [c for c in others if c.matrix is None]
         groups = {name.rpartition("/")[0] for name in signals}
         # A group of an HDF5 file is a run of its own.
-        own = [c for c in own if {c.name.rpartition("/")[0]} == groups] or own
-        sure = [c for c in own if is_time_name(c.variable.rpartition("/")[2])]
+        if groups != {""}:
+            own = [c for c in own if {c.name.rpartition("/")[0]} == groups] or own
+        sure = [c for c in own if is_time_name(c.variable) or is_time_name(c.variable.rpartition("/")[2])]
         if sure:
             return sure, ""
         named = [c for c in own if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]

@@ -381,7 +381,7 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
             point = parameter("at", dict.fromkeys(term.signals, 0.3))
             linear = choose_text(f"model.linearized({point})", "Model.linearized in Python")
             raise ModelError(
-                f"the equation of {item.output} has the non-linear term {term}, and {what} is for linear models; "
+                f"the equation of {item.output} has the non-linear term {term}, and {what} needs a linear model; "
                 f"use the linear model about an operating point, {linear}, or free runs (simulate, compare)"
             )
 
@@ -391,7 +391,7 @@ def check_frictionless(equations: Sequence[Equation], what: str) -> None:
     for item in equations:
         if item.friction is not None:
             raise ModelError(
-                f"the equation of {item.output} has friction, and {what} is for linear models; use "
+                f"the equation of {item.output} has friction, and {what} needs a linear model; use "
                 f"{parameter('method', 'output-error')} and simulations (simulate, compare), or leave the friction out"
             )
 

@@ -60,7 +60,7 @@ class Element:
 
 
 def _power(sign: float, order: float) -> Callable[[Complex, Sequence[float]], Response]:
-    """Return the impedance (p s^order)^sign with its derivative."""
+    """Return a function of (s, p): the impedance (p s^order)^sign and its derivative with respect to ln p."""
     return lambda s, p: (z := (p[0] * s**order) ** sign, [sign * z])
 
 
@@ -93,10 +93,14 @@ CIRCUIT_ELEMENTS = {
         lambda p: ({0.0: SQUARE_ROOT_OF_2 * p[0]}, {0.5: 1.0}),
     ),
     "Wo": Element(
-        "diffusion to a blocked end", (("_R", "Ω"), ("_tau", "s")), lambda s, p: _diffusion(s, p, blocked=True)
+        "open Warburg: finite diffusion, reflecting end",
+        (("_R", "Ω"), ("_tau", "s")),
+        lambda s, p: _diffusion(s, p, blocked=True),
     ),
     "Ws": Element(
-        "diffusion to an open end", (("_R", "Ω"), ("_tau", "s")), lambda s, p: _diffusion(s, p, blocked=False)
+        "short Warburg: finite diffusion, transmitting end",
+        (("_R", "Ω"), ("_tau", "s")),
+        lambda s, p: _diffusion(s, p, blocked=False),
     ),
     "G": Element("Gerischer element", (("_R", "Ω"), ("_tau", "s")), _gerischer),
 }
@@ -115,7 +119,7 @@ class Circuit:
     ----------
     text
         Elements in series joined by ``-``, in parallel in ``p(…, …)``: ``R0-p(R1,CPE1)-W1``. Elements are R, C, L, CPE
-        (Q, alpha), W (sigma: half-infinite diffusion), Wo and Ws (R, tau: diffusion to a blocked or an open end) and G
+        (Q, alpha), W (sigma: half-infinite diffusion), Wo and Ws (R, tau: open and short Warburg) and G
         (R, tau: Gerischer), each with a number of its own.
     values
         Known values by name: ``R0``, ``CPE1_Q``, ``CPE1_alpha``, ``W1_sigma``, in Ω, F, H, s.
@@ -135,7 +139,7 @@ class Circuit:
     @cached_property
     def tree(self) -> Node:
         """Circuit as nested groups."""
-        text = re.sub(r"\s", "", self.text)
+        text = "".join(c for c in self.text if not c.isspace())
         tokens = _TOKEN_PATTERN.findall(text)
         if "".join(tokens) != text:
             raise ModelError(f"circuit {self.text!r} is not understood; write it as in 'R0-p(R1,CPE1)-W1'")
@@ -152,7 +156,9 @@ class Circuit:
             return group("series", parts)
 
         def single() -> Node:
-            token = tokens.pop(0) if tokens else "the end"
+            if not tokens:
+                raise ModelError(f"circuit {self.text!r} ends where an element is expected; write one, as in R0-C1")
+            token = tokens.pop(0)
             if token == "p(":
                 parts = [series()]
                 while tokens and tokens[0] == ",":
@@ -164,7 +170,8 @@ class Circuit:
             if _letters(token) not in CIRCUIT_ELEMENTS:
                 known = ", ".join(f"{n} ({e.meaning})" for n, e in CIRCUIT_ELEMENTS.items())
                 raise ModelError(
-                    f"circuit {self.text!r}: {token!r} is no element; known: {known}, and p(…,…); an equation has '='"
+                    f"circuit {self.text!r}: {token!r} is not an element; known: {known}, and p(…,…); an equation "
+                    "needs '='"
                 )
             if token in seen:
                 raise ModelError(f"circuit {self.text!r}: two elements are {token}; number them, such as R0 and R1")
@@ -256,13 +263,15 @@ class Circuit:
         return top, bottom
 
     def __str__(self) -> str:
-        return re.sub(r"\s", "", self.text)
+        return "".join(c for c in self.text if not c.isspace())
 
 
 def impedance_with_slopes(
     circuit: Circuit, w: Floats, more: Mapping[str, float], node: Node | None = None
 ) -> tuple[Complex, dict[str, Complex]]:
-    """Return the impedance of a part, and its derivatives by ln of every parameter, by an exponent itcircuit.
+    """Return the impedance of a circuit part and its derivatives.
+
+    Derivatives are with respect to ln(parameter), and with respect to alpha itself for exponents.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ def delays_of_inputs(runs: Sequence[Run], given: Delays, *, delayed: bool) -> di
 
 @dataclass(frozen=True)
 class FittedForm:
-    """Form or structure with its fit, its number of parameters, the color of its residuals, and its criterion."""
+    """Form or structure with its fit, number of parameters, variance inflation of the residuals, and BIC."""
 
     structure: Structure
     joint: JointFit
@@ -109,7 +109,7 @@ class FittedForm:
 
 
 def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
-    """Sort by Schwarz's criterion, best first, with the color of the whitest residuals among them."""
+    """Return fits sorted by BIC, best first, with the smallest variance inflation among them."""
     scatter = min((f.scatter for f in fits), default=1.0)
     return sorted(
         (replace(f, bic=schwarz_criterion(f.joint, f.parameters, scatter)) for f in fits), key=lambda f: f.bic
@@ -141,7 +141,7 @@ class AutomaticSelection:
         """Fit the candidates and validate the best; return all trials in order."""
         fits = self._fit_integer_orders()
         if fits:
-            # Noise with a color lets high orders fit it: the best of every order is validated, whatever its criterion.
+            # Under colored noise high orders overfit: the best form of each order is validated, whatever its BIC.
             known = {f.form for f in fits}
             fewer = [replace(f, zeros=m) for f in _leaders(fits) for m in range(f.zeros)]
             fits = _rank([*fits, *self._fit([f for f in fewer if f not in known])])
@@ -186,10 +186,10 @@ class AutomaticSelection:
         return self._fit_neighbors(fits)
 
     def _fit_neighbors(self, fits: list[FittedForm]) -> list[FittedForm]:
-        """Add the neighbors of the best forms, and of each that turns out to be as good; best first.
+        """Return the fits with the neighbors of the best forms added, best first.
 
-        A high order may hide a property that it imitates: a level, direct feedthrough, a pole that a zero cancels. Each
-        step to a form that has it and is simpler lowers the criterion.
+        A high order can approximate a property that is missing, such as a level or direct feedthrough. The search moves
+        to neighbors that have it at a lower order while BIC decreases.
         """
         done = {f.form for f in fits}
         new = [f.form for f in fits[:EXTENDED_CANDIDATES]]
@@ -305,7 +305,7 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
     ]
     if form.zeros > 0:
         lower = replace(form, order=form.order - 1, zeros=form.zeros - 1, integrator=False)
-        # A pole and a zero at s = 0 do what a level does.
+        # A canceled pole and zero at s = 0 are equivalent to a level.
         found += [lower, replace(lower, offset="level"), replace(lower, integrator=form.integrator)]
     return [f for f in dict.fromkeys(found) if f.zeros >= 0 and f.order > int(f.integrator)]
 

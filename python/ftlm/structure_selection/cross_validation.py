@@ -422,9 +422,9 @@ def scatter_factor(joint: JointFit) -> float:
 
 
 def schwarz_criterion(joint: JointFit, numbers: int, scatter: float) -> float:
-    """Schwarz's criterion with `scatter` samples per effective sample; doi:10.1214/aos/1176344136.
+    """Return the Schwarz criterion (BIC) with `scatter` samples per effective sample; doi:10.1214/aos/1176344136.
 
-    Initial terms count like parameters: a pole that a zero cancels adds one, which does what a level does.
+    Initial terms count as parameters: a canceled pole and zero add one, which can model a level.
     """
     samples = joint.samples / scatter
     each = samples / max(len(joint.noise), 1)

@@ -264,9 +264,9 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
 
 
 def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
-    """Return ranked trials with their Schwarz criteria, in which the color of noise is that of the best's residuals.
+    """Return ranked trials with BIC, whose effective sample size is that of the residuals of the best trial.
 
-    A higher order that predicts worse leaves whiter residuals where it fits drifts and disturbances of these samples.
+    Not that of the whitest ones: a high order can fit drifts and disturbances, and still predict worse.
     """
     scatter = 1.0 if ranked[0].joint is None else scatter_factor(ranked[0].joint)
     return [t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked]
