@@ -30,8 +30,7 @@ pub enum Intersample {
 ///
 /// ```compile_fail,E0308
 /// use ftlm::prelude::*;
-/// use ftlm::signal::block_pulse::pulse_means;
-/// let means = pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Linear).unwrap();
+/// let means = PulseMeans::new(vec![0.5, 2.0]);
 /// let channel = Channel::new("y", means, Role::Output);
 /// ```
 #[derive(Debug, Clone, PartialEq)]

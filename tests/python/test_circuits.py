@@ -151,7 +151,9 @@ def test_summary_report_validation_and_json(tmp_path):
     assert found.to_dict()["circuit"] == "R0-p(R1,CPE1)-W1"
     assert list(found.to_frame().index) == list(found.values)
     assert found._repr_html_()
-    assert ftlm.plot.nyquist(found) is not None
+    (axes,) = ftlm.plot.nyquist(found).axes
+    measured = next(line for line in axes.lines if len(line.get_xdata()) == F.size)
+    np.testing.assert_allclose(measured.get_ydata(), -spectrum(formula(*true)).response.imag)
 
 
 def test_equal_groups_are_numbered_from_the_fastest_on():

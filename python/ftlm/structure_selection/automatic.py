@@ -142,12 +142,9 @@ class AutomaticSelection:
         fits = self._fit_integer_orders()
         if fits:
             # Under colored noise high orders overfit: the best form of each order is validated, whatever its BIC.
-            known = {f.form for f in fits}
-            fewer = [replace(f, zeros=m) for f in _leaders(fits) for m in range(f.zeros)]
-            fits = _rank([*fits, *self._fit([f for f in fewer if f not in known])])
-            leaders = _leaders(fits)
-            ahead = [f for f in fits if f.form in leaders]
+            leaders = _best_of_each_order(fits)
             near = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in leaders]
+            ahead = [f for f in fits if f.form in leaders]
             best = self._validate([*ahead, *near[: VALIDATED_CANDIDATES - len(ahead)]])
             every = _rank([*fits, *self._fit_fractional_forms(fits, best)])
             least = min(f.bic for f in every if f.form is not None)
@@ -183,7 +180,18 @@ class AutomaticSelection:
         fits = self._fit_zeros(forms, probes)
         if self._is_delayed(fits, offset):
             fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
-        return self._fit_neighbors(fits)
+        fits = self._fit_neighbors(fits)
+        # A zero less may be better within an order although a higher order fits the noise.
+        while fewer := [
+            form
+            for form in (replace(f, zeros=f.zeros - 1) for f in _best_of_each_order(fits) if f.zeros > 0)
+            if form not in {f.form for f in fits}
+        ]:
+            fitted = self._fit(fewer)
+            if not fitted:
+                break
+            fits = _rank([*fits, *fitted])
+        return fits
 
     def _fit_neighbors(self, fits: list[FittedForm]) -> list[FittedForm]:
         """Return the fits with the neighbors of the best forms added, best first.
@@ -289,8 +297,8 @@ class AutomaticSelection:
         return _rank(found)
 
 
-def _leaders(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
-    """Best form of each order by the criterion among the forms of that order."""
+def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
+    """Return the form of least BIC of each order, with the color of noise of that order."""
     forms = [f for f in fits if f.form is not None]
     orders = sorted({f.form.order for f in forms if f.form})
     return [g.form for n in orders if (g := _rank([f for f in forms if f.form and f.form.order == n])[0]).form]
