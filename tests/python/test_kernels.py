@@ -1,6 +1,5 @@
 """`ftlm.kernels` against dense matrices, SciPy and the recursion as published; broadcasting, and arguments refused."""
 
-import sys
 import threading
 
 import numpy as np
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 
 import ftlm
 from ftlm import _core, kernels
+from thread_pair import run_in_two_threads
 
 STEP = 0.1
 PAIR = kernels.Candidates(np.ones((2, 4)), [1], step=STEP)
@@ -154,16 +154,7 @@ def test_two_threads_compute_at_once_what_one_does(monkeypatch, name, work):
         found[key] = work(x)
 
     monkeypatch.setattr(_core, name, watched)
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(60.0)
-    try:
-        threads = [threading.Thread(target=run, args=(key,)) for key in range(2)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    finally:
-        sys.setswitchinterval(interval)
+    run_in_two_threads(run)
     assert most == [2]
     for one in found.values():
         np.testing.assert_array_equal(one, alone)

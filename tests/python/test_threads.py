@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 
 import numpy as np
@@ -15,6 +14,7 @@ from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.discretization import recording
 from ftlm.simulation.output_samples import output_simulation
 from ftlm.utils.resources import interruptible_pool, stop_flag
+from thread_pair import run_in_two_threads
 
 
 def compared(samples: np.ndarray, inputs: np.ndarray) -> list:
@@ -170,16 +170,7 @@ def test_two_fits_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         fit_output_error([run], structure, start={"alpha": 1.0, "a": -0.3, "b": 0.5})
 
     monkeypatch.setattr(_core, "joint_fit", watched)
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(60.0)
-    try:
-        threads = [threading.Thread(target=work) for _ in range(2)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    finally:
-        sys.setswitchinterval(interval)
+    run_in_two_threads(lambda _: work())
     assert most == [2]
 
 
