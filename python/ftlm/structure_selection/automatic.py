@@ -92,7 +92,9 @@ def delays_of_inputs(runs: Sequence[Run], given: Delays, *, delayed: bool) -> di
     """
     if not delayed:
         return {n: d for n, d in given.items() if (d[0] if isinstance(d, tuple) else d) > 0.0}
-    longest = min(min(MAX_DELAY_SAMPLES, run.length * MAX_DELAY_SHARE) * run.step for run in runs)
+    limit = min(min(MAX_DELAY_SAMPLES, run.length * MAX_DELAY_SHARE) * run.step for run in runs)
+    # Three digits, since the range is a part of the structure's name.
+    longest = float(f"{limit:.3g}")
     return {**dict.fromkeys(runs[0].inputs, (0.0, longest)), **given}
 
 
