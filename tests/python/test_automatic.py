@@ -130,3 +130,40 @@ def test_identify_and_select_find_the_same_model_by_auto(tmp_path: Path) -> None
     wrong = CliRunner().invoke(app, ["identify", *words, "--orders", "alpha=1"])
     assert wrong.exit_code == 2
     assert "--orders: of a structure that is given, not used with --structure auto" in wrong.output
+
+
+def controlled_record(seed: int, rows: int, time_constant: float, gain: float) -> ftlm.Run:
+    """Return a lag under a PI controller that reads its noisy output in the same row, with steps of the setpoint."""
+    g = np.random.default_rng(seed)
+    step, pole = time_constant / 20, np.exp(-1 / 20)
+    setpoint = 5 + np.repeat(g.uniform(-1, 1, rows), 100)[:rows]
+    x, integral, inputs, outputs = 0.0, 0.0, [], []
+    for r in setpoint:
+        outputs.append(x + 0.01 * g.standard_normal())
+        integral += (r - outputs[-1]) * step
+        inputs.append((r - outputs[-1] + integral / time_constant) / gain)
+        x = pole * x + gain * (1 - pole) * inputs[-1]
+    return ftlm.Run.from_arrays(step=step, inputs={"u": inputs}, outputs={"y": outputs})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_answer_of_a_controller_within_a_row_is_not_taken_for_feedthrough(seed: int) -> None:
+    found = ftlm.select(controlled_record(seed, 600, 2.0, 3.0), "auto", threads=1)
+    assert found.winner.name == "D^1 y = a0 y + b0 u"
+    values = found.best.parameters
+    for name, true in (("a0", -0.5), ("b0", 1.5)):
+        assert abs(values[name].value - true) < 3 * values[name].standard_error
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_feedthrough_is_found_where_the_input_is_as_rough_as_that_of_a_controller(seed: int) -> None:
+    # A battery under a rough current: its resistance answers within the row.
+    g = np.random.default_rng(seed)
+    current = lfilter([1.0], [1.0, -0.5], g.standard_normal(800))
+    pole = np.exp(-0.05)
+    voltage = 0.5 * current + lfilter([0, 2 * (1 - pole)], [1, -pole], current)
+    noisy = voltage + 0.02 * voltage.std() * g.standard_normal(800)
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"current": current}, outputs={"voltage": noisy})
+    found = ftlm.select(run, "auto", threads=1)
+    assert found.winner.name == "D^1 voltage = a0 voltage + b1 D^1 current + b0 current"
+    assert found.best.parameters["b1"].value == pytest.approx(0.5, rel=0.02)

@@ -10,11 +10,13 @@ from typing import TypeAlias
 
 from ftlm.data.run import Run
 from ftlm.estimation.output_error import JointFit
+from ftlm.simulation.discretization import compared_values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.candidates import describe_structure
 from ftlm.structure_selection.cross_validation import Trial, parameter_count, scatter_factor, schwarz_criterion
 from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
+from ftlm.validation.feedback import feedback_test
 
 #: Highest integer order.
 MAX_ORDER = 4
@@ -62,6 +64,11 @@ class IntegerOrderForm:
     delayed: bool = False
     integrator: bool = False
     offset: str = "none"
+
+    @property
+    def has_feedthrough(self) -> bool:
+        """Whether the output jumps with its inputs."""
+        return self.zeros >= self.order
 
     def structure(self, runs: Sequence[Run], output: str, delays: Delays = NO_DELAYS) -> Structure:
         """Return the structure of the form for one output of runs, with given delays as :func:`delays_of_inputs`."""
@@ -138,6 +145,8 @@ class AutomaticSelection:
     output: str
     evaluator: CandidateEvaluator
     delays: Delays = field(default_factory=dict)
+    #: Inputs that depend on the output: the controller's answer within a row would be taken for direct feedthrough.
+    feedback: tuple[str, ...] = field(default=(), init=False)
 
     def run(self) -> list[Trial]:
         """Fit the candidates and validate the best; return all trials in order."""
@@ -182,6 +191,7 @@ class AutomaticSelection:
         fits = self._fit_zeros(forms, probes)
         if self._is_delayed(fits, offset):
             fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
+        self.feedback = self._inputs_in_loop(fits)
         fits = self._fit_neighbors(fits)
         # A zero less may be better within an order although a higher order fits the noise.
         while fewer := [
@@ -195,6 +205,27 @@ class AutomaticSelection:
             fits = _rank([*fits, *fitted])
         return fits
 
+    def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:
+        """Return the inputs that depend on the output, by the residuals of the best form, which has no feedthrough.
+
+        Within a row a controller and direct feedthrough are correlated with the output alike; the sign is opposite to
+        that of the static gain for a controller.
+        """
+        if not fits:
+            return ()
+        best = fits[0]
+        residuals = [part[self.output] for part in best.joint.residuals]
+        # Residuals are those of the inner samples.
+        signals = {n: [compared_values(r, best.structure, n)[1:-1] for r in self.runs] for n in self.runs[0].inputs}
+        names, coefficients = list(signals), best.joint.coefficients
+        found = []
+        for name, values in signals.items():
+            test = feedback_test(residuals, values, [v for n, v in signals.items() if n != name])
+            gain = -coefficients.get("a0", -1.0) * coefficients[f"b{_number(names, name)}0"]
+            if test.has_feedback or (test.state == "undecided" and test.same_row * math.copysign(1.0, gain) < -1.0):
+                found.append(name)
+        return tuple(found)
+
     def _fit_neighbors(self, fits: list[FittedForm]) -> list[FittedForm]:
         """Return the fits with the neighbors of the best forms added, best first.
 
@@ -206,7 +237,8 @@ class AutomaticSelection:
         expanded: set[IntegerOrderForm | None] = {None}
         while new:
             expanded.update(new)
-            more = [n for n in dict.fromkeys(n for form in new if form for n in _neighbors(form)) if n not in done]
+            near = [n for form in new if form for n in _neighbors(form) if not (self.feedback and n.has_feedthrough)]
+            more = [n for n in dict.fromkeys(near) if n not in done]
             done.update(more)
             fits = _rank([*fits, *self._fit(more)])
             new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
@@ -270,8 +302,9 @@ class AutomaticSelection:
             f"D^alpha {y} = a0 {y} + {driving}": INITIAL_FRACTIONAL_ORDERS,
             f"D^alpha {y} = a1 D^mu {y} + a0 {y} + {driving}": INITIAL_FRACTIONAL_ORDERS[1:],
             f"D^alpha {y} = {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
-            f"D^alpha {y} = {direct} + {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
         }
+        if not self.feedback:
+            texts[f"D^alpha {y} = {direct} + {driving}"] = INITIAL_FRACTIONAL_ORDERS[:2]
         if form.order == FRACTIONAL_DAMPING_ORDER:
             texts[f"D^2 {y} = a1 D^mu {y} + a0 {y} + {driving}"] = (2.0,)
 

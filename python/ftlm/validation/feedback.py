@@ -76,6 +76,9 @@ class FeedbackTest:
         Rows that were tested.
     bias
         Largest bias of a parameter by the feedback, in its standard errors; None if it is not known.
+    same_row
+        Statistic of the correlation between the innovations of input and output in the same row over its limit (99.5
+        %), with the sign of the correlation: a controller that acts within the row, or direct feedthrough.
     response
         Part of the input that past residuals explain, one array per run in the unit of the input; empty unless found.
     """
@@ -86,6 +89,7 @@ class FeedbackTest:
     share: float = 0.0
     rows: int = 0
     bias: float | None = None
+    same_row: float = 0.0
     response: tuple[Floats, ...] = field(default=(), repr=False, compare=False)
 
     @property
@@ -381,11 +385,12 @@ class _Innovations:
         clipped = clipped - clipped.mean()
         if robust_deviation(self.present) < QUIET_SHARE:
             return FeedbackTest("none", "the output has no noise that could come back", rows=count)
-        now = self._present_ratio(clipped)
+        signed = self._present_ratio(clipped)
+        now = abs(signed)
         at_once = f"it is correlated with the output of the same row (ratio {now:.2g}): a controller, or a feedthrough"
         if self.scale < PREDICTED_SHARE or self.noise < QUIET_SHARE:
             if now > 1:
-                return FeedbackTest("undecided", at_once, rows=count)
+                return FeedbackTest("undecided", at_once, rows=count, same_row=signed)
             return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
         ratio, columns, rows = self._ratio(0, clipped)
         target = clipped[rows]
@@ -394,7 +399,7 @@ class _Innovations:
 
         def result(state: FeedbackState, reason: str = "") -> FeedbackTest:
             response = self._response(columns, rows) if state == "found" else ()
-            return FeedbackTest(state, reason, ratio, share, count, response=response)
+            return FeedbackTest(state, reason, ratio, share, count, same_row=signed, response=response)
 
         # No two signals that were made beforehand explain most of what is new in a rough input.
         if share >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
@@ -425,14 +430,16 @@ class _Innovations:
         return result("found")
 
     def _present_ratio(self, clipped: Floats) -> float:
-        """Statistic over its limit of the output's innovation of the same row, for integral controllers.
+        """Statistic over its limit of the output's innovation of the same row, with the sign of the correlation.
 
-        The past of such an input contains the past outputs already, so that they explain no more of it.
+        The past of the input of an integral controller contains the past outputs already, so that they explain no more
+        of it.
         """
         size = max(robust_deviation(self.present), 1e-300)
         present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)
         column = _project_out(self.past, present[:, None], self.weights)
-        return _score_ratio(clipped, column / max(float(np.linalg.norm(column)), 1e-300))
+        ratio = _score_ratio(clipped, column / max(float(np.linalg.norm(column)), 1e-300))
+        return math.copysign(ratio, float(clipped @ column[:, 0]))
 
     def _ratio_with_noisy_input(self, rows: NDArray[np.intp]) -> float:
         """Least ratio if the measured input had noise: corrected least squares, over shares of the largest noise.
