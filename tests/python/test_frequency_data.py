@@ -663,6 +663,9 @@ FORMS = {
     "a remark under the names": ("freq,re,im\n# measured at 25 C\n", ""),
     "quoted names": ('"Frequency (Hz)","Z\' (Ohm)","Z\'\' (Ohm)"\n', ""),
     "a row at rest": ("f [Hz],Zreal,Zimag\n", "0,0.06,0\n"),
+    "text below the table": ("freq,Zreal,Zimag\n", "\nFit results\nRs,0.01\nchi2,1e-4,9\n"),
+    "no names": ("", ""),
+    "a remark between names and rows": ("ZPLOT2 ASCII\nFreq(Hz)\tZ'(a)\tZ''(b)\nEnd Comments\n", ""),
 }
 
 
@@ -679,4 +682,16 @@ def test_impedances_are_read_as_instruments_write_them(tmp_path, form):
     found = ftlm.load_frequency(tmp_path / "cell.csv")
     np.testing.assert_allclose(found.response, z, rtol=1e-8)
     np.testing.assert_allclose(found.frequency, W, rtol=1e-8)
-    assert any("1 of 61 rows are at frequency 0 and left out" in w for w in found.warnings) == bool(tail)
+    said = "lines 63 to 65 are below the table and left out" if "Fit" in tail else "1 of 61 rows are at frequency 0"
+    assert any(said in w for w in found.warnings) == bool(tail)
+    assert any("taken as 'frequency', 'real', 'imag'" in w for w in found.warnings) == (not head)
+    if head:
+        assert "impedance spectrum" in ftlm.open_file(tmp_path / "cell.csv").problem
+
+
+def test_two_tables_in_a_file_are_refused_with_the_line_of_the_second(tmp_path):
+    table = "freq,re,im\n" + "".join(f"{k},1,-{k}\n" for k in range(1, 9))
+    (tmp_path / "two.csv").write_text(f"{table}\n{table}")
+    words = "a table ends above line 11, and line 12 is a row of another one; keep one table in a file"
+    with pytest.raises(ftlm.DataError, match=words):
+        ftlm.load_frequency(tmp_path / "two.csv")

@@ -111,6 +111,8 @@ class _Rows:
     ragged: int = 0
     ragged_line: int = 0
     ragged_cells: list[str] = field(default_factory=list)
+    after_blank: bool = False
+    footer: list[int] = field(default_factory=list)
     blocks: list[npt.NDArray[np.float64]] = field(default_factory=list)
     bad_cells: dict[int, _BadCells] = field(default_factory=dict)
     moments: dict[int, list[Timestamps]] = field(default_factory=dict)
@@ -187,6 +189,10 @@ def parse_text(
         found = replace(found, layout=replace(found.layout, separator=None, decimal=None))
     kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[found.separator]} between cells)"
     assumed = () if header is not None else guessed + found.assumed
+    if rows.footer:
+        lines = f"lines {rows.footer[0]} to {rows.footer[-1]} are" if len(rows.footer) > 1 else f"line {rows.footer[0]} is"
+        words = f"{lines} below the table and left out"
+        assumed = (*assumed, Assumption("", rows.count, words, "remove the empty line above them"))
     if found.names is None:
         assumed = tuple(_with_remark(a, remark, found.width) for a in assumed)
     return FileTable(path, columns, True, header, layout=what.under(found.layout), assumed=assumed, kind=kind)
@@ -263,7 +269,14 @@ def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: st
         # With tabs, a line of empty cells is a row of missing values, not a blank line.
         gap = found.separator == "\t" and "\t" in line and not line.strip()
         if at >= found.begin and (gap or _has_content(line, mark)):
+            if rows.footer or (rows.after_blank and _is_footer(line, found, source, at)):
+                _check_footer(rows, line, at, source)
+                rows.footer.append(at)
+                continue
             kept.append((at, line))
+            rows.after_blank = False
+        elif at >= found.begin and not line.strip():
+            rows.after_blank = bool(kept) or rows.count > 0
         elif at >= found.begin and line.lstrip()[:1] == mark:
             _check_remark(line, at, found, source)
     if not kept:
@@ -279,6 +292,24 @@ def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: st
         plain = not found.comma and found.mark is None and not any("_" in line for _, line in kept)
         rows.blocks.append(_numbers(rows, cells, [at for at, _ in kept], plain=plain))
     rows.count += len(cells)
+
+
+def _is_footer(line: str, found: TableDialect, source: str, at: int) -> bool:
+    """Whether a line after an empty one is text below the table: it begins with a word and is no row."""
+    cells = split_cells([line], found.separator, source, at)[0]
+    numbers = [is_number(cell, comma=found.comma, mark=found.mark) or is_timestamp(cell) for cell in cells]
+    return bool(cells[0].strip()) and not numbers[0] and (len(cells) != found.width or not any(numbers))
+
+
+def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
+    """Raise if a line below the table is a row again."""
+    found = rows.found
+    cells = split_cells([line], found.separator, source, at)[0]
+    if len(cells) == found.width and all(is_number(c, comma=found.comma, mark=found.mark) for c in cells):
+        raise DataError(
+            f"{source}: a table ends above line {rows.footer[0]}, and line {at} is a row of another one; keep one table "
+            "in a file"
+        )
 
 
 def _check_remark(line: str, at: int, found: TableDialect, source: str) -> None:

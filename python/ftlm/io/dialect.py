@@ -155,7 +155,7 @@ class Assumption:
     Parameters
     ----------
     option : str
-        Option of :class:`ftlm.Layout` or argument of :func:`ftlm.load` that sets it explicitly.
+        Option of :class:`ftlm.Layout` or argument of :func:`ftlm.load` that sets it explicitly; empty if there is none.
     value : str or int
         Value that was assumed.
     words : str
@@ -503,7 +503,9 @@ def _header(
             if units_above and len(fit_names(cut[top - 2])) == width and cut[top - 2].words:
                 count = 2
             elif len(fit_names(cut[top - 1])) != width and top > 1:
-                count = 0
+                # A remark of one cell may stand between names and rows.
+                named = len(fit_names(cut[top - 2])) == width and cut[top - 2].has_only_words
+                count = 2 if named and cut[top - 1].width == 1 else 0
     if count > top and given.skip is None and count < len(cut):
         # A header of numbers looks like a row.
         top = count
@@ -526,7 +528,8 @@ def _header(
     check_distinct(names, line.at, source)
     if count == 1:
         return names, None, top
-    units = [unit_of(cell) for cell in cut[top - 1].cells]
+    below = cut[top - 1].cells
+    units = [unit_of(cell) for cell in below] if len(below) > 1 or width == 1 else []
     units += [""] * (len(names) - len(units))
     return names, units[: len(names)], top
 
@@ -668,7 +671,7 @@ def _summarize_layout(
         words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
         assumed.append(Assumption("skip", skip, words, layout_parameter(skip=Placeholder("LINES"))))
     if given.header is None and units is not None:
-        words = f"line {cut[top - 1].at} holds units"
+        words = f"line {cut[top - 1].at} holds units" if any(units) else f"line {cut[top - 1].at} is a remark"
         assumed.append(Assumption("header", 2, words, layout_parameter(header=1)))
     elif given.header is None and header == 0:
         assumed.append(

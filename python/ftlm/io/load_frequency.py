@@ -136,6 +136,10 @@ _MAX_PART_NAME_CHARACTERS = 60
 _MAGNITUDE_TOLERANCE = 0.02
 
 
+#: Parts in the columns of a file of three columns without names, as potentiostats export them.
+HEADERLESS_PARTS = ("frequency", "real", "imag")
+
+
 @dataclass(frozen=True)
 class _ResponseColumn:
     """Column of a frequency response: part, unit in the file, and whether its name inverts the sign."""
@@ -171,7 +175,8 @@ def load_frequency(
         Column by part: ``frequency``; ``real`` and ``imag``, or ``magnitude`` and ``phase``; ``deviation``, the
         standard deviation of the real and of the imaginary part. By default columns are recognized by their names:
         ``freq``, ``f``, ``omega``; ``Re``, ``Zreal``, ``Z'``; ``Im``, ``Zimag``, ``Z''`` and ``-Z''``, ``-Im(Z)`` (the
-        sign inverted); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``; ``sigma``.
+        sign inverted); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``; ``sigma``. Three columns without
+        names are ``frequency``, ``real`` and ``imag``, with a warning.
     frequency_unit
         ``"Hz"``, ``"kHz"``, ``"MHz"``, ``"mHz"`` or ``"rad/s"``. Default the unit in the column name, ``freq/Hz``,
         ``f [Hz]``, ``f_Hz``; else, with a warning, rad/s for a column called omega and Hz for others.
@@ -203,8 +208,12 @@ def load_frequency(
     pool = Pool([table])
     if table.header is not None:
         raise DataError(f"{table.path.name} is a run over time that ftlm wrote; load it with ftlm.load")
-    found = _select_parts(pool, columns) if columns is not None else _find_parts(pool)
     notes = [str(a) for a in table.assumed if a.counts]
+    if columns is None and table.layout.header == 0 and len(pool.columns) == len(HEADERLESS_PARTS):
+        columns = dict(zip(HEADERLESS_PARTS, pool.names, strict=True))
+        way_out = parameter("columns", PART_COLUMNS)
+        notes.append(f"no line of names: the columns are taken as {join_names(HEADERLESS_PARTS)}; otherwise {way_out}")
+    found = _select_parts(pool, columns) if columns is not None else _find_parts(pool)
     omega = _frequencies(found["frequency"], frequency_unit, notes)
     factor, unit = 1.0, ""
     if "real" in found and "imag" in found:

@@ -299,21 +299,18 @@ class _FilePreview:
             wanted.time = CSV_TIME
         if wanted.step is not None:
             return None, (), ""
+        signals = self._named_signals()
+        if header is None and wanted.time is None and not signals and is_response(self.pool):
+            path = shlex.quote(os.fspath(self.table.path))
+            command = f"ftlm identify-frequency {path} {parameter('circuit', _ARC_CIRCUIT)}"
+            how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_CIRCUIT!r})", command)
+            words = "the columns are those of a frequency response or an impedance spectrum"
+            fits = "fits a first model, for an impedance a resistor in series with a depressed semicircle"
+            return None, (), f"{words}; {how} {fits}"
         matrices = list(dict.fromkeys(c.matrix for c in every if c.matrix is not None))
         try:
-            clock, assumed = self.pool.time(wanted.time, matrices if len(matrices) == 1 else [], self._named_signals())
+            clock, assumed = self.pool.time(wanted.time, matrices if len(matrices) == 1 else [], signals)
         except DataError as error:
-            if is_response(self.pool):
-                path = shlex.quote(os.fspath(self.table.path))
-                command = f"ftlm identify-frequency {path} {parameter('circuit', _ARC_CIRCUIT)}"
-                how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_CIRCUIT!r})", command)
-                return (
-                    None,
-                    (),
-                    f"the columns are those of a frequency response or an impedance spectrum, and none is a "
-                    f"time; {how} "
-                    "fits a first model, for an impedance a resistor in series with a depressed semicircle",
-                )
             return None, (), str(error)
         if assumed is not None:
             return clock, (assumed,), ""
