@@ -7,8 +7,10 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
+from typer.testing import CliRunner
 
 import ftlm
+from ftlm.cli.main import app
 
 N = 40
 U, Y = np.arange(N) % 7 * 1.0, np.sin(np.arange(N) / 5)
@@ -174,3 +176,13 @@ def test_groups_of_an_hdf5_file_have_a_time_each(tmp_path, units):
     for rows, step in ((40, 0.1), (50, 0.05)):
         run = ftlm.load(tmp_path / "two.h5", inputs={"u": f"run{rows}/u"}, outputs={"y": f"run{rows}/y"})
         assert (run.step, run.length) == (step, rows)
+        group = ftlm.load(tmp_path / "two.h5" / f"run{rows}")
+        assert (group.name, group.step, list(group.inputs), list(group.outputs)) == (f"run{rows}", step, ["u"], ["y"])
+    with pytest.raises(ftlm.DataError, match=r"holds 2 runs, a group with a time each; .*two\.h5/run40"):
+        ftlm.load(tmp_path / "two.h5")
+    with pytest.raises(ftlm.DataError, match=r"the group 'run41' is not in the file.*did you mean 'run40'"):
+        ftlm.load(tmp_path / "two.h5" / "run41")
+    shown = CliRunner().invoke(app, ["inspect", str(tmp_path / "two.h5")])
+    assert shown.exit_code == 0, shown.output
+    assert "run40" in shown.output
+    assert "run50" in shown.output

@@ -14,7 +14,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import MissingPolicy
 from ftlm.errors import DataError, ModelError
 from ftlm.io.dialect import Layout
-from ftlm.io.load import LoadOptions, Signals, load_selection, select_columns
+from ftlm.io.load import LoadOptions, Signals, load_selection, run_paths, select_columns
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.structure.structure import Structure
 
@@ -98,7 +98,7 @@ class ReadingOptions:
     def runs(
         self, files: Sequence[str] | None, structure: Structure | None = None, *, apart: bool = False
     ) -> list[Run]:
-        """Load each file as a run, detrended if requested.
+        """Load each file as a run, detrended if requested; each group with a time of an HDF5 file is one.
 
         .mat files with one signal each form one run unless `apart`. Columns that no option names are the signals of
         `structure`, if the files have them.
@@ -121,7 +121,10 @@ class ReadingOptions:
                 run = self._load(list(files), signals)
                 print(f"ftlm: {len(files)} .mat files read as one run", file=sys.stderr)
                 return [run]
-        return [self._load(f, signals) for f in files]
+        # Columns that are named by their group choose one run.
+        named = any("/" in text for text in (*(self.inputs or ()), *(self.outputs or ()), self.time or ""))
+        paths = files if named else [path for file in files for path in run_paths(file)]
+        return [self._load(path, signals) for path in paths]
 
     def _load(self, path: str | list[str], signals: Signals | None) -> Run:
         wanted = select_columns(

@@ -190,8 +190,9 @@ def parse_text(
     kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[found.separator]} between cells)"
     assumed = () if header is not None else guessed + found.assumed
     if rows.footer:
-        lines = f"lines {rows.footer[0]} to {rows.footer[-1]} are" if len(rows.footer) > 1 else f"line {rows.footer[0]} is"
-        words = f"{lines} below the table and left out"
+        first, last = rows.footer[0], rows.footer[-1]
+        which = f"lines {first} to {last} are" if last > first else f"line {first} is"
+        words = f"{which} below the table and left out"
         assumed = (*assumed, Assumption("", rows.count, words, "remove the empty line above them"))
     if found.names is None:
         assumed = tuple(_with_remark(a, remark, found.width) for a in assumed)
@@ -307,8 +308,8 @@ def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
     cells = split_cells([line], found.separator, source, at)[0]
     if len(cells) == found.width and all(is_number(c, comma=found.comma, mark=found.mark) for c in cells):
         raise DataError(
-            f"{source}: a table ends above line {rows.footer[0]}, and line {at} is a row of another one; keep one table "
-            "in a file"
+            f"{source}: a table ends above line {rows.footer[0]}, and line {at} is a row of another one; keep one "
+            "table in a file"
         )
 
 

@@ -21,7 +21,7 @@ from ftlm.io.cell_parsing import split_unit
 from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles
 from ftlm.io.delimited_text import read_text
 from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Assumption, Layout
-from ftlm.io.isolated_reader import binary_format_of, read_isolated
+from ftlm.io.isolated_reader import HDF5_FORMAT, binary_format_of, read_isolated
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER, read_toml
@@ -72,12 +72,13 @@ def load(
     ----------
     path : path or sequence of paths
         Text, optionally compressed by gzip; ``.xlsx``, ``.xls``, ``.ods``; ``.mat``, ``.h5``, ``.npz``, ``.npy``;
-        ``.parquet``, ``.feather``. The layout of text and sheets is given by `layout` or detected: comma, semicolon,
-        tab or white space between cells, decimal points or commas, a line of names, a line of units, dates. Ambiguous
-        files raise an error. Assumptions that affect values are listed in the `warnings` of the run, with the option
-        that overrides them. Lines that begin with ``#`` are skipped. Without a header the columns are c1, c2, …
-        The columns of a matrix V are V.1, V.2, … (or ``V(:,1)``), a vector keeps its name; samples are in rows.
-        Columns of several files are pooled; a name in two files is prefixed by its file, ``STEM/V.3``.
+        ``.parquet``, ``.feather``. A group of an HDF5 file is named in the path, ``runs.h5/run1``. The layout of text
+        and sheets is given by `layout` or detected: comma, semicolon, tab or white space between cells, decimal points
+        or commas, a line of names, a line of units, dates. Ambiguous files raise an error. Assumptions that affect
+        values are listed in the `warnings` of the run, with the option that overrides them. Lines that begin with
+        ``#`` are skipped. Without a header the columns are c1, c2, … The columns of a matrix V are V.1, V.2, … (or
+        ``V(:,1)``), a vector keeps its name; samples are in rows. Columns of several files are pooled; a name in two
+        files is prefixed by its file, ``STEM/V.3``.
     time : str or int, optional
         Time column, by name or, in a single text file, by position from 0. Without `time` and `step`, the column
         called t, time or seconds is used (any case, alone or with a unit as in ``time [ms]`` or ``t_ms``). Otherwise,
@@ -316,24 +317,41 @@ def time_header(clock: Column) -> str:
     return f"{clock.variable} [{clock.file_unit}]" if below else clock.variable
 
 
-def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:
+def _paths(given: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
+    """Return files, each with the group of an HDF5 file that the path goes on to; "" for the whole file."""
     entries = [given] if isinstance(given, (str, os.PathLike)) else given
     if not isinstance(entries, Sequence) or not all(isinstance(entry, (str, os.PathLike)) for entry in entries):
         raise DataError(f"path is a {type(given).__name__}; pass the path of a file, or a list of paths")
     if not entries:
         raise DataError("path: the list is empty; pass the path of at least one file")
-    paths = [Path(entry) for entry in entries]
+    places = [_split_group(Path(entry)) for entry in entries]
     total = 0
-    for index, path in enumerate(paths):
+    for index, (path, group) in enumerate(places):
         total += _size(path)
-        if any(path.resolve() == other.resolve() for other in paths[:index]):
-            raise DataError(f"{str(path)!r} is given twice; give every file once")
+        if any(path.resolve() == other.resolve() and group == inner for other, inner in places[:index]):
+            raise DataError(f"{str(path / group)!r} is given twice; give every file once")
     if total > _MAX_FILE_BYTES:
         raise DataError(
-            f"{join_names(map(str, paths))}: {total} bytes, more than the limit of {_MAX_FILE_BYTES}; "
+            f"{join_names(str(path) for path, _ in places)}: {total} bytes, more than the limit of {_MAX_FILE_BYTES}; "
             "split the record or lower its rate"
         )
-    return paths
+    return places
+
+
+def _split_group(path: Path) -> tuple[Path, str]:
+    """Split a path that goes on into an HDF5 file, such as ``runs.h5/run1``, into the file and the group."""
+    for parent in path.parents:
+        if parent.suffix.lower() in HDF5_FORMAT.suffixes and parent.is_file():
+            return parent, path.relative_to(parent).as_posix()
+    return path, ""
+
+
+def run_paths(path: str) -> list[str]:
+    """Return the paths of the runs in a file: of each group with a time of its own, if an HDF5 file has several."""
+    if Path(path).suffix.lower() not in HDF5_FORMAT.suffixes or not Path(path).is_file():
+        return [path]
+    (table,) = read_tables(path, Layout())
+    return [str(Path(path) / group) for group in table.runs] or [path]
 
 
 def _size(path: Path) -> int:
@@ -354,19 +372,20 @@ def _size(path: Path) -> int:
 
 def read_tables(path: PathLike | Sequence[PathLike], layout: Layout) -> list[FileTable]:
     """Read the tables of files, independent of the column selection."""
-    paths = _paths(path)
+    places = _paths(path)
     read: dict[Path, FileTable] = {}
-    kinds = {path: binary_format_of(path) for path in paths}
+    kinds = {file: binary_format_of(file) for file, _ in places}
     for kind in dict.fromkeys(kinds.values()):
         if kind is not None:
-            own = [path for path in paths if kinds[path] is kind]
+            own = [file for file in kinds if kinds[file] is kind]
             for name in own:
                 layout.check_used(repr(name.name), kind.label, SHEET_OPTIONS if kind.has_sheets else ())
             read |= dict(zip(own, read_isolated(own, kind, layout), strict=True))
-    for name in paths:
-        if kinds[name] is None:
+    for name, form in kinds.items():
+        if form is None:
             layout.check_used(repr(name.name), "text", TEXT_OPTIONS)
-    return [read[path] if path in read else read_text(path, layout) for path in paths]
+    tables = [read[file] if file in read else read_text(file, layout) for file, _ in places]
+    return [table.in_group(group) if group else table for table, (_, group) in zip(tables, places, strict=True)]
 
 
 def column_names(path: PathLike) -> tuple[str, ...] | None:

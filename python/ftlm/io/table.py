@@ -92,6 +92,35 @@ class FileTable:
     assumed: tuple[Assumption, ...] = ()
     kind: str = ""
 
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Groups of an HDF5 file that have a time each, and so are runs of their own; empty if it holds one run."""
+        places = [c.variable.rpartition("/") for c in self.columns if c.matrix is None]
+        groups = tuple(dict.fromkeys(group for group, _, name in places if group and is_time_name(name)))
+        return groups if len(groups) > 1 else ()
+
+    def in_group(self, group: str) -> FileTable:
+        """Return the columns of a group under their names in it.
+
+        Raises
+        ------
+        DataError
+            No column is in the group.
+        """
+        path, prefix = self.path / group, f"{group}/"
+        columns = [
+            replace(c, variable=c.variable.removeprefix(prefix), name=c.name.removeprefix(prefix), source=path)
+            for c in self.columns
+            if c.variable.startswith(prefix)
+        ]
+        if not columns:
+            groups = sorted({c.variable.rpartition("/")[0] for c in self.columns} - {""})
+            raise DataError(
+                f"{str(self.path)!r}: the group {group!r} is not in the file{nearest(group, groups)}; its groups are "
+                f"{join_names(groups) or 'none'}"
+            )
+        return replace(self, path=path, columns=columns)
+
 
 class Pool:
     """Columns of all files under unique names."""
@@ -185,6 +214,11 @@ class Pool:
         clocks, assumed = [], None
         for table in self._tables:
             named, why = self._clocks(table, signals)
+            if len(named) > 1 and table.runs:
+                raise DataError(
+                    f"{table.path.name} holds {len(table.runs)} runs, a group with a time each; give the path of one, "
+                    f"as in {str(table.path / table.runs[0])!r}; the groups are {join_names(table.runs)}"
+                )
             if len(named) > 1:
                 raise DataError(
                     f"{table.path.name}: the columns {join_names(column.name for column in named)} may all be the "
