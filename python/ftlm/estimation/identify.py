@@ -273,6 +273,8 @@ def identify(
     chosen = resolve_method(method)
     if bounds is not None:
         chosen = method_with_options(chosen.name, {**vars(chosen), "bounds": bounds})
+    if isinstance(structure, str) and structure == "auto":
+        raise ModelError("structure = 'auto'; use ftlm.select(runs, 'auto').best, which chooses and identifies one")
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
     check_threads(threads)
