@@ -167,3 +167,16 @@ def test_feedthrough_is_found_where_the_input_is_as_rough_as_that_of_a_controlle
     found = ftlm.select(run, "auto", threads=1)
     assert found.winner.name == "D^1 voltage = a0 voltage + b1 D^1 current + b0 current"
     assert found.best.parameters["b1"].value == pytest.approx(0.5, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sensor_that_drifts_changes_neither_order_nor_gain(seed: int) -> None:
+    g = np.random.default_rng(seed)
+    u = np.repeat(g.uniform(-1, 1, 20), 30)
+    pole = np.exp(-0.05)
+    y = lfilter([0, 3 * (1 - pole)], [1, -pole], u)
+    noisy = y + 0.3 * y.std() * np.linspace(0, 1, 600) + 0.02 * y.std() * g.standard_normal(600)
+    found = ftlm.select(ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": noisy}), "auto", threads=1)
+    assert (found.winner.structure.offset, [*found.best.parameters]) == ("ramp", ["a0", "b0"])
+    for name, true in (("a0", -0.5), ("b0", 1.5)):
+        assert abs(found.best.parameters[name].value - true) < 3 * found.best.parameters[name].standard_error

@@ -56,7 +56,8 @@ class IntegerOrderForm:
     integrator
         Whether the equation has no term in the output itself: a pole at s = 0.
     offset
-        Kind of offset of each run: ``"none"``, or ``"level"``, the value at which the output rests.
+        Kind of offset of each run: ``"none"``; ``"level"``, the value at which the output rests; or ``"ramp"``, a load
+        that drifts.
     """
 
     order: int
@@ -348,8 +349,9 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
     ]
     if form.zeros > 0:
         lower = replace(form, order=form.order - 1, zeros=form.zeros - 1, integrator=False)
-        # A canceled pole and zero at s = 0 are equivalent to a level.
-        found += [lower, replace(lower, offset="level"), replace(lower, integrator=form.integrator)]
+        # A canceled pole and zero at s = 0 are equivalent to a level, or with the initial terms to a drift.
+        found += [lower, *(replace(lower, offset=o) for o in ("level", "ramp"))]
+        found.append(replace(lower, integrator=form.integrator))
     return [f for f in dict.fromkeys(found) if f.zeros >= 0 and f.order > int(f.integrator)]
 
 

@@ -111,7 +111,7 @@ def select(
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
         ``"auto"``: one output, every input, integer orders 1 to 4 with zeros, delays, direct feedthrough, an
-        integrator and an output level, then fractional orders. These are chosen if they predict better, or as well
+        integrator, an output level and a drift, then fractional orders. These are chosen if they predict better, or as well
         with a Schwarz criterion lower by 10. Feedthrough is not tried where an input answers the output (a closed
         loop): the answer of a controller within a row would be taken for it.
     validation
