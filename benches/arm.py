@@ -38,7 +38,7 @@ def recovery(seeds: range, levels: list[float]) -> None:
             run = with_noise(clean_run(stage, shape), level, [seed, round(level), stage])
             start = time.process_time()
             try:
-                fit = ftlm.identify(run, structure(stage), method="output-error", threads=1).fit
+                fit = ftlm.identify(run, structure(stage), method="output-error", threads=1).joint
             except ftlm.FtlmError as error:
                 lost[key] = lost.get(key, 0) + 1
                 print(*key, seed, error, flush=True)

@@ -186,7 +186,7 @@ OTHERS = [
 
 def numbers(found: ftlm.Identification, asked: Sequence[str] = ()) -> str:
     """Values with standard errors, orders with intervals."""
-    joint = found.fit
+    joint = found.joint
     assert joint is not None
     out = []
     for name, value in zip(joint.names, joint.values.tolist(), strict=True):
@@ -212,7 +212,7 @@ def judged(
         begun = time.process_time()
         try:
             found = fitted([runs[u] for u in used], made)
-            fits = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
+            fits = {n: found.model.compare(r).fit[output] for n, r in runs.items()}
         except ftlm.FtlmError as error:
             yield "+".join(used), str(error), "", ""
             continue
@@ -290,8 +290,8 @@ def gains() -> Iterator[str]:
             free = run[output] - np.column_stack(shares).sum(axis=1)
             rest = columns[:, 2:]
             left = free - rest @ np.linalg.lstsq(rest, free, rcond=1e-12)[0]
-            fits = [lsim_link.fit_percent(run[output], e) for e in (left, run[output] - columns @ gain)]
-            ours = found.model.compare(run).fit_percent[output]
+            fits = [lsim_link.fit(run[output], e) for e in (left, run[output] - columns @ gain)]
+            ours = found.model.compare(run).fit[output]
             yield (
                 f"| {output} | {used} | {judge} | **{ours:.1f}** (SciPy {fits[0]:.1f}) | {fits[1]:.1f} | "
                 f"{gain[0]:.3f} | {gain[1]:.3f} |"
@@ -342,7 +342,7 @@ def hubs() -> Iterator[str]:
             found = ftlm.identify(
                 runs[used], made, method=ftlm.OutputError(intervals="quadratic", start=start), threads=1
             )
-            fits = {n: found.model.compare(r).fit_percent for n, r in runs.items()}
+            fits = {n: found.model.compare(r).fit for n, r in runs.items()}
             told = " | ".join(
                 ", ".join(f"{f[y]:.1f}" if n == used else f"**{f[y]:.1f}**" for n, f in fits.items())
                 for y in made.outputs
@@ -392,7 +392,7 @@ def steps() -> Iterator[str]:
     yield "| --- | --- | --- | --- | --- | --- |"
     for name, (text, freed, zero) in SINGLE.items():
         found = fitted([runs[n] for n in FIVE], structure(words("theta12", text, freed), ["theta12"], zero))
-        fits = {n: found.model.compare(r).fit_percent["theta12"] for n, r in runs.items()}
+        fits = {n: found.model.compare(r).fit["theta12"] for n, r in runs.items()}
         own = [fits[n] for n in FIVE]
         lqg = [v for n, v in fits.items() if n.startswith("lqg") and n not in FIVE]
         lqr = [v for n, v in fits.items() if n.startswith("lqr")]
@@ -411,6 +411,6 @@ def left_out() -> Iterator[str]:
             text, freed, zero = SINGLE[kind]
             made = structure(words("theta12", text, freed), ["theta12"], zero)
             found = fitted([r for n, r in runs.items() if n != left], made)
-            fits[kind].append(found.model.compare(run).fit_percent["theta12"])
+            fits[kind].append(found.model.compare(run).fit["theta12"])
         yield f"| {left} | {' | '.join(f'{v[-1]:.1f}' for v in fits.values())} |"
     yield f"| median (least) | {' | '.join(spread(v) for v in fits.values())} |"

@@ -276,7 +276,7 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
         print(f"    ! {warning}", flush=True)
     for name, run in runs.items():
         there = found.model.compare(run)
-        fits = ", ".join(f"{n} {v:.2f}" for n, v in there.fit_percent.items())
+        fits = ", ".join(f"{n} {v:.2f}" for n, v in there.fit.items())
         print(
             f"    {name} {'fitted' if name in names else 'judged'}: {fits}, "
             f"offset {there.offsets[0]['theta11']['constant']:+.3f}",

@@ -87,9 +87,9 @@ def arm(name: str, used: Sequence[str] = ("psf", "lqr")) -> None:
     identify, before, found = ftlm.identify, peak(), []
     seconds = spent(lambda: found.append(identify([runs[n] for n in used], structure, threads=1)))
     numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in found[0].parameters.values())
-    fits = {n: found[0].model.compare(run).fit_percent["theta22"] for n, run in runs.items()}
+    fits = {n: found[0].model.compare(run).fit["theta22"] for n, run in runs.items()}
     case = name if len(used) > 1 else f"{name} on {used[0]}"
-    told(case, seconds, before, f"{found[0].fit_percent['theta22']:.2f} %: {percents(fits, used)}; {numbers}")
+    told(case, seconds, before, f"{found[0].fit['theta22']:.2f} %: {percents(fits, used)}; {numbers}")
 
 
 def state_space(python: str) -> None:
@@ -162,7 +162,7 @@ def long(samples: int) -> None:
     identify, before, found = ftlm.identify, peak(), []
     seconds = spent(lambda: found.append(identify(run, ftlm.equation("D^alpha y = a y + b u"), threads=1)))
     numbers = ", ".join(f"{p.name} {p.value:.6g}" for p in found[0].parameters.values())
-    told(f"{samples} samples", seconds, before, f"{found[0].fit_percent['y']:.2f} %: {numbers}")
+    told(f"{samples} samples", seconds, before, f"{found[0].fit['y']:.2f} %: {numbers}")
 
 
 def main() -> None:

@@ -150,7 +150,7 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
             "off": off > OFF,
             "runs": own.evaluations,
         }
-    correlation = np.abs(found.fit.correlation) if found.fit is not None else np.zeros((1, 1))
+    correlation = np.abs(found.joint.correlation) if found.joint is not None else np.zeros((1, 1))
     np.fill_diagonal(correlation, 0.0)
     times = (fit - begin, test - fit, end - test)
     return {"numbers": numbers, "correlation": float(np.nanmax(correlation)), "times": times}

@@ -104,15 +104,15 @@ def chain(run: ftlm.Run, name: str) -> Iterator[str]:
         except ftlm.FtlmError as error:
             yield f"| {run.name} | {name} | {kind} | {error} | | |"
             continue
-        assert found.fit is not None
-        cost = found.fit.noise["y"] ** 2
+        assert found.joint is not None
+        cost = found.joint.noise["y"] ** 2
         ratio = cost / least
         worse = " **worse**" if ratio > 1.0 + TOLD else ""
         numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in found.parameters.values())
         spent = time.process_time() - begun
         yield (
-            f"| {run.name} | {name} | {kind} | {found.fit_percent['y']:.2f} | {ratio:.4f}{worse} | {numbers}; "
-            f"{found.fit.initial_terms} initial terms | {spent:.1f} s |"
+            f"| {run.name} | {name} | {kind} | {found.fit['y']:.2f} | {ratio:.4f}{worse} | {numbers}; "
+            f"{found.joint.initial_terms} initial terms | {spent:.1f} s |"
         )
         least = min(least, cost)
 

@@ -56,7 +56,7 @@ def recovery(seeds: int) -> None:
         clean, found, hits, count, times = plant.clean(), 0, 0, 0, []
         for seed in range(seeds):
             begun = time.process_time()
-            joint = ftlm.identify(plant.run(clean, seed), plant.structure, threads=1).fit
+            joint = ftlm.identify(plant.run(clean, seed), plant.structure, threads=1).joint
             times.append(time.process_time() - begun)
             assert joint is not None
             ratio = joint.noise[plant.output] / (NOISE * float(np.std(clean)))

@@ -284,11 +284,11 @@ def heating() -> Iterator[str]:
         found = ftlm.identify(run, structure)
         part = ftlm.identify(run.window(0, 1000), structure)
         numbers = ", ".join(f"{n} {v:.3f} ± {found.standard_errors[n]:.2g}" for n, v in found.orders.items())
-        finer = found.fit.noise["T"] if found.fit is not None else np.nan
+        finer = found.joint.noise["T"] if found.joint is not None else np.nan
         yield (
-            f"{name}: fit {found.fit_percent['T']:.2f} %, residuals {finer:.2f} degC, BIC {found.information.bic:.0f}"
+            f"{name}: fit {found.fit['T']:.2f} %, residuals {finer:.2f} degC, BIC {found.information.bic:.0f}"
             f"{'; ' + numbers if numbers else ''}; identified from the first 1000 of 1600 s: "
-            f"{part.model.compare(run).fit_percent['T']:.2f} % of all"
+            f"{part.model.compare(run).fit['T']:.2f} % of all"
         )
         yield from (f"  {name}: {w}" for w in found.warnings)
 

@@ -87,7 +87,7 @@ def fitted(words: str, runs: list[ftlm.Run], judged: list[ftlm.Run]) -> ftlm.Ide
     begun = time.process_time()
     found = ftlm.identify(runs, ftlm.equation(words), threads=1, method=ftlm.OutputError(intervals="quadratic"))
     output = found.model.outputs[0]
-    fits = ", ".join(f"{r.name} {found.model.compare(r).fit_percent[output]:.1f}" for r in judged)
+    fits = ", ".join(f"{r.name} {found.model.compare(r).fit[output]:.1f}" for r in judged)
     numbers = ", ".join(f"{n} {v:.5g} ± {found.standard_errors[n]:.2g}" for n, v in found.coefficients.items())
     used = "+".join(r.name for r in runs)
     print(f"| {output} | {used} | {numbers} | {fits} | {time.process_time() - begun:.0f} s", flush=True)

@@ -264,7 +264,7 @@ def unseen() -> Figure:
     plot = figure.add_subplot(xlabel="time [s]", ylabel="deflection [rad]")
     plot.plot(sine.time[thin], sine["theta12"][thin], color="0.7", linewidth=3, label="measured, noise of 1e-4 rad")
     for name, fit, style in (("published algorithm", published, "C1"), ("ftlm identify", ours, "C0")):
-        words = f"{name}: {max(fit.fit_percent['theta12'], 0.0):.1f} %"
+        words = f"{name}: {max(fit.fit['theta12'], 0.0):.1f} %"
         plot.plot(sine.time[thin], fit.simulated["theta12"][0][thin], style, linewidth=1, label=words)
     figure.legend(fontsize="small", loc="outside lower center", ncols=3)
     return figure

@@ -77,7 +77,7 @@ def projected(
     return (found[:count] if first is None else np.r_[first, found[: count - 1]]), left
 
 
-def fit_percent(y: np.ndarray, left: np.ndarray) -> float:
+def fit(y: np.ndarray, left: np.ndarray) -> float:
     """Fit of a free run that leaves this."""
     return 100.0 * (1.0 - float(np.linalg.norm(left) / np.linalg.norm(y - y.mean())))
 

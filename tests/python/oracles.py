@@ -238,7 +238,7 @@ def normalised_residual(measured: np.ndarray, model: np.ndarray) -> float:
     return root_mean_square(measured, model) / float(np.std(measured, ddof=0))
 
 
-def fit_percent(measured: np.ndarray, model: np.ndarray) -> float:
+def fit(measured: np.ndarray, model: np.ndarray) -> float:
     """Fit in per cent: 100 for a perfect model, 0 for one no better than the mean."""
     measured, model = np.asarray(measured, float), np.asarray(model, float)
     return float(100 * (1 - np.linalg.norm(measured - model) / np.linalg.norm(measured - measured.mean())))

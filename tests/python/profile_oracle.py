@@ -544,9 +544,9 @@ def _tangent(attempt: Iterate, i: int) -> Floats:
 
 def likelihood_of(result: Identification) -> ProfileLikelihood:
     """Return the profile likelihood around the optimum of an output-error result."""
-    if result.fit is None or result.task is None:
+    if result.joint is None or result.task is None:
         raise ModelError(
             f"method {result.method!r} has no likelihood to profile; identify by {parameter('method', 'output-error')}"
         )
-    problem = FreeProblem.of(replace(result.task.structure, initial=result.fit.initial))
-    return ProfileLikelihood.of(result.fit, problem, result.task.runs)
+    problem = FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
+    return ProfileLikelihood.of(result.joint, problem, result.task.runs)

@@ -74,7 +74,7 @@ def test_what_parts_are_is_what_is_identified_of_them(changed):
     alone = ftlm.identify(run.window(6.0, None), SECOND, threads=1)
     assert changed.results[1].coefficients == alone.coefficients
     assert changed.results[1].intervals == alone.intervals
-    assert changed.cross_validation[1][0] == alone.model.compare(run.window(0.0, 6.0)).fit_percent
+    assert changed.cross_validation[1][0] == alone.model.compare(run.window(0.0, 6.0)).fit
 
 
 def test_a_part_begins_as_its_own_fit_found():
@@ -110,8 +110,8 @@ def test_all_numbers_together_are_told_by_their_covariances():
     """Two parts by the formula for two: the difference in the sum of their covariances; three by weights."""
     parts = [changing([40.0], seed=seed) for seed in range(3)]
     results = [ftlm.identify(run, SECOND, threads=1) for run in parts]
-    points = [r.fit.values for r in results]
-    spreads = [r.fit.covariance for r in results]
+    points = [r.joint.values for r in results]
+    spreads = [r.joint.covariance for r in results]
     apart = points[0] - points[1]
     assert joint_distance(results[:2]) == (
         pytest.approx(float(apart @ np.linalg.solve(spreads[0] + spreads[1], apart))),
@@ -125,9 +125,9 @@ def test_all_numbers_together_are_told_by_their_covariances():
 
 def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
     first, second = same.results
-    blind = replace(second.fit, covariance=np.where(np.eye(3) * [1, 0, 0] > 0, np.inf, second.fit.covariance))
-    place = second.fit.names[0]
-    half = [first, replace(second, fit=blind)]
+    blind = replace(second.joint, covariance=np.where(np.eye(3) * [1, 0, 0] > 0, np.inf, second.joint.covariance))
+    place = second.joint.names[0]
+    half = [first, replace(second, joint=blind)]
     told = {d.name: d for d in differences(half)}
     assert math.isnan(told[place].difference_in_errors)
     assert not told[place].disjoint
@@ -135,8 +135,8 @@ def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
     found = replace(same, results=tuple(half), differences=tuple(differences(half)))
     assert found.not_identifiable == (place,)
     assert f"{place}: not identifiable from some part" in str(found)
-    nothing = replace(second.fit, covariance=np.diag([np.inf] * 3))
-    none = [first, replace(second, fit=nothing)]
+    nothing = replace(second.joint, covariance=np.diag([np.inf] * 3))
+    none = [first, replace(second, joint=nothing)]
     assert joint_distance(none) == (None, 0)
     found = replace(same, results=tuple(none), differences=tuple(differences(none)), distance=None, degrees=0)
     assert found.consistent is None
@@ -145,13 +145,13 @@ def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
 
 def test_intervals_by_profile_are_compared_by_the_ends_that_face_each_other(same):
     first, second = same.results
-    name = first.fit.names[0]
+    name = first.joint.names[0]
     value = values(first)[name], values(second)[name]
     low, high = sorted(value)
 
     def bent(result, below, above):
         bounds = replace_interval(result, name, values(result)[name] - below, values(result)[name] + above)
-        return replace(result, fit=bounds)
+        return replace(result, joint=bounds)
 
     order = (first, second) if value[0] <= value[1] else (second, first)
     gap = high - low
@@ -173,7 +173,7 @@ def values(result):
 
 
 def replace_interval(result, name, low, high):
-    return replace(result.fit, profiles={name: ftlm.ProfileInterval(low, high, 0.95)})
+    return replace(result.joint, profiles={name: ftlm.ProfileInterval(low, high, 0.95)})
 
 
 def test_a_page_a_frame_and_json(changed, tmp_path):

@@ -48,7 +48,7 @@ def predicted(words: ftlm.Structure, runs: dict[str, ftlm.Run], fitted: str) -> 
     """Fit in percent of the free run on the run that the model never saw."""
     found = ftlm.identify(runs[fitted], words, method="output-error")
     other = "lqr" if fitted == "psf" else "psf"
-    return found.model.compare(runs[other]).fit_percent["theta12"], found
+    return found.model.compare(runs[other]).fit["theta12"], found
 
 
 def stock(words: str) -> ftlm.Structure:
@@ -72,7 +72,7 @@ def test_one_fractional_order_predicts_better_than_none(runs) -> None:
         whole, _ = predicted(stock(GAUGE), runs, fitted)
         fractional, found = predicted(stock(SPRING_POT), runs, fitted)
         assert fractional > whole + 2.0
-        low, high = found.fit.intervals["beta"]
+        low, high = found.joint.intervals["beta"]
         assert 0.0 < low < high < 0.15
 
 
@@ -94,7 +94,7 @@ def test_a_filtered_equation_starts_where_its_filter_does(runs) -> None:
     assert sorted(found.initial[0]["theta12"]) == [-2.0, -1.0, 0.0, 1.0, np.inf]
     assert abs(simulated[1] - simulated[0]) < 2.0 * np.abs(np.diff(simulated[1:50])).max()
     # A link that feeds energy has 64.6: no more than chance.
-    assert found.fit_percent["theta12"] == pytest.approx(65.0, abs=0.5)
+    assert found.fit["theta12"] == pytest.approx(65.0, abs=0.5)
 
 
 def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:
@@ -106,8 +106,8 @@ def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:
     # On psf the gauge has a level of its own; without it the fit has 91.0, and 70.6 on lqr.
     for fitted, other, own, unseen in (("psf", "lqr", 92.5, 70.8), ("lqr", "psf", 83.6, 72.3)):
         found = ftlm.identify(runs[fitted], link, method="output-error")
-        assert found.fit_percent["theta22"] == pytest.approx(own, abs=0.5)
-        assert found.model.compare(runs[other]).fit_percent["theta22"] == pytest.approx(unseen, abs=0.5)
+        assert found.fit["theta22"] == pytest.approx(own, abs=0.5)
+        assert found.model.compare(runs[other]).fit["theta22"] == pytest.approx(unseen, abs=0.5)
         assert found.coefficients["p4"] == pytest.approx(-2.05, abs=0.12)
         assert found.coefficients["d4"] < 0.0
 
@@ -135,7 +135,7 @@ def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bo
     step = runs["lqr"].step
     point, known = lsim_link.fitted(tables["lqr"], step, output, terms, [(-115, -2), (-260, -1)], first=first, **asked)
     scipy = {
-        n: lsim_link.fit_percent(t[output], lsim_link.projected(t, step, output, point, terms, known=known, **asked)[1])
+        n: lsim_link.fit(t[output], lsim_link.projected(t, step, output, point, terms, known=known, **asked)[1])
         for n, t in tables.items()
     }
     assert scipy == pytest.approx({"lqr": own, "psf": unseen}, abs=0.3)
@@ -146,7 +146,7 @@ def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bo
         initial="caputo",
     )
     found = ftlm.identify(runs["lqr"], made, method=ftlm.OutputError(intervals="quadratic"))
-    ours = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
+    ours = {n: found.model.compare(r).fit[output] for n, r in runs.items()}
     assert ours == pytest.approx(scipy, abs=0.3)
 
 
@@ -163,6 +163,6 @@ def test_where_one_signal_stands_for_the_rest_there_is_no_machine(runs) -> None:
     )
     made = replace(link.with_orders({"mu4": 1.0}), initial="caputo")
     found = ftlm.identify(runs["psf"], made, method=ftlm.OutputError(intervals="quadratic"))
-    assert found.fit_percent["theta22"] > 92.0
+    assert found.fit["theta22"] > 92.0
     assert found.coefficients["b4"] == pytest.approx(-0.83, abs=0.05)
     assert found.orders["beta4"] < 0.02

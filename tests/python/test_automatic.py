@@ -42,7 +42,7 @@ def test_auto_finds_a_delay_zeros_feedthrough_and_an_integrator(
     other, truth = record(numerator, denominator, seed=2, hold=7, late=late)
     found = ftlm.select(run, "auto", threads=1)
     assert words in found.winner.name
-    assert found.best.model.compare(other).fit_percent["y"] > truth - 0.5
+    assert found.best.model.compare(other).fit["y"] > truth - 0.5
 
 
 def test_auto_finds_the_level_of_an_output_rather_than_a_pole_and_a_zero_at_zero() -> None:

@@ -30,7 +30,7 @@ def found(small_run):
 
 def test_the_optimum_of_a_clean_run_is_found(found):
     assert found.method == "genetic"
-    assert found.fit_percent["y"] > 98
+    assert found.fit["y"] > 98
     assert all(BOUNDS[n][0] <= value <= BOUNDS[n][1] for n, value in found.coefficients.items())
     assert found.intervals == {}
 

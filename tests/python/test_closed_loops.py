@@ -261,7 +261,7 @@ def test_the_reference_takes_the_bias_out():
             found = ftlm.identify(run, STRUCTURE, method=ftlm.OutputError(reference=reference))
             errors[how].append((found.coefficients["b"] - loops.TRUTH["b"]) / found.standard_errors["b"])
             assert loop_codes(found) == (["loop_found"] if how == "measured" else [])
-            assert found.fit.converged
+            assert found.joint.converged
     assert abs(np.mean(errors["r"])) < 0.5 * abs(np.mean(errors["measured"]))
 
 
@@ -339,7 +339,7 @@ def test_residuals_are_orthogonal_to_what_follows_the_reference():
     # The oracle: sensitivities by differences of the exact step response's convolutions with the answer to r.
     run = loops.loop("closed, coloured", 3)
     found = ftlm.identify(run, STRUCTURE, method=ftlm.OutputError(reference="r"))
-    assert found.fit.converged
+    assert found.joint.converged
     values = {n: p.value for n, p in found.parameters.items()}
     (answer,), _ = instrument_runs([run], STRUCTURE, "r")
 

@@ -349,7 +349,7 @@ def test_a_file_keeps_it(tmp_path) -> None:
     assert np.ptp(there["theta11"]) > 0.05
     for name in ("theta11", "theta12"):
         assert np.array_equal(there[name], back[name])
-    assert again.compare(there).fit_percent["theta12"] > 99.99
+    assert again.compare(there).fit["theta12"] > 99.99
 
 
 # ----------------------------------------------------------------------------------------------------------- estimates
@@ -378,7 +378,7 @@ def test_both_bodies_are_recovered(seed: int) -> None:
     found = ftlm.identify(sampled_arm(seed), ftlm.equation(WORDS, initial="rest"), threads=1)
     near(found, {**TRUTH, "fc": 4.0})
     assert found.intervals["fc"][1] - found.intervals["fc"][0] < 0.02
-    assert min(found.fit_percent.values()) > 99.5
+    assert min(found.fit.values()) > 99.5
     assert found.warnings == ()
 
 
@@ -409,7 +409,7 @@ def test_the_arm_is_identified_by_the_natural_call() -> None:
     clean = model.simulate(ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=zeros))
     noisy = {n: clean[n] + 0.003 * np.std(clean[n]) * rng.standard_normal(t.size) for n in zeros}
     run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy)
-    found = ftlm.identify(run, structure, threads=1).fit
+    found = ftlm.identify(run, structure, threads=1).joint
     for name, value in zip(found.names, found.values.tolist(), strict=True):
         assert abs(value - {**orders, **free}[name]) < 4.0 * found.standard_errors[name], name
 

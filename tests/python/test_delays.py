@@ -70,7 +70,7 @@ def test_a_delay_is_estimated_with_the_rest(found):
     assert errors["delay_u"] < plants.clean_run("3T").step
     assert found.model.structure.delay == found.delays
     assert found.model.structure.free_delays == {}
-    assert found.fit.step_converged
+    assert found.joint.step_converged
 
 
 def test_its_score_is_that_of_a_standard_normal_number():
@@ -104,8 +104,8 @@ def test_the_model_is_the_one_with_the_delay_known(found, tmp_path):
     run = late_run(DELAY, 40, 0)
     known = structure().with_delays(found.delays).with_orders(found.orders).with_coefficients(found.coefficients)
     assert np.array_equal(ftlm.Model(known).simulate(run)["y"], found.model.simulate(run)["y"])
-    assert found.fit_percent["y"] == pytest.approx(found.model.compare(run).fit_percent["y"], abs=1e-12)
-    assert found.fit_percent["y"] > 98
+    assert found.fit["y"] == pytest.approx(found.model.compare(run).fit["y"], abs=1e-12)
+    assert found.fit["y"] > 98
     saved = found.model.save(tmp_path / "late.json")
     again = ftlm.load_model(saved)
     assert again.structure.delay == found.delays
@@ -267,7 +267,7 @@ def test_a_negative_delay_is_estimated(words):
     assert found.delays["u"] == pytest.approx(-0.14, abs=4 * error)
     assert error < 0.02
     assert found.coefficients["b"] == pytest.approx(4.0, abs=4 * found.standard_errors["b"])
-    assert found.fit_percent["y"] > 98.5
+    assert found.fit["y"] > 98.5
 
 
 def test_an_input_is_no_more_than_a_row_early():

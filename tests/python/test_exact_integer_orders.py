@@ -84,7 +84,7 @@ def fit_and_truth(seed: int, more: int = 0) -> tuple[float, float]:
     run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": noisy})
     equation = ftlm.equation(f"D^{n} y = {' + '.join(terms)}", initial="rest")
     found = ftlm.identify(run, equation, method=ftlm.OutputError(intervals="quadratic"))
-    left = 1 - found.fit_percent["y"] / 100
+    left = 1 - found.fit["y"] / 100
     return left**2, float(np.sum((noisy - y) ** 2) / np.sum((noisy - noisy.mean()) ** 2))
 
 

@@ -293,7 +293,7 @@ def test_results_become_frames(small_run, with_noise):
     assert frame.loc["alpha", "value"] == fit.orders["alpha"]
     assert frame.loc["a", "low"] == fit.intervals["a"][0]
     errors = fit.comparison.to_frame()
-    assert errors.loc[(run.name, "y", "output error"), "fit"] == fit.fit_percent["y"]
+    assert errors.loc[(run.name, "y", "output error"), "fit"] == fit.fit["y"]
     search = ftlm.identify(run, ftlm.equation(words, orders={"alpha": "1.4:1.8:0.1"}), method="least-squares")
     table = search.searches["y"].to_frame()
     assert table.iloc[0]["alpha"] == search.orders["alpha"]

@@ -81,7 +81,7 @@ def test_a_filter_in_motion_is_found_with_the_start(names: str) -> None:
     run = hub_run(names, start=(0.3, 1.0, 0.05, -0.4), held=(0.25, 0.8, 0.07, 0.2))
     model = solved(WORDS, TRUTH, behind(*names), initial="caputo")
     found = model.compare(run)
-    assert min(found.fit_percent.values()) > 99.7
+    assert min(found.fit.values()) > 99.7
     start = found.initial[0]
     assert {n for n in "xq" if {-1.0, -2.0} <= set(start[n])} == set(names)
     for name in names:
@@ -104,13 +104,13 @@ def test_a_cart_is_recovered_behind_its_filter(level: float, rate: float, held: 
         assert abs(found.coefficients[name] - value) < 4.0 * found.standard_errors[name], name
         low, high = found.intervals[name]
         assert high - low < 0.02
-    assert found.fit_percent["y"] > 99.4
+    assert found.fit["y"] > 99.4
     assert found.warnings == ()
     if rate:
         return
     # Taken for the position itself, what was read gives other numbers.
     blind = ftlm.identify(run, ftlm.equation(CART, initial=initial), threads=1)
-    assert blind.fit_percent["y"] < 99.0
+    assert blind.fit["y"] < 99.0
     assert abs(blind.coefficients["fc"] - 0.8) > 0.05
 
 
@@ -122,7 +122,7 @@ def test_both_bodies_are_recovered(names: str) -> None:
     )
     for name, value in TRUTH.items():
         assert abs(found.coefficients[name] - value) < 4.0 * found.standard_errors[name], name
-    assert min(found.fit_percent.values()) > 99.5
+    assert min(found.fit.values()) > 99.5
 
 
 def test_the_arm_s_hub_and_its_filtered_link(tmp_path) -> None:
@@ -140,7 +140,7 @@ def test_the_arm_s_hub_and_its_filtered_link(tmp_path) -> None:
     back = ftlm.load_model(model.save(tmp_path / "arm.json")).simulate(run)
     for name in ("theta11", "theta12"):
         assert np.array_equal(there[name], back[name])
-    assert model.compare(there).fit_percent["theta12"] > 99.99
+    assert model.compare(there).fit["theta12"] > 99.99
 
 
 def test_what_was_filtered_and_drives_a_body_that_sticks_is_refused() -> None:

@@ -86,7 +86,7 @@ def test_one_equation_with_a_filtered_input_or_output(filtered, method, m):
     found = ftlm.identify(run, words, method=method, m=m)
     for name, value in TRUTH.items():
         assert found.coefficients[name] == pytest.approx(value, rel=1e-6), name
-    assert found.model.compare(run).fit_percent["y"] > 99.9999
+    assert found.model.compare(run).fit["y"] > 99.9999
     if filtered:
         wrong = ftlm.identify(run, ftlm.equation(WORDS, initial="rest"), method="least-squares")
         assert max(abs(wrong.coefficients[n] / v - 1) for n, v in TRUTH.items()) > 0.05
@@ -103,7 +103,7 @@ def test_equations_that_follow_together_behind_filters(filtered):
     found = ftlm.identify(run, replace(structure, coupling="simulated"), method="output-error")
     for name, value in (TRUTH | SECOND).items():
         assert found.coefficients[name] == pytest.approx(value, rel=1e-6), name
-    assert min(found.model.compare(run).fit_percent.values()) > 99.9999
+    assert min(found.model.compare(run).fit.values()) > 99.9999
     simulated, truth = found.model.simulate(run, tolerance=1e-5), measured(filtered, together=True)
     # What a filtered signal drives comes filtered; the machine's own motion comes as it is measured.
     known = measured(("y", "z", "v"), together=True) if "v" in filtered else truth
@@ -120,14 +120,14 @@ def test_a_run_in_motion_starts_with_a_filter_in_motion(filtered):
     for name, value in TRUTH.items():
         assert found.coefficients[name] == pytest.approx(value, rel=1e-4), name
     compared = found.model.compare(run)
-    assert compared.fit_percent["y"] > 99.999
+    assert compared.fit["y"] > 99.999
     started = compared.initial[0]["y"]
     assert sorted(started) == [-2.0, -1.0, 0.0, 1.0]
     again = found.model.simulate(run, initial=compared.initial[0], tolerance=1e-4)
     np.testing.assert_allclose(again["y"], compared.simulated["y"][0], atol=2e-4 * np.abs(again["y"]).max())
     assert "filter's state 1" in found.details()
     # Exponents that are given are all there is.
-    given = ftlm.Model(replace(found.model.structure, initial=(0.0, 1.0))).compare(run).fit_percent["y"]
+    given = ftlm.Model(replace(found.model.structure, initial=(0.0, 1.0))).compare(run).fit["y"]
     assert given < 99.0
 
 
@@ -171,7 +171,7 @@ def test_a_derivative_above_its_equations_order_takes_none_of_the_beginning(filt
     for name, value in ABOVE_TRUTH.items():
         assert found.coefficients[name] == pytest.approx(value, rel=0.01), name
     compared = found.model.compare(run)
-    assert compared.fit_percent["y"] > 99.8
+    assert compared.fit["y"] > 99.8
     if "v" not in filtered:
         # At the first samples as everywhere.
         missed = np.abs(compared.simulated["y"][0] - run["y"])
@@ -279,7 +279,7 @@ def test_equations_that_follow_together_start_with_their_filters_in_motion(names
     model = ftlm.Model(carried(names, fixed=CARRIED_TRUTH))
     compared = model.compare(run)
     # All that is left is the force between its samples.
-    assert min(compared.fit_percent.values()) > 99.98
+    assert min(compared.fit.values()) > 99.98
     start = compared.initial[0]
     assert {n for n in "xq" if {-1.0, -2.0} <= set(start[n])} == set(names)
     for name in names:
@@ -318,7 +318,7 @@ def test_coupled_runs_in_motion_are_identified_from_their_own_start(filtered):
     found = ftlm.identify(run, structure, method="output-error")
     for name, value in (TRUTH | SECOND).items():
         assert found.coefficients[name] == pytest.approx(value, rel=1e-5), name
-    assert min(found.model.compare(run).fit_percent.values()) > 99.999
+    assert min(found.model.compare(run).fit.values()) > 99.999
     assert "filter's state 1" in found.details()
 
 
@@ -380,9 +380,9 @@ def test_an_input_that_passed_the_filter_is_not_filtered_again():
     # A model as it is, on signals that a state-space model made: today's answer for a deflection among the inputs.
     run = run_of(measured(("y", "v")))
     model = ftlm.Model(ftlm.equation(WORDS, sensor_filter=sensor(("y", "v")), initial="rest", fixed=TRUTH))
-    assert model.compare(run).fit_percent["y"] > 99.9999
+    assert model.compare(run).fit["y"] > 99.9999
     twice = ftlm.Model(ftlm.equation(WORDS, sensor_filter=sensor(("y",)), initial="rest", fixed=TRUTH))
-    assert twice.compare(run).fit_percent["y"] < 95.0
+    assert twice.compare(run).fit["y"] < 95.0
 
 
 def test_responses_are_those_of_the_measured_signals():

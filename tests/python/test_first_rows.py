@@ -118,7 +118,7 @@ def test_equation_error_methods_see_deviations_from_the_level(method):
     y = 35.0 + plant([3.0], [6.0, 1.0], u) + 1e-3 * np.random.default_rng(6).standard_normal(u.size)
     found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS), method=method)
     assert gain_of(found) == pytest.approx(3.0, rel=0.03)
-    assert found.fit_percent["y"] > 95
+    assert found.fit["y"] > 95
     assert found.comparison.offsets[0]["y"]["level"] == pytest.approx(35.0, abs=0.05)
 
 
@@ -153,7 +153,7 @@ def test_a_level_is_known_to_models_comparisons_and_files(tmp_path):
     found.model.save(tmp_path / "m.json")
     again = ftlm.load_model(tmp_path / "m.json")
     assert again.structure.offset == "level"
-    assert again.compare(run_of(u, y)).fit_percent == pytest.approx(found.fit_percent)
+    assert again.compare(run_of(u, y)).fit == pytest.approx(found.fit)
     # The printed fit is that of the simulation and the level, sample by sample.
     level = found.comparison.offsets[0]["y"]["level"]
     c = found.coefficients
@@ -173,7 +173,7 @@ def test_a_model_from_zero_predicts_a_run_at_another_level_from_rest():
     other = step_input(200, 40, 1.0, -2.0)
     there = 55.0 + plant([1.7], [12.0, 1.0], other - 1.0) + 0.01 * np.random.default_rng(2).standard_normal(200)
     compared = found.model.compare(run_of(other, there))
-    assert compared.fit_percent["y"] > 99
+    assert compared.fit["y"] > 99
     # One number, no history.
     assert list(compared.initial[0]["y"]) == [np.inf]
 
@@ -221,8 +221,8 @@ def test_a_level_that_is_asked_for_does_not_imply_rest():
     found = ftlm.identify(run, ftlm.equation("D y = a y + b u", offset="level"))
     assert found.parameters["a"].value == pytest.approx(-1 / 40, rel=0.02)
     assert found.parameters["b"].value == pytest.approx(0.6 / 40, rel=0.02)
-    assert found.fit_percent["y"] > 97
-    assert found.model.compare(run).fit_percent["y"] > 97
+    assert found.fit["y"] > 97
+    assert found.model.compare(run).fit["y"] > 97
 
 
 def test_initial_values_of_the_textbook_are_refused_with_caputos_powers():

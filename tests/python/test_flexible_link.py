@@ -368,12 +368,12 @@ def test_the_whole_arm_is_one_joint_fit():
     found = ftlm.identify(
         arm_in_motion(5000, 0.01), replace(ftlm.flexible_link(form="published", stage="both"), initial="rest")
     )
-    assert len(found.fit.names) == 20
+    assert len(found.joint.names) == 20
     for stage in (1, 2):
         for name, value in demo_plant(stage, form="published").orders.items():
             assert abs(found.orders[name] - value) < 5 * found.standard_errors[name], name
     # One percent of noise leaves 99.00 on average.
-    assert min(found.fit_percent.values()) > 98.98
+    assert min(found.fit.values()) > 98.98
 
 
 def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or_comparison(clean_a):

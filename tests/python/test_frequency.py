@@ -309,12 +309,12 @@ def test_the_covariance_of_a_tied_coefficient_is_that_of_its_product(plant, driv
     fit = ftlm.identify(with_noise(clean, 1e-4, 1), ftlm.flexible_link(form="published", stage=1))
     numbers = parameter_vector(fit.model)
     deviation = np.sqrt(np.diag(np.array(fit.model.estimate.covariance)))
-    errors, values = fit.standard_errors, fit.fit.coefficients
+    errors, values = fit.standard_errors, fit.joint.coefficients
     at = {t.name: 9 * i + 2 * k + 2 for i, e in enumerate(fit.model.equations) for k, t in enumerate(e.terms)}
     for name in ("a1", "b1"):
         assert numbers[at[name]] == pytest.approx(values[name])
         assert deviation[at[name]] == pytest.approx(errors[name], rel=1e-9)
-    joint, names = fit.fit, fit.fit.names
+    joint, names = fit.joint, fit.joint.names
     a, r = names.index("a1"), names.index("r1")
     product = np.zeros(len(names))
     product[a], product[r] = -values["r1"], -values["a1"]
@@ -325,7 +325,7 @@ def test_what_is_known_of_a_fit_stays_with_the_saved_model(fits, tmp_path):
     fit = fits[0]
     loaded = ftlm.load_model(fit.model.save(tmp_path / "m.json"))
     assert loaded.estimate == fit.model.estimate
-    assert loaded.estimate.fit == fit.fit_percent
+    assert loaded.estimate.fit == fit.fit
     w = [1.0, 3.0]
     for one, two in zip(analysis.response_deviation(loaded, w), analysis.response_deviation(fit.model, w), strict=True):
         np.testing.assert_array_equal(one, two)

@@ -325,7 +325,7 @@ def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
         assert abs(found.coefficients[name] - truth) < 4.0 * error + 0.004
     constants = [o["y"]["constant"] for o in found.comparison.offsets]
     np.testing.assert_allclose(constants, [0.15, -0.1], atol=0.02)
-    assert found.fit_percent["y"] > 98.5
+    assert found.fit["y"] > 98.5
     assert np.isnan(found.equation_error["y"].fit)
     page = found.report(tmp_path / "cart.html").read_text()
     assert "sgn" in page
@@ -339,7 +339,7 @@ def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
     assert str(again).count("equation error") == 1
     assert reason in str(again)
     assert "nan" not in str(again)
-    assert again.fit_percent["y"] == pytest.approx(found.fit_percent["y"], abs=1e-9)
+    assert again.fit["y"] == pytest.approx(found.fit["y"], abs=1e-9)
 
 
 def test_a_velocity_of_one_sign_does_not_tell_friction_from_an_offset() -> None:

@@ -35,12 +35,12 @@ def run_of(path: str, current: str, *, clip: float = np.inf, **options) -> ftlm.
 def test_a_hub_with_friction_follows_its_current(path: str, options, least: float) -> None:
     run = run_of(path, "Im1_meas_A", **options)
     found = ftlm.identify(run, ftlm.equation(HUB, initial="caputo"))
-    assert found.fit_percent["theta11"] >= least
+    assert found.fit["theta11"] >= least
     low, high = found.intervals["fc"]
     assert 0.0 < low < high < 10.0
     # Without friction the same equation is further off.
     plain = ftlm.identify(run, ftlm.equation(HUB.replace(" - fc*sign(D theta11)", ""), initial="caputo"))
-    assert plain.fit_percent["theta11"] < found.fit_percent["theta11"]
+    assert plain.fit["theta11"] < found.fit["theta11"]
 
 
 def test_steps_that_were_not_fitted_are_predicted() -> None:
@@ -50,6 +50,6 @@ def test_steps_that_were_not_fitted_are_predicted() -> None:
     }
     fitted = ("30", "20", "minus10", "minus20")
     found = ftlm.identify([steps[n] for n in fitted], ftlm.equation(HUB, initial="caputo"))
-    judged = [found.model.compare(steps[n]).fit_percent["theta11"] for n in steps if n not in fitted]
+    judged = [found.model.compare(steps[n]).fit["theta11"] for n in steps if n not in fitted]
     assert np.median(judged) >= 85.0
     assert min(judged) >= 60.0

@@ -65,7 +65,7 @@ def test_without_the_input_a_decay_is_identified():
     found = ftlm.identify(decay, ftlm.equation("D^2 y = a1 D y + a0 y"), threads=1)
     assert found.coefficients["a1"] == pytest.approx(-0.8, abs=4 * found.standard_errors["a1"])
     assert found.coefficients["a0"] == pytest.approx(-9.16, abs=4 * found.standard_errors["a0"])
-    assert found.fit_percent["y"] > 98
+    assert found.fit["y"] > 98
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -76,7 +76,7 @@ def test_an_input_of_few_frequencies_is_counted(method, u, fixes):
     assert [w for w in found.warnings if said in w]
     if method == "output-error":
         # Correlated by more than 0.995, and yet each known to within a tenth: both can be used.
-        joint = found.fit
+        joint = found.joint
         pair = joint.names.index("a0"), joint.names.index("b0")
         assert abs(joint.correlation[pair]) > MAX_PARAMETER_CORRELATION
         assert all(
@@ -154,7 +154,7 @@ def test_a_lattice_of_one_point_is_that_point(method):
 @pytest.mark.parametrize(("noise", "fit"), [(1.0, 30), (3.2, 5)])
 def test_noise_as_large_as_the_signal_widens_the_intervals(noise, fit):
     found = identified(run(square(), noise=noise), "output-error")
-    assert found.fit_percent["y"] == pytest.approx(fit, abs=2)
+    assert found.fit["y"] == pytest.approx(fit, abs=2)
     assert truth_is_inside(found)
     assert any("does not differ significantly from 0" in w for w in found.warnings)
     assert any(f.code == "buried_in_noise" for f in found.findings)

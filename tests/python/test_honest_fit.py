@@ -51,10 +51,10 @@ def test_simulation_and_comparison_are_scipys(zeta, per_period, through):
         y = exact(numerator, [1, 2 * zeta, 1], u, step, kind)
         run, model = run_of(u, y, step, kind), ftlm.Model(ftlm.equation(words, initial="rest"))
         np.testing.assert_allclose(model.simulate(run)["y"], y, atol=1e-6 * np.max(np.abs(y)))
-        assert model.compare(run).fit_percent["y"] > 100 - 1e-3
+        assert model.compare(run).fit["y"] > 100 - 1e-3
         noisy = y + 0.1 * np.std(y) * np.random.default_rng(2).standard_normal(rows)
         found = model.compare(run_of(u, noisy, step, kind)).output_error["y"]
-        assert found.fit == pytest.approx(nrmse_fit(noisy, y), abs=1e-3)
+        assert found.joint == pytest.approx(nrmse_fit(noisy, y), abs=1e-3)
         assert found.rmse == pytest.approx(np.sqrt(np.mean((noisy - y) ** 2)), rel=1e-5)
 
 
@@ -137,15 +137,13 @@ def test_the_printed_fit_of_a_light_damping_is_that_of_the_model(per_period):
     noisy = y + 0.02 * np.std(y) * np.random.default_rng(0).standard_normal(rows)
     run = run_of(u, noisy, step)
     result = ftlm.identify(run, ftlm.equation("D^2 y = a1 D y + a0 y + b0 u"))
-    assert result.fit_percent["y"] == pytest.approx(98.0, abs=0.15)
-    assert result.fit_percent["y"] == pytest.approx(nrmse_fit(noisy, result.model.simulate(run)["y"]), abs=1e-4)
-    assert result.fit_percent == result.model.compare(run).fit_percent
-    assert result.validate(run).fit_percent == result.fit_percent
+    assert result.fit["y"] == pytest.approx(98.0, abs=0.15)
+    assert result.fit["y"] == pytest.approx(nrmse_fit(noisy, result.model.simulate(run)["y"]), abs=1e-4)
+    assert result.fit == result.model.compare(run).fit
+    assert result.validate(run).fit == result.fit
     a1, a0, b0 = (result.coefficients[n] for n in ("a1", "a0", "b0"))
-    assert result.fit_percent["y"] == pytest.approx(
-        nrmse_fit(noisy, exact([b0], [1, -a1, -a0], u, step, "zoh")), abs=1e-4
-    )
-    assert compare_means(result.model, run).fit_percent["y"] < 95  # what was printed
+    assert result.fit["y"] == pytest.approx(nrmse_fit(noisy, exact([b0], [1, -a1, -a0], u, step, "zoh")), abs=1e-4)
+    assert compare_means(result.model, run).fit["y"] < 95  # what was printed
 
 
 def test_noise_is_not_averaged_away():
@@ -157,8 +155,8 @@ def test_noise_is_not_averaged_away():
     model = ftlm.Model(ftlm.equation("D y = -1.0 y + 1.0 u", initial="rest"))
     found = model.compare(run_of(u, noisy, step))
     assert found.output_error["y"].rmse == pytest.approx(np.sqrt(np.mean((noisy - y) ** 2)), rel=1e-6)
-    assert found.fit_percent["y"] == pytest.approx(nrmse_fit(noisy, y), abs=1e-4)
-    assert compare_means(model, run_of(u, noisy, step)).fit_percent["y"] > found.fit_percent["y"] + 10
+    assert found.fit["y"] == pytest.approx(nrmse_fit(noisy, y), abs=1e-4)
+    assert compare_means(model, run_of(u, noisy, step)).fit["y"] > found.fit["y"] + 10
 
 
 @pytest.mark.parametrize("kind", ["zoh", "foh"])
@@ -170,7 +168,7 @@ def test_a_run_in_motion_gets_its_initial_terms_from_samples(kind, through):
     y = exact(numerator, [1, 0.04, 1], u, step, kind, start=[0.3, 0.5])
     model = ftlm.Model(ftlm.equation(words, initial="caputo"))
     found = model.compare(run_of(u, y, step, kind))
-    assert found.fit_percent["y"] > 100 - 1e-3
+    assert found.fit["y"] > 100 - 1e-3
     terms = {"y": found.initial[0]["y"]}
     again = model.simulate(run_of(u, y, step, kind), initial=terms)["y"]
     np.testing.assert_allclose(again, y, atol=2e-6 * np.max(np.abs(y)))
@@ -194,7 +192,7 @@ def test_a_model_that_runs_away_is_said_to():
     run = run_of(commands(300, 9), commands(300, 10), 0.1)
     model = ftlm.Model(ftlm.equation("D^1.5 y = 90 y + 1.0 u", initial="rest"))
     found = model.compare(run)
-    assert not np.isfinite(found.fit_percent["y"])
+    assert not np.isfinite(found.fit["y"])
     assert not found.output_error["y"].fit >= 0
 
 
@@ -207,8 +205,8 @@ def test_a_real_arm_with_feed_through_prints_what_it_simulates():
     own = nrmse_fit(acceleration, result.model.simulate(run)["y"])
     c = result.coefficients
     theirs = exact([c["b2"], c["b1"], c["b0"]], [1, -c["a1"], -c["a0"]], torque, 0.01, "zoh")
-    assert result.fit_percent["y"] == pytest.approx(own, abs=1e-3)
-    assert result.fit_percent["y"] == pytest.approx(nrmse_fit(acceleration, theirs), abs=1e-3)
+    assert result.fit["y"] == pytest.approx(own, abs=1e-3)
+    assert result.fit["y"] == pytest.approx(nrmse_fit(acceleration, theirs), abs=1e-3)
 
 
 @pytest.mark.parametrize(("seed", "rows"), [(0, 401), (1, 201), (3, 201)])
@@ -218,5 +216,5 @@ def test_the_printed_fit_is_that_of_the_residuals_where_numbers_cannot_be_told_a
     run = whole.window(0.0, (rows - 1) * whole.step)
     structure = ftlm.equation("D^alpha y = d D^mu y + e D^nu y + a y + b u", initial="rest")
     found = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="quadratic"))
-    assert found.fit.standard_errors["mu"] > 0.2
-    assert found.output_error["y"].rmse == pytest.approx(found.fit.noise["y"], rel=0.1)
+    assert found.joint.standard_errors["mu"] > 0.2
+    assert found.output_error["y"].rmse == pytest.approx(found.joint.noise["y"], rel=0.1)

@@ -98,7 +98,7 @@ def test_the_truth_is_found_without_noise(small_run, structure, method):
     weak = ftlm.MultiInnovation(prior_covariance=1e9) if method == "multi-innovation" else method
     found = ftlm.identify(small_run, structure, method=weak, m=512)
     assert found.coefficients == {n: pytest.approx(v, rel=2e-3) for n, v in TRUTH.items()}
-    assert found.fit_percent["y"] > 99.9
+    assert found.fit["y"] > 99.9
     assert found.warnings == ()
     assert found.method == method
     assert found.searches == {}
@@ -159,7 +159,7 @@ def test_known_coefficients_stay_what_they_are(small_run):
     assert found.coefficients["a"] == pytest.approx(-3, rel=2e-3)
     everything = ftlm.identify(small_run, ftlm.equation(WORDS, fixed=TRUTH), method="least-squares")
     assert everything.coefficients == TRUTH
-    assert everything.fit_percent["y"] > 99.9
+    assert everything.fit["y"] > 99.9
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -271,7 +271,7 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
     for described in plants["A"]["equations"]:
         for term in described["terms"]:
             assert found.coefficients[term["name"]] == pytest.approx(term["coefficient"], rel=1e-3)
-    assert all(fit > 99.9 for fit in found.fit_percent.values())
+    assert all(fit > 99.9 for fit in found.fit.values())
     assert found.warnings == ()
     assert found.model.units == {"theta11": "rad", "theta12": "rad", "I1": "A"}
 
@@ -295,7 +295,7 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
             ours, theirs = getattr(found, kind)["y"], getattr(again, kind)["y"]
             for figure in ("error", "rmse", "nr", "fit"):
                 assert getattr(theirs, figure) == pytest.approx(getattr(ours, figure), rel=1e-12), figure
-        assert again.fit_percent == pytest.approx(found.fit_percent, rel=1e-12)
+        assert again.fit == pytest.approx(found.fit, rel=1e-12)
     if initial == "caputo":
         return  # each run's free run then fits its own initial terms, which a search does not
     if len(found.comparison.initial[0]["y"]) == 0:
@@ -511,7 +511,7 @@ def test_output_error_is_the_default_and_gives_intervals(small_run, with_noise):
         assert low - width / 2 < truth[name] < high + width / 2, name
         assert found.standard_errors[name] == pytest.approx(width / 2 / 1.96, rel=1e-3)
     assert set(found.intervals) == set(truth)
-    assert found.fit_percent["y"] > 95
+    assert found.fit["y"] > 95
     assert found.output_error["y"].rmse == pytest.approx(found.model.compare(run).output_error["y"].rmse, rel=1e-12)
 
 

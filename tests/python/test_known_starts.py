@@ -47,7 +47,7 @@ def test_a_richer_structure_from_a_simpler_one_is_never_worse(run, simple):
         method=ftlm.OutputError(start=simple, intervals="quadratic"),
         threads=1,
     )
-    assert rich.fit.noise["y"] <= simple.fit.noise["y"] * (1 + 1e-6)
+    assert rich.joint.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-6)
     from_model = ftlm.identify(
         run,
         ftlm.equation(RICH, initial="rest"),
@@ -65,8 +65,8 @@ def test_a_start_leads_where_automatic_ones_do_not():
         run, structure("3T"), method=ftlm.OutputError(start=truth, intervals="quadratic"), threads=1
     )
     alone = ftlm.identify(run, structure("3T"), method=ftlm.OutputError(intervals="quadratic"), threads=1)
-    assert with_start.fit.cost <= alone.fit.cost * (1 + 1e-9)
-    np.testing.assert_allclose(with_start.fit.values, alone.fit.values, rtol=1e-3)
+    assert with_start.joint.cost <= alone.joint.cost * (1 + 1e-9)
+    np.testing.assert_allclose(with_start.joint.values, alone.joint.values, rtol=1e-3)
 
 
 def test_the_command_takes_a_saved_model(run, simple, tmp_path):

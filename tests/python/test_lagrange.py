@@ -238,7 +238,7 @@ def test_free_runs_are_those_of_the_derived_form(stage: int) -> None:
 def test_driven_by_the_measured_hub_the_link_bends_as_it_does_coupled(stage: int) -> None:
     run = clean_run(stage, "multisine")
     alone = ftlm.Model(replace(model(stage).structure, coupling="measured", initial="rest"))
-    assert alone.compare(run).fit_percent[f"theta{stage}2"] > 99.8
+    assert alone.compare(run).fit[f"theta{stage}2"] > 99.8
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -338,7 +338,7 @@ def test_a_held_input_is_not_differentiated_beyond_the_output() -> None:
 def scores(stage: int, shape: str, level: float, seed: int) -> np.ndarray:
     """z-scores of all nine numbers from the automatic start."""
     run = with_noise(clean_run(stage, shape), level, [seed, round(level), stage])
-    found = ftlm.identify(run, structure(stage), method="output-error", threads=1).fit
+    found = ftlm.identify(run, structure(stage), method="output-error", threads=1).joint
     values = dict(zip(found.names, found.values.tolist(), strict=True))
     assert found.names == list(truth(stage))
     return np.array([(values[n] - v) / found.standard_errors[n] for n, v in truth(stage).items()])

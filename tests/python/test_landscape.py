@@ -21,8 +21,8 @@ def fit(small_run, with_noise):
 
 def form(fit, landscape):
     """The quadratic form of both orders' covariance over the landscape's points."""
-    at = [fit.fit.names.index(n) for n in landscape.names]
-    spread = fit.fit.covariance[np.ix_(at, at)]
+    at = [fit.joint.names.index(n) for n in landscape.names]
+    spread = fit.joint.covariance[np.ix_(at, at)]
     x, y = np.meshgrid(landscape.x - landscape.x.mean(), landscape.y - landscape.y.mean())
     moved = np.stack([x.ravel(), y.ravel()])
     return np.einsum("ki,kl,li->i", moved, np.linalg.inv(spread), moved).reshape(x.shape)
@@ -46,7 +46,7 @@ def test_refitted_the_cost_is_that_of_the_covariance(fit):
 
 def test_costs_are_those_of_residuals_after_a_linear_step(fit):
     found = output_error_landscape(fit)
-    joint, task = fit.fit, fit.task
+    joint, task = fit.joint, fit.task
     problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
     weights = [1.0 / joint.noise[o] for o in task.structure.outputs]
     grid = Objective(problem, task.runs, weights, joint.refinement)
@@ -79,7 +79,7 @@ def test_held_the_cost_is_never_lower(fit):
 def test_the_pair_least_told_apart_is_named(fit):
     first, second, correlation = correlated_orders(fit)
     assert (first, second) == ("alpha", "nu")
-    assert correlation == pytest.approx(fit.fit.correlation[0, 1])
+    assert correlation == pytest.approx(fit.joint.correlation[0, 1])
     drawn = heat_map(output_error_landscape(fit))
     assert "All other numbers refitted, by one linear step." in drawn.caption
     assert "increase of the weighted sum of squares" in drawn.caption
@@ -96,7 +96,7 @@ def test_without_two_orders_or_errors_there_is_none(fit, small_run, with_noise):
     one = ftlm.identify(run, ftlm.equation("D^alpha y = a D^0.6 y + c y + b u"))
     assert correlated_orders(one) is None
     assert output_error_landscape(one) is None
-    unknown = replace(fit, fit=replace(fit.fit, covariance=np.full_like(fit.fit.covariance, np.nan)))
+    unknown = replace(fit, joint=replace(fit.joint, covariance=np.full_like(fit.joint.covariance, np.nan)))
     assert output_error_landscape(unknown) is None
     searched = ftlm.identify(run, ftlm.equation("D^1.6 y = a D^0.6 y + c y + b u"), method="least-squares")
     assert output_error_landscape(searched) is None

@@ -61,7 +61,7 @@ def test_a_free_run_is_scipys_of_the_input_bent_by_hand(words, options, by_hand)
     y = response(bent(u, **by_hand))
     model = ftlm.Model(ftlm.equation(PLANT.format(words), initial="rest", **options))
     np.testing.assert_allclose(model.simulate(run_of(u, 0 * y))["y"], y, atol=1e-6 * np.max(np.abs(y)))
-    assert model.compare(run_of(u, y)).fit_percent["y"] > 99.999
+    assert model.compare(run_of(u, y)).fit["y"] > 99.999
     # Data in is never changed.
     run = run_of(u, y)
     model.simulate(run)
@@ -149,7 +149,7 @@ def test_a_limit_is_found_within_its_interval(words, name, value, by_hand):
         y = response(bent(u, **by_hand))
         noisy = y + 0.02 * np.std(y) * np.random.default_rng(seed).standard_normal(y.size)
         found = ftlm.identify(run_of(u, noisy), ftlm.equation(FREE.format(words), initial="rest"), threads=1)
-        assert found.fit.converged
+        assert found.joint.converged
         for k, (n, v) in enumerate((TRUTH | {name: value}).items()):
             low, high = found.intervals[n]
             within[k] += low <= v <= high
@@ -164,11 +164,11 @@ def test_without_its_limit_the_plant_is_another():
     noisy = run_of(u, y + 0.01 * np.std(y) * np.random.default_rng(7).standard_normal(y.size))
     plain = ftlm.identify(noisy, ftlm.equation(FREE.format("u"), initial="rest"), threads=1)
     found = ftlm.identify(noisy, ftlm.equation(FREE.format("sat(u, 0.1:3)"), initial="rest"), threads=1)
-    assert plain.fit_percent["y"] < 90
-    assert found.fit_percent["y"] > 98
+    assert plain.fit["y"] < 90
+    assert found.fit["y"] > 98
     u = levels(600, 8)
     other = run_of(u, response(bent(u, sat=0.6)))
-    assert found.model.compare(other).fit_percent["y"] > 99 > plain.model.compare(other).fit_percent["y"]
+    assert found.model.compare(other).fit["y"] > 99 > plain.model.compare(other).fit["y"]
 
 
 def test_a_limit_is_found_where_rows_have_times_of_their_own():
@@ -246,7 +246,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
     assert f"sat(u, {found.limits['sat_u']:.6g})" in str(found)
     html = str(equation_html(again.equations[0], limits=again.structure.limits))
     assert "<mi>sat</mi>" in html
-    assert "saturation of u" in parameter_table(again, found.fit).to_html()
+    assert "saturation of u" in parameter_table(again, found.joint).to_html()
     text = found.report(tmp_path / "report.html").read_text()
     assert "saturation of" in text
     assert found.to_dict()["limits"] == found.limits

@@ -190,7 +190,7 @@ def test_a_run_in_motion_that_passes_zero_as_it_starts_is_found_out():
     assert max(map(abs, motion.scores(found, plant).values())) < 3.5
     # Whoever judges the model on this run sees it as the fit did.
     assert found.model.structure.initial == "history"
-    assert ftlm.compare(found.model, run).fit_percent == pytest.approx(found.fit_percent, rel=1e-12)
+    assert ftlm.compare(found.model, run).fit == pytest.approx(found.fit, rel=1e-12)
 
 
 def test_whole_orders_need_whole_powers_alone():
@@ -215,7 +215,7 @@ def test_a_comparison_has_the_history_of_the_fit(halves, tmp_path):
     saved = ftlm.load_model(found.model.save(tmp_path / "model.json"))
     for model in (found.model, saved):
         again = model.compare(run)
-        assert again.fit_percent == pytest.approx(found.fit_percent, rel=1e-12)
+        assert again.fit == pytest.approx(found.fit, rel=1e-12)
         assert again.initial == found.comparison.initial
     terms = found.comparison.initial[0]
     assert list(terms["y"]) == [0, 0.25, 0.5, 0.75, 1, 1.25, 1.5, 2]
@@ -229,7 +229,7 @@ def test_a_run_in_motion_is_judged_with_its_own_history(halves):
     (first, second), (found, _) = halves
     judged = found.validate(second)
     clean = 100 * (1 - 0.01)
-    assert judged.fit_percent["y"] == pytest.approx(clean, abs=0.3)
+    assert judged.fit["y"] == pytest.approx(clean, abs=0.3)
     assert len(judged.initial[0]["y"]) == 8
     assert found.validate(first).initial == [{"y": {}}]
 
@@ -246,9 +246,9 @@ def test_a_history_explains_no_more_of_a_run_than_a_past_input_could(name, seed,
     true, wrong = (
         ftlm.Model(structure.with_coefficients({**coefficients, "b": share * coefficients["b"]})) for share in (1, 0.02)
     )
-    assert ftlm.compare(true, run).fit_percent["y"] > 99.1
+    assert ftlm.compare(true, run).fit["y"] > 99.1
     judged = ftlm.compare(wrong, run)
-    assert judged.fit_percent["y"] < 15
+    assert judged.fit["y"] < 15
     # What is printed is still what the initial terms simulate.
     answer = wrong.simulate(run, initial=judged.initial[0])["y"]
     np.testing.assert_allclose(answer, judged.simulated["y"][0], atol=1e-6 * np.std(run["y"]))
@@ -262,7 +262,7 @@ def test_a_run_that_no_input_moves_is_explained_by_its_past():
     run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u[100:]}, outputs={"y": y})
     structure = ftlm.equation(plant.words, initial="history").with_orders({"alpha": 0.7})
     model = ftlm.Model(structure.with_coefficients({"a": 0.5, "b": 1.0}))
-    assert ftlm.compare(model, run).fit_percent["y"] > 99
+    assert ftlm.compare(model, run).fit["y"] > 99
 
 
 def test_the_length_follows_the_noise_never_the_fit(halves):

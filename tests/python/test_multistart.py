@@ -16,8 +16,8 @@ def test_what_only_a_coarse_grid_carries_gives_way_to_another_optimum() -> None:
     run, noise = resonant_plant(39), []
     for text in ("D^alpha y = d D^mu y + a y + b u", "D^alpha y = d D^mu y + e D^nu y + a y + b u"):
         found = ftlm.identify(run, ftlm.equation(text), method=ftlm.OutputError(intervals="quadratic"))
-        assert found.fit is not None
-        noise.append(found.fit.noise["y"])
+        assert found.joint is not None
+        noise.append(found.joint.noise["y"])
     assert noise[1] < 1.0005 * noise[0]
 
 
@@ -27,7 +27,7 @@ def test_of_two_free_orders_each_is_known_in_a_race_of_its_own_where_noise_would
     fits = [
         ftlm.identify(
             run, ftlm.equation(f"D^alpha y = d D^{mu} y + a y + b u"), method=ftlm.OutputError(intervals="quadratic")
-        ).fit
+        ).joint
         for mu in ("1", "mu")
     ]
     assert fits[0] is not None
@@ -41,8 +41,8 @@ def test_the_order_of_an_input_is_freed_from_where_orders_are_integers() -> None
         found = ftlm.identify(
             run, ftlm.equation(text, initial="rest"), method=ftlm.OutputError(intervals="quadratic"), threads=1
         )
-        assert found.fit is not None
-        noise.append(found.fit.noise["y"])
+        assert found.joint is not None
+        noise.append(found.joint.noise["y"])
     assert noise[1] < 0.99995 * noise[0]
 
 

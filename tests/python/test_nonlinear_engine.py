@@ -261,7 +261,7 @@ def test_two_runs_with_a_delay_gaps_and_initial_values_are_fitted_together():
         y[300:340] = np.nan
         runs.append(ftlm.Run.from_arrays(step=0.01, inputs=inputs, outputs={"y": y}, missing="weight", name=f"{start}"))
     structure = ftlm.equation(text, delay={"u": (0.0, 0.2)}, initial="caputo")
-    joint = ftlm.identify(runs, structure, threads=1).fit
+    joint = ftlm.identify(runs, structure, threads=1).joint
     assert abs(joint.noise["y"] / 0.004 - 1) < 0.1
     for name, value in joint.values_by_name.items():
         assert abs(value - truth[name]) < 3.5 * joint.standard_errors[name], name
@@ -285,7 +285,7 @@ def tally(plant, seeds):
     """Number of intervals that hold the truth, and their number; raise where the noise is not reached."""
     clean, hits, count = plant.clean(), 0, 0
     for seed in seeds:
-        joint = identify(plant, clean, seed).fit
+        joint = identify(plant, clean, seed).joint
         noise = np.std(clean) * 0.01
         assert abs(joint.noise[plant.output] / noise - 1) < 0.1, (seed, joint.noise[plant.output] / noise)
         for name, (low, high) in joint.intervals.items():

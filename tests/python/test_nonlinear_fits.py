@@ -34,7 +34,7 @@ def test_equation_error_at_the_true_orders(runs, name, method):
     for parameter, estimate in result.parameters.items():
         # The bias of noise on the regressors of D^mu y.
         assert estimate.value == pytest.approx(PLANTS[name].truth[parameter], rel=0.15)
-    assert result.comparison.fit_percent["y"] > 90
+    assert result.comparison.fit["y"] > 90
 
 
 def test_column_of_a_nonlinear_term_is_that_of_its_signals(runs):

@@ -129,7 +129,7 @@ def test_a_constant_added_to_the_input_changes_only_the_offset(method):
     assert other.coefficients == pytest.approx(one.coefficients, rel=close)
     moved = other.comparison.offsets[0]["y"]["constant"] - one.comparison.offsets[0]["y"]["constant"]
     assert moved == pytest.approx(-3.0 * one.coefficients["b"], rel=10 * close)
-    assert other.fit_percent["y"] == pytest.approx(one.fit_percent["y"], abs=0.1)
+    assert other.fit["y"] == pytest.approx(one.fit["y"], abs=0.1)
 
 
 def test_a_motor_whose_tachometer_has_a_zero_of_its_own():
@@ -139,7 +139,7 @@ def test_a_motor_whose_tachometer_has_a_zero_of_its_own():
     assert low <= 0.035 <= high
     assert found.delays["u"] == pytest.approx(0.035, abs=1e-3)
     a, b = found.coefficients["a"], found.coefficients["b"]
-    covariance = found.fit.covariance[:2, :2]
+    covariance = found.joint.covariance[:2, :2]
     slope = np.array([-b / a**2, 1.0 / a])
     assert abs(b / a - 8.0) < 3 * np.sqrt(slope @ covariance @ slope)
     assert found.comparison.offsets[0]["w"]["constant"] / a == pytest.approx(5.0, rel=0.02)
@@ -161,7 +161,7 @@ def test_another_run_gets_its_own_offset():
     other = fractional_run(2, -2.0, name="other")
     checked = found.validate([other])
     assert checked.offsets[0]["y"]["constant"] == pytest.approx(-2.0, rel=0.05)
-    assert checked.fit_percent["y"] > 95
+    assert checked.fit["y"] > 95
     assert "offset in the equation of y in other (estimated on that run, for it alone): -" in str(checked)
     assert found.resid(other).initial_terms == 1
     # A simulation has none unless it is given.
@@ -322,8 +322,8 @@ def test_the_hub_of_the_arm_runs_free_with_an_offset_of_the_current():
     )
     structure = ftlm.equation("D^2 theta11 = -d D theta11 + b I1 + k theta12")
     without, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="constant")
-    assert without.fit_percent["theta11"] < 70
-    assert found.fit_percent["theta11"] > 85
+    assert without.fit["theta11"] < 70
+    assert found.fit["theta11"] > 85
     assert found.information.bic < without.information.bic - 1000
 
 
@@ -346,7 +346,7 @@ def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_pat
         checked = found.validate(other)
         zero = checked.offsets[0][run.outputs[0]]["constant"] / found.coefficients["a"]
         assert zero == pytest.approx(-2.0, rel=0.1)
-        assert checked.fit_percent[run.outputs[0]] > 95
+        assert checked.fit[run.outputs[0]] > 95
         assert "estimated on that run, for it alone" in str(checked)
     run.to_csv(tmp_path / "cell.csv")
     words = ["identify", str(tmp_path / "cell.csv"), "--structure", "D^alpha v = -a v + b i", "--offset", "auto"]
@@ -477,7 +477,7 @@ def test_the_offset_of_the_hub_ends_in_the_global_optimum(name, within):
     reached = 100 * (1 - best / np.linalg.norm(y - y.mean()))
     structure = ftlm.equation("D^2 theta11 = -d D theta11 + b I1 + k theta12 + c")
     found = ftlm.identify(thin, structure)
-    assert found.fit_percent["theta11"] == pytest.approx(reached, abs=0.3)
+    assert found.fit["theta11"] == pytest.approx(reached, abs=0.3)
     assert reached == pytest.approx({"psf": 76.4, "lqr": 87.9}[name], abs=0.3)
 
 

@@ -457,16 +457,16 @@ def test_criteria_of_a_small_example():
     assert oracles.absolute_error(measured, model) == 3
     assert oracles.root_mean_square(measured, model) == pytest.approx(np.sqrt(5 / 4))
     assert oracles.normalised_residual(measured, model) == pytest.approx(np.sqrt(5 / 4) / np.sqrt(3.5))
-    assert oracles.fit_percent(measured, model) == pytest.approx(100 * (1 - np.sqrt(5) / np.sqrt(14)))
+    assert oracles.fit(measured, model) == pytest.approx(100 * (1 - np.sqrt(5) / np.sqrt(14)))
 
 
 def test_fit_and_normalised_residual_are_one_number():
     rng = np.random.default_rng(7)
     measured, model = rng.standard_normal((2, 40))
     nr = oracles.normalised_residual(measured, model)
-    assert oracles.fit_percent(measured, model) == pytest.approx(100 * (1 - nr))
-    assert oracles.fit_percent(measured, measured) == 100
-    assert oracles.fit_percent(measured, np.full(40, measured.mean())) == pytest.approx(0, abs=1e-12)
+    assert oracles.fit(measured, model) == pytest.approx(100 * (1 - nr))
+    assert oracles.fit(measured, measured) == 100
+    assert oracles.fit(measured, np.full(40, measured.mean())) == pytest.approx(0, abs=1e-12)
 
 
 # Error, RMSE, NR as printed (strings keep the number of digits): Tables 4 and 5, integer row first, then p = 1 … 7.

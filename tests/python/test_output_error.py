@@ -125,27 +125,27 @@ def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int
     found = ftlm.identify(run, ftlm.flexible_link(form="published", stage=stage), method="output-error")
     plant = demo_plant(stage, form="published")
     truth = {n: v for n, v in plant.orders.items()} | plant.coefficients
-    assert found.fit is not None
-    for name, value in {**found.orders, **found.fit.coefficients}.items():
+    assert found.joint is not None
+    for name, value in {**found.orders, **found.joint.coefficients}.items():
         if name in truth:
             assert abs(value - truth[name]) < 5 * found.standard_errors[name], name
     for name, (low, high) in found.intervals.items():
         assert low < high, name
-    for output, noise_found in found.fit.noise.items():
+    for output, noise_found in found.joint.noise.items():
         assert noise_found == pytest.approx(noise * np.std(run[output]), rel=0.06)
     coefficients = found.coefficients
     d, h = 2 * stage, 2 * stage - 1
     assert coefficients[f"b{d}"] == -coefficients[f"b{h}"]
-    assert coefficients[f"a{d}"] == pytest.approx(-coefficients[f"a{h}"] * found.fit.coefficients[f"r{stage}"])
+    assert coefficients[f"a{d}"] == pytest.approx(-coefficients[f"a{h}"] * found.joint.coefficients[f"r{stage}"])
 
 
 def test_printed_figures_are_those_of_compare_and_the_model_saves(tmp_path) -> None:
     run = three_terms(40, 1)
     found = ftlm.identify(run, ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u"))
     assert found.method == "output-error"
-    assert found.fit_percent["y"] > 98
+    assert found.fit["y"] > 98
     again = ftlm.load_model(found.model.save(tmp_path / "m.json")).compare(run)
-    assert again.fit_percent["y"] == pytest.approx(found.fit_percent["y"], abs=1e-12)
+    assert again.fit["y"] == pytest.approx(found.fit["y"], abs=1e-12)
     assert "±" in str(found)
     assert set(found.to_dict()["intervals"]) == set(THREE_TERMS)
 
@@ -174,7 +174,7 @@ def test_a_run_that_does_not_start_at_rest_keeps_its_initial_terms_to_itself() -
     truth = {"alpha": 1.6, "nu": 0.7, "a1": -0.8, "a0": -2.0, "b0": 1.5}
     for name, value in {**found.orders, **found.coefficients}.items():
         assert abs(value - truth[name]) < 5 * found.standard_errors[name] + 1e-6, name
-    assert found.fit_percent["y"] > 99
+    assert found.fit["y"] > 99
 
 
 def test_what_the_run_cannot_tell_is_said_in_words() -> None:
@@ -208,7 +208,7 @@ def test_the_search_is_the_same_for_any_number_of_threads() -> None:
 
 def test_the_choice_of_an_optimum_is_given_in_words() -> None:
     found = ftlm.identify(three_terms(40, 0), structure())
-    joint = found.fit
+    joint = found.joint
     level = joint.starts[0][0]
     same = sum(v <= 1.001 * level for v, _ in joint.starts)
     assert joint.choice.startswith(f"{same} of {len(joint.starts)} starts ended in the lowest optimum, first that of: ")

@@ -84,7 +84,7 @@ def test_frequency_result_has_the_same_names():
     assert found.validate(data).verdict.level == "with care"
     residual = (found.model.frequency_response(omega)[0, 0] - data.response) / np.abs(data.response)
     expected = 100 - 100 * np.sqrt(np.mean(np.abs(residual) ** 2))
-    assert found.fit_percent == {"y": pytest.approx(expected)}
+    assert found.fit == {"y": pytest.approx(expected)}
     assert list(found.to_frame().index) == ["a", "b"]
 
 
@@ -98,5 +98,5 @@ def test_search_and_selection_have_the_same_names():
     assert chosen.parameters == chosen.best.parameters
     assert chosen.verdict == chosen.best.verdict
     assert chosen.covariance.shape == (2, 2)
-    assert chosen.validate(run(seed=2)).fit_percent["y"] > 95
+    assert chosen.validate(run(seed=2)).fit["y"] > 95
     assert chosen.summary() == str(chosen)

@@ -174,10 +174,10 @@ def test_steps_have_their_bands(joint):
 
 def test_correlations_are_those_of_the_fit(joint):
     axis = saved(ftlm.plot.correlation(joint)).axes[0]
-    np.testing.assert_array_equal(axis.images[0].get_array(), joint.fit.correlation)
+    np.testing.assert_array_equal(axis.images[0].get_array(), joint.joint.correlation)
     assert len(axis.texts) == 6
     with pytest.raises(ftlm.errors.ModelError, match="gives no joint covariance"):
-        ftlm.plot.correlation(replace(joint, fit=None))
+        ftlm.plot.correlation(replace(joint, joint=None))
 
 
 def test_residuals_over_time_and_how_often(joint):
@@ -190,7 +190,7 @@ def test_residuals_over_time_and_how_often(joint):
 def test_models_side_by_side(joint, found):
     figure = saved(ftlm.plot.models({"one": joint.comparison, HOSTILE: found.comparison}))
     widths = [p.get_width() for p in figure.axes[0].patches]
-    assert widths == pytest.approx([joint.fit_percent["y"], found.fit_percent["y"]])
+    assert widths == pytest.approx([joint.fit["y"], found.fit["y"]])
     other = replace(joint.comparison, output_error={"z": joint.output_error["y"]})
     with pytest.raises(ftlm.errors.ModelError, match="has the outputs z"):
         ftlm.plot.models({"one": joint.comparison, "two": other})

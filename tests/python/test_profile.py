@@ -49,8 +49,8 @@ def quadratic(run: ftlm.Run, words: str, loss: Loss = "squares") -> ftlm.Identif
 
 
 def problem_of(result: ftlm.Identification) -> FreeProblem:
-    assert result.fit is not None
-    return FreeProblem.of(replace(result.task.structure, initial=result.fit.initial))
+    assert result.joint is not None
+    return FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
 
 
 def intervals_of(
@@ -58,16 +58,16 @@ def intervals_of(
 ) -> ProfileResult:
     """Intervals of all free parameters by the core, with a budget of simulations, around another optimum."""
     problem, budget = problem_of(result), None if most is None else (most, 0)
-    assert result.fit is not None
-    joint = result.fit if fit is None else fit
+    assert result.joint is not None
+    joint = result.joint if fit is None else fit
     return profile_intervals(joint, problem, result.task.runs, problem.names, 0.95, budget=budget, **options)
 
 
 def one_error_beside(result: ftlm.Identification) -> JointFit:
     """The fit as if it had ended a standard error beside the optimum."""
     valley = likelihood_of(result)
-    assert result.fit is not None
-    return replace(result.fit, finest_grid_values=valley.best.values + valley.errors)
+    assert result.joint is not None
+    return replace(result.joint, finest_grid_values=valley.best.values + valley.errors)
 
 
 # ---------------------------------------------------------------------------------------------- the program in NumPy
@@ -100,7 +100,7 @@ def test_the_core_finds_what_the_program_in_numpy_finds(
         np.testing.assert_allclose((own.low, own.high), (other.low, other.high), rtol=1e-7, atol=1e-7 * width)
         np.testing.assert_allclose(own.points, other.points, rtol=1e-6, atol=1e-6)
         assert own.evaluations == other.evaluations
-    chosen = profile_intervals(found.fit, problem_of(found), found.task.runs, None, 0.95)
+    chosen = profile_intervals(found.joint, problem_of(found), found.task.runs, None, 0.95)
     assert list(chosen.intervals) == nonlinear_parameters(valley, 0.95)
 
 
@@ -251,8 +251,8 @@ def test_an_open_end_is_infinite_and_so_is_the_naive_cost_below_the_threshold(
 def test_terminal_json_frame_page_and_file_say_the_same(found: ftlm.Identification, tmp_path: Path) -> None:
     own = found.profiles["c"]
     assert found.intervals["c"] == (own.low, own.high)
-    assert found.fit is not None
-    assert found.fit.intervals["c"] == (own.low, own.high)
+    assert found.joint is not None
+    assert found.joint.intervals["c"] == (own.low, own.high)
     text = found.details()
     assert f"−∞ to {own.high:.6g}" in text
     assert "but those written out: by profile likelihood" in text
@@ -318,9 +318,9 @@ def test_progress_counts_ends_and_stops_the_work(found: ftlm.Identification) -> 
     problem = problem_of(found)
     runs = [recording(run, problem.structure) for run in found.task.runs]
     with pytest.raises(KeyboardInterrupt):
-        _core.profile_intervals(problem.core, runs, fit_state(found.fit, problem), [0], half_width(0.95), stop=stop)
+        _core.profile_intervals(problem.core, runs, fit_state(found.joint, problem), [0], half_width(0.95), stop=stop)
     with pytest.raises(ftlm.ModelError, match="parameter 3 of 3; count them from 0"):
-        _core.profile_intervals(problem.core, runs, fit_state(found.fit, problem), [3], half_width(0.95))
+        _core.profile_intervals(problem.core, runs, fit_state(found.joint, problem), [3], half_width(0.95))
 
 
 def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
@@ -376,17 +376,17 @@ def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
     twice = ftlm.Run.from_arrays(inputs={"u": u, "v": u}, outputs={"y": run["y"]}, step=STEP)
     structure = ftlm.equation("D^2 y = -0.8 D y + a y + b u + e v", initial="rest")
     plain = quadratic(run, "D^2 y = -0.8 D y + a y + b u")
-    assert plain.fit is not None
+    assert plain.joint is not None
     assert plain.task is not None
     task = replace(plain.task, runs=(twice,), structure=structure)
     values = np.array([plain.coefficients["a"], 1.0, plain.coefficients["b"] - 1.0])
     joint = replace(
-        plain.fit,
+        plain.joint,
         coefficients=dict(zip("abe", values.tolist(), strict=True)),
         finest_grid_values=values,
         covariance=np.diag([1.0, np.inf, np.inf]),
     )
-    seen = replace(plain, task=task, fit=joint).profile(threads=1)
+    seen = replace(plain, task=task, joint=joint).profile(threads=1)
     assert (seen["b"].low, seen["e"].high) == (-math.inf, math.inf)
     assert -4.0 in seen["a"]
     assert not seen["a"].is_open
@@ -399,9 +399,9 @@ def test_a_lower_optimum_on_the_way_is_gone_on_from(bent: ftlm.Run) -> None:
     there = intervals_of(plain, fit=one_error_beside(plain), evaluations=1)
     assert there.lower_optimum is not None
     assert there.lower_on_finer_grid
-    assert plain.fit is not None
-    np.testing.assert_allclose(there.lower_optimum, plain.fit.finest_grid_values, rtol=1e-3)
-    shift = dict(zip(plain.fit.names, plain.fit.values - plain.fit.finest_grid_values, strict=True))
+    assert plain.joint is not None
+    np.testing.assert_allclose(there.lower_optimum, plain.joint.finest_grid_values, rtol=1e-3)
+    shift = dict(zip(plain.joint.names, plain.joint.values - plain.joint.finest_grid_values, strict=True))
     for name, own in there.intervals.items():
         shifted = (right[name].low - shift[name], right[name].high - shift[name])
         np.testing.assert_allclose((own.low, own.high), shifted, rtol=2e-3)
@@ -443,7 +443,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     same = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
     # The fit was right all the while: its residuals do not fall, and its starts stay told.
     assert not [w for w in same.warnings if "the search for intervals did" in w]
-    assert same.fit.starts == right.fit.starts
+    assert same.joint.starts == right.joint.starts
     calls.clear()
     # As if it had been lower: of one optimum found twice rounding decides which is.
     monkeypatch.setattr(profiling, "MIN_NOISE_REDUCTION", -1.0)
@@ -497,10 +497,10 @@ def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification)
 
 
 def test_warnings_follow_the_profile(found: ftlm.Identification) -> None:
-    assert found.fit is not None
+    assert found.joint is not None
     problem = problem_of(found)
-    before = identifiability_findings(replace(found.fit, profiles={}), problem)
-    after = identifiability_findings(found.fit, problem)
+    before = identifiability_findings(replace(found.joint, profiles={}), problem)
+    after = identifiability_findings(found.joint, problem)
     assert [f for f in before if (f.code, f.parameter) == ("not_different_from_0", "c")]
     assert not [f for f in after if (f.code, f.parameter) == ("not_different_from_0", "c")]
 

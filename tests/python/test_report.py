@@ -151,7 +151,7 @@ def test_page_says_what_it_must(page, identified):
     assert "standard error" in text  # that there are none
     heads = [text.index(head) for head in ("Validation: measured and simulated", "Equations", "Warnings", "Errors")]
     assert heads == sorted(heads)
-    assert f"{identified.fit_percent['theta12']:.4g}\u00a0%" in text
+    assert f"{identified.fit['theta12']:.4g}\u00a0%" in text
 
 
 def test_charts_are_named_for_those_who_cannot_see_them(page):
@@ -247,12 +247,12 @@ def test_a_folder_that_cannot_be_written_is_said_before_any_work(tmp_path, ident
 
 def test_intervals_that_are_none_are_said(tmp_path, small_run, with_noise):
     found = ftlm.identify(with_noise(small_run, 0.02, 1), ftlm.equation("D^alpha y = a D^0.6 y + c y + b u"))
-    broken = replace(found.fit, covariance=np.full_like(found.fit.covariance, np.nan))
-    result = replace(found, fit=broken)
+    broken = replace(found.joint, covariance=np.full_like(found.joint.covariance, np.nan))
+    result = replace(found, joint=broken)
     text = " ".join(Page(result.report(tmp_path / "p.html").read_text("utf-8")).text)
     assert text.count("undefined") >= 3 * 4
     assert "the standard errors of alpha, a, c, b are not defined" in text
-    table = parameter_table(found.model, found.fit)
+    table = parameter_table(found.model, found.joint)
     low, high = found.intervals["alpha"]
     assert table.rows[0][1:5] == [found.orders["alpha"], found.standard_errors["alpha"], low, high]
 
@@ -339,7 +339,7 @@ def test_results_are_rich_in_a_notebook(identified, square):
     assert "<math>" in shown["identification"]
     values = {float(v) for v in Page(shown["identification"]).data}
     assert set(identified.coefficients.values()) <= values
-    assert identified.fit_percent["theta12"] in values
+    assert identified.fit["theta12"] in values
     for warning in identified.warnings:
         assert warning in " ".join(Page(shown["identification"]).text)
     plain = ftlm.Model(ftlm.equation("D^1.5 y = -y + u"))._repr_html_()

@@ -361,8 +361,8 @@ def test_output_error_finds_the_simulated_arm_and_its_intervals_say_so(reproduct
     for number, stage in reproduction.stages.items():
         result = stage.candidates["output error"].result
         truth = reproduction.truth[number]
-        for name in (*result.orders, *result.fit.coefficients):
-            value = {**result.orders, **result.fit.coefficients}[name]
+        for name in (*result.orders, *result.joint.coefficients):
+            value = {**result.orders, **result.joint.coefficients}[name]
             assert abs(value - truth[name]) < 4 * result.standard_errors[name], name
         # What is left is the noise that was put on the angles.
         assert all(f.rmse == pytest.approx(1e-4, rel=0.05) for f in result.output_error.values())

@@ -258,7 +258,7 @@ def test_validation_far_below_estimation_is_said(noisy, small_model):
     assert any("no validation" in w for w in again.warnings)
     fresh = small_model.simulate(blank(np.sin(0.02 * np.arange(800) ** 1.1)), tolerance=1e-5)
     assert found.validate(fresh).warnings == ()
-    assert found.validate(fresh).fit_percent == found.model.compare(fresh).fit_percent
+    assert found.validate(fresh).fit == found.model.compare(fresh).fit
 
 
 # ------------------------------------------------------------------------------------------------ tests that can fail

@@ -146,14 +146,14 @@ def test_what_stood_in_a_gap_changes_nothing_and_all_figures_count_what_is_there
     count = int(np.sum(~gaps[1:-1]))
     assert found.information is not None
     assert found.information.samples == count
-    assert found.fit is not None
-    assert found.fit.samples == count
+    assert found.joint is not None
+    assert found.joint.samples == count
     # The figures of the free run by hand, on what was read.
     simulated = found.model.simulate(run_of(u, y))["y"]
     read = y[~gaps]
     fit = 100 * (1 - np.linalg.norm(read - simulated[~gaps]) / np.linalg.norm(read - read.mean()))
-    assert found.fit_percent["y"] == pytest.approx(fit, abs=1e-4)
-    assert found.fit.noise["y"] == pytest.approx(np.sqrt(np.mean((read - simulated[~gaps]) ** 2)), rel=0.01)
+    assert found.fit["y"] == pytest.approx(fit, abs=1e-4)
+    assert found.joint.noise["y"] == pytest.approx(np.sqrt(np.mean((read - simulated[~gaps]) ** 2)), rel=0.01)
     assert found.residuals is not None
     assert found.residuals.passed
     assert np.isnan(found.equation_error["y"].nr)
@@ -367,19 +367,19 @@ def test_a_run_of_irregular_rows_is_identified_as_a_regular_one() -> None:
     near_truth(found)
     assert found.residuals is not None
     assert found.residuals.passed
-    assert found.fit_percent["y"] > 98.8
+    assert found.fit["y"] > 98.8
     t = record(6, 0.3)[0]
     assert np.array_equal(found.comparison.times[0], t[t <= run.duration])
     assert found.comparison.measured["y"][0].size == found.comparison.times[0].size
-    assert found.model.compare(run).fit_percent["y"] == pytest.approx(found.fit_percent["y"], abs=1e-9)
+    assert found.model.compare(run).fit["y"] == pytest.approx(found.fit["y"], abs=1e-9)
     # A third of the outputs gone as well: the same mechanism serves.
     u, part = run.sample_times.data["u"], run.sample_times.data["y"].copy()
     part[::3] = np.nan
     both = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": part}, time=t, resample=STEP, missing="weight")
     fewer = ftlm.identify(both, ftlm.equation(FREE))
     near_truth(fewer)
-    assert fewer.fit is not None
-    assert fewer.fit.samples == pytest.approx(2 / 3 * ROWS, abs=4)
+    assert fewer.joint is not None
+    assert fewer.joint.samples == pytest.approx(2 / 3 * ROWS, abs=4)
 
 
 def test_a_known_delay_is_honoured_and_a_free_one_says_what_it_costs() -> None:
@@ -389,7 +389,7 @@ def test_a_known_delay_is_honoured_and_a_free_one_says_what_it_costs() -> None:
         inputs={"u": u[:late]}, outputs={"y": np.interp(t[:late] - 0.2, t, y, left=0.0)}, time=t[:late], resample=STEP
     )
     known = ftlm.identify(run, ftlm.equation(FREE, delay={"u": 0.2}))
-    assert known.fit_percent["y"] > 99
+    assert known.fit["y"] > 99
     free = ftlm.identify(run, ftlm.equation(FREE, delay={"u": (0.1, 0.3)}))
     assert free.delays["u"] == pytest.approx(0.2, abs=0.02)
     assert any("outputs were interpolated linearly" in w for w in free.warnings)
@@ -440,8 +440,8 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     )
     # The noise is that of the usual samples, and the figures are those of all.
     y = noisy(1)[1]
-    assert robust.fit.noise["y"] == pytest.approx(0.01 * np.std(y), rel=0.15)
-    assert robust.fit_percent["y"] < 90
+    assert robust.joint.noise["y"] == pytest.approx(0.01 * np.std(y), rel=0.15)
+    assert robust.fit["y"] < 90
 
 
 def test_one_outlier_that_holds_most_of_the_squares_is_named() -> None:

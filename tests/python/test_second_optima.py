@@ -110,7 +110,7 @@ def test_one_optimum_is_not_reported_twice():
     found = ftlm.identify(run, structure)
     assert "second_optimum" not in codes(found)
     # A candidate that costs more on the coarse grid, or one that ends where the fit did, is none.
-    joint, problem = found.fit, FreeProblem.of(structure)
+    joint, problem = found.joint, FreeProblem.of(structure)
     far = list(joint.values * 1.2)
     for cost in (1.0, 1.2):
         again = replace(joint, survivors=[(1.0, list(joint.values)), (cost, far)])
@@ -123,7 +123,7 @@ def test_second_optima_of_a_long_run_are_looked_for_on_its_first_part(monkeypatc
     y = lsim(lti([3.0], [1.0, 2.0, 4.0]), u, 0.05 * np.arange(14000), interp=False)[1]
     run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y + 0.02 * g.standard_normal(14000)})
     structure = ftlm.equation("D^2 y = a D y + c y + b u", initial="rest")
-    joint = ftlm.identify(run, structure).fit
+    joint = ftlm.identify(run, structure).joint
     lengths = []
 
     class Counted(Objective):

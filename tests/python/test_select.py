@@ -82,7 +82,7 @@ def test_what_is_judged_was_not_fitted(runs, chosen):
     for left, seen in ((runs[0], runs[1]), (runs[1], runs[0])):
         alone = ftlm.identify(seen, chosen.winner.structure, threads=1, method=ftlm.OutputError(intervals="quadratic"))
         own = chosen.winner.validation[left.name]["y"]
-        assert own == pytest.approx(alone.model.compare(left).fit_percent["y"], abs=2e-3)
+        assert own == pytest.approx(alone.model.compare(left).fit["y"], abs=2e-3)
 
 
 def test_any_number_of_threads_gives_the_same_bits(runs, chosen):
@@ -240,8 +240,8 @@ def test_what_was_chosen_from_rest_is_judged_on_a_run_in_motion(runs):
     whole = motor(3, rows=800)
     found = ftlm.select(whole.window(0, 8.0), [ftlm.equation("D^2 y = d D y + a y + b u")], threads=1)
     late = whole.window(8.0, 16.0)
-    ours = found.best.validate(late).fit_percent["y"]
-    theirs = ftlm.identify(whole.window(0, 8.0), found.winner.structure).validate(late).fit_percent["y"]
+    ours = found.best.validate(late).fit["y"]
+    theirs = ftlm.identify(whole.window(0, 8.0), found.winner.structure).validate(late).fit["y"]
     assert ours > 95.0
     assert abs(ours - theirs) < 0.1
 

@@ -74,9 +74,9 @@ def test_a_machine_that_grows_is_found_growing() -> None:
     )
     assert found.coefficients["d"] == pytest.approx(0.2, abs=0.02)
     assert found.coefficients["a"] == pytest.approx(-25.0, rel=0.01)
-    assert found.fit is not None
-    assert found.fit.unstable_optimum is not None
-    assert found.fit.unstable_optimum.is_accepted
+    assert found.joint is not None
+    assert found.joint.unstable_optimum is not None
+    assert found.joint.unstable_optimum.is_accepted
     assert any("significant at 99 %" in w or "no stable one" in w for w in found.warnings)
     assert any("grows without bound" in w for w in found.warnings)
 
@@ -92,7 +92,7 @@ def test_what_is_printed_of_a_machine_that_grows_is_what_it_leaves() -> None:
     )
     words = ftlm.equation("D^2 y = d D y + a y + u", initial="caputo", offset="constant")
     model = ftlm.Model(words.with_coefficients({"d": 2 * growth, "a": -400.0}))
-    assert model.compare(run).fit_percent["y"] > 99.8
+    assert model.compare(run).fit["y"] > 99.8
 
 
 def test_a_machine_that_dies_away_is_compared_with_nothing() -> None:
@@ -100,8 +100,8 @@ def test_a_machine_that_dies_away_is_compared_with_nothing() -> None:
         swing(-0.5), ftlm.equation("D^2 y = a y + d D y + b u"), method=ftlm.OutputError(intervals="quadratic")
     )
     assert found.coefficients["d"] == pytest.approx(-0.5, abs=0.03)
-    assert found.fit is not None
-    assert found.fit.unstable_optimum is None
+    assert found.joint is not None
+    assert found.joint.unstable_optimum is None
     assert not any("stable" in w for w in found.warnings)
 
 
@@ -163,14 +163,14 @@ def test_a_link_that_would_feed_energy_is_no_link(runs_of_lqr: ftlm.Run) -> None
     run, unseen = runs_of_lqr, arm_run("psf", 10)
     link = StructureOptions(orders=["beta4=0"], fixed=["w4=0"]).structure("arm:2")
     found = ftlm.identify(run, link, method=ftlm.OutputError(intervals="quadratic"))
-    assert found.fit is not None
-    assert found.fit.unstable_optimum is not None
-    assert not found.fit.unstable_optimum.is_accepted
-    assert 0.01 < found.fit.unstable_optimum.residual_excess < 0.1
+    assert found.joint is not None
+    assert found.joint.unstable_optimum is not None
+    assert not found.joint.unstable_optimum.is_accepted
+    assert 0.01 < found.joint.unstable_optimum.residual_excess < 0.1
     assert found.coefficients["d4"] < 0.0
     assert found.model.stability(coupling="measured").unstable_poles == 0
     assert found.coefficients["p4"] == pytest.approx(-2.1, abs=0.15)
-    assert found.validate(unseen).fit_percent["theta22"] > 70.0
+    assert found.validate(unseen).fit["theta22"] > 70.0
     assert any("not significant" in w for w in found.warnings)
 
 

@@ -318,19 +318,19 @@ def test_it_is_recovered_from_the_automatic_start_with_intervals(tmp_path) -> No
         error = found.standard_errors[name]
         assert error < 0.08 * truth
         assert abs(found.coefficients[name] - truth) < 4.0 * error
-    assert found.fit_percent["y"] > 99.0
+    assert found.fit["y"] > 99.0
     assert found.warnings == ()
     page = found.report(tmp_path / "sledge.html").read_text()
     assert "Stribeck" in page
     # Coulomb friction alone leaves what it is for.
     plain = ftlm.identify(run, ftlm.equation(SLEDGE.replace(NEAR, ""), initial="rest"))
-    assert plain.fit_percent["y"] < found.fit_percent["y"] - 0.3
+    assert plain.fit["y"] < found.fit["y"] - 0.3
     # A run that was not fitted.
     other = sledge(2)[0]
-    assert found.model.compare(other).fit_percent["y"] > max(99.0, plain.model.compare(other).fit_percent["y"])
+    assert found.model.compare(other).fit["y"] > max(99.0, plain.model.compare(other).fit["y"])
     kept = ftlm.load_model(found.model.save(tmp_path / "sledge.json"))
     assert kept.estimate.covariance == found.model.estimate.covariance
-    assert kept.compare(other).fit_percent["y"] == found.model.compare(other).fit_percent["y"]
+    assert kept.compare(other).fit["y"] == found.model.compare(other).fit["y"]
 
 
 def test_offsets_of_several_runs_stand_beside_it() -> None:

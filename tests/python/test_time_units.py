@@ -36,7 +36,7 @@ def test_a_flat_fit_does_not_depend_on_the_unit_of_time(seed):
     found = {
         unit: ftlm.identify(
             lag(seed, scale), ftlm.equation(FLAT), threads=1, method=ftlm.OutputError(intervals="quadratic")
-        ).fit
+        ).joint
         for unit, scale in UNITS.items()
     }
     seconds = found["s"]

@@ -65,7 +65,7 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
     from ftlm.estimation.model_checks import identifiability_findings
 
     structure = ftlm.equation(WORDS, orders={"alpha": "1.5:1.7:0.1"})
-    joint = ftlm.identify(noisy, structure).fit
+    joint = ftlm.identify(noisy, structure).joint
     problem = FreeProblem.of(structure)
     assert not [w for w in identifiability_findings(joint, problem) if "alpha" in w.text]
     for value in (0.3**2, np.nan, np.inf):
@@ -85,7 +85,7 @@ def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
 
     from ftlm.estimation.model_checks import correlation_findings
 
-    joint = ftlm.identify(noisy, ftlm.equation(WORDS)).fit
+    joint = ftlm.identify(noisy, ftlm.equation(WORDS)).joint
     n = len(joint.names)
     # All of them correlated by 0.999; only the size of their errors differs.
     alike = np.full((n, n), 0.999) + 0.001 * np.eye(n)
@@ -137,7 +137,7 @@ def test_what_is_printed_is_what_compare_says(noisy, tmp_path):
             re.search(r"^  y +(\S+) +not tried", str(found), re.MULTILINE),
             re.search(r"^y +output error.* ([\d.]+)$", found.details(), re.MULTILINE),
         ):
-            assert float(printed[1]) == pytest.approx(again.fit_percent["y"], rel=1e-3)
+            assert float(printed[1]) == pytest.approx(again.fit["y"], rel=1e-3)
 
 
 def test_every_figure_of_a_report_follows_from_the_saved_model_and_the_run(noisy, tmp_path):
@@ -166,6 +166,6 @@ def test_an_unstable_model_is_called_so_however_well_it_fits(method: str) -> Non
         noisy = clean + 1e-4 * np.std(clean) * rng.standard_normal(u.size)
         run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": noisy})
         found = ftlm.identify(run, ftlm.equation("D y = a0 y + b0 u", initial="rest"), method=method)
-        assert found.fit_percent["y"] > 99
+        assert found.fit["y"] > 99
         said = [w for w in found.warnings if "1 pole with a positive real part" in w and "grows without bound" in w]
         assert len(said) == grows

@@ -10,7 +10,7 @@ import plants
 import truth
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.reproduction.simulated_arm import demo_plant
-from oracles import fit_percent
+from oracles import fit
 
 ARM = plants.truth("A")
 
@@ -53,7 +53,7 @@ def test_coupled_instrumental_variables_reach_the_fit_that_the_noise_allows_and_
     found = ftlm.identify(run, at_truth, method="instrumental-variables")
     # Equation by equation, this seed's coupled free run fits the clean outputs by 96.9 and 97.6 %.
     simulated = found.model.simulate(clean, tolerance=1e-6)
-    assert min(fit_percent(clean[n], simulated[n]) for n in clean.outputs) > 99.9
+    assert min(fit(clean[n], simulated[n]) for n in clean.outputs) > 99.9
     assert found.settings["m"] == run.length - 1
     assert found.residuals is not None
     assert all(found.residuals.white.values())
@@ -79,7 +79,7 @@ def test_the_lattice_with_instrumental_variables_finds_the_orders_of_three_terms
         assert abs(found.orders["alpha"] - 2.2) < 0.051
         assert abs(found.orders["nu"] - 0.9) < 0.051
         assert sum(found.exclusion_counts.values()) + len(found.table) == found.candidates
-        assert fit_percent(clean["y"], found.model.simulate(clean)["y"]) > 99.8
+        assert fit(clean["y"], found.model.simulate(clean)["y"]) > 99.8
     whole = ftlm.identify(run, structure, method=ftlm.InstrumentalVariables(order_grid=lattice))
     assert whole.orders == found.orders
     assert set(whole.standard_errors) == {"alpha", "nu", "a1", "a0", "b0"}
@@ -104,7 +104,7 @@ def test_noise_beyond_the_instruments_is_said(fitted: ftlm.Identification) -> No
         plants.structure("3T"),
         method=ftlm.InstrumentalVariables(order_grid=ftlm.order_grid(0.2, alpha=(1.8, 2.4))),
     )
-    assert found.fit_percent["y"] < 90
+    assert found.fit["y"] < 90
     assert found.warnings
 
 
@@ -114,7 +114,7 @@ def test_noise_beyond_the_instruments_is_said(fitted: ftlm.Identification) -> No
 def test_physical_parameters_follow_from_one_of_them(fitted: ftlm.Identification) -> None:
     inertia = 0.0635
     found = fitted.physical(J_11=inertia)
-    c = fitted.fit.coefficients
+    c = fitted.joint.coefficients
     assert found["J_11"].value == inertia
     assert found["J_11"].standard_error < 1e-9
     assert found["K_s1"].value == pytest.approx(c["a1"] * inertia)
@@ -167,9 +167,9 @@ def test_an_equation_error_method_has_no_physical_intervals() -> None:
 def test_coefficients_of_the_law_have_standard_errors(fitted: ftlm.Identification) -> None:
     assert set(fitted.standard_errors) >= {"a2", "b2", "d2", "g2", "r1"}
     assert fitted.standard_errors["b2"] == pytest.approx(fitted.standard_errors["b1"], rel=1e-9)
-    place = [fitted.fit.names.index(n) for n in ("a1", "r1")]
-    spread = fitted.fit.covariance[np.ix_(place, place)]
-    slope = np.array([-fitted.fit.coefficients["r1"], -fitted.fit.coefficients["a1"]])
+    place = [fitted.joint.names.index(n) for n in ("a1", "r1")]
+    spread = fitted.joint.covariance[np.ix_(place, place)]
+    slope = np.array([-fitted.joint.coefficients["r1"], -fitted.joint.coefficients["a1"]])
     assert fitted.standard_errors["a2"] == pytest.approx(np.sqrt(slope @ spread @ slope), rel=1e-9)
 
 
@@ -265,10 +265,10 @@ def test_a_richer_equation_never_fits_worse_than_a_simpler_one() -> None:
     simple = ftlm.identify(run, ftlm.equation("D^alpha y = a0 y + b0 u", **rest))
     structure = ftlm.equation("D^alpha y = a2 D^kappa y + a1 D^nu y + a0 y + b0 u", **rest)
     rich = ftlm.identify(run, structure, method=ftlm.OutputError(intervals="quadratic"))
-    assert rich.fit.noise["y"] <= simple.fit.noise["y"] * (1 + 1e-4)
+    assert rich.joint.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-4)
     # What it does not need it cannot tell, and says so.
     assert any("not identifiable" in w or "does not differ significantly from 0" in w for w in rich.warnings)
-    assert any("from a" in origin and "= 0" in origin for _, origin in rich.fit.starts)
+    assert any("from a" in origin and "= 0" in origin for _, origin in rich.joint.starts)
 
 
 @pytest.mark.slow
@@ -291,10 +291,10 @@ def test_an_order_too_many_ends_as_a_pole_too_fast_to_see_and_not_in_a_mode_of_t
     run = ftlm.Run.from_arrays(step=2.0, inputs={"u": u, "one": one}, outputs={"y": noisy})
     first = ftlm.identify(run, ftlm.equation("D y = a0 y + b0 u + c0 one", initial=(0.0,)))
     second = ftlm.identify(run, ftlm.equation("D^2 y = a1 D y + a0 y + b0 u + c0 one", initial=(0.0, 1.0)))
-    assert second.fit is not None
+    assert second.joint is not None
     # Left to itself the fit follows the misfit with a mode of the pulse scheme: 62 % beside the first order's 74 %.
-    assert second.fit_percent["y"] >= first.fit_percent["y"] - 0.1
-    assert second.fit.noise["y"] == pytest.approx(second.output_error["y"].rmse, rel=0.1)
+    assert second.fit["y"] >= first.fit["y"] - 0.1
+    assert second.joint.noise["y"] == pytest.approx(second.output_error["y"].rmse, rel=0.1)
 
 
 @pytest.mark.slow

@@ -284,7 +284,7 @@ def test_both_bodies_are_recovered(seed: int, start) -> None:
     found = ftlm.identify(noisy(seed, start), ftlm.equation(WORDS, initial=initial), threads=1)
     for name, value in {**TRUTH, **STRENGTH}.items():
         assert abs(found.coefficients[name] - value) < 4.0 * found.standard_errors[name], name
-    assert min(found.fit_percent.values()) > 99.5
+    assert min(found.fit.values()) > 99.5
     assert found.warnings == ()
 
 

@@ -53,7 +53,7 @@ def test_friction_is_the_same_in_any_unit(kind):
     for time, outputs, inputs in UNITS.values():
         there = identified(told(run, time, outputs, inputs), structure)
         assert there.orders == pytest.approx(here.orders, abs=1e-6)
-        assert there.fit_percent["y"] == pytest.approx(here.fit_percent["y"], abs=1e-5)
+        assert there.fit["y"] == pytest.approx(here.fit["y"], abs=1e-5)
         alpha, mu = here.orders.get("alpha", 2.0), here.orders.get("mu", 1.0)
         second = outputs * time**-alpha
         units = {
@@ -102,7 +102,7 @@ def test_laws_between_coefficients_are_the_same_in_any_unit():
         time, outputs, inputs = UNITS[kind]
         there = identified(told(run, time, outputs, inputs), structure)
         assert there.orders == pytest.approx(here.orders, abs=1e-6)
-        assert there.fit_percent == pytest.approx(here.fit_percent, abs=1e-4)
+        assert there.fit == pytest.approx(here.fit, abs=1e-4)
         alpha, mu, beta = (here.orders[n] for n in ("alpha1", "mu2", "beta2"))
         units = {
             "a1": time ** (beta - 2),

@@ -108,7 +108,7 @@ def test_fits_are_those_of_the_models_on_the_other_run(fractional):
     for each in link.fits.values():
         for name, fitted in each.items():
             for other, run in runs.items():
-                wanted = fitted.result.model.compare(run.select(["theta11", "theta12"])).fit_percent["theta12"]
+                wanted = fitted.result.model.compare(run.select(["theta11", "theta12"])).fit["theta12"]
                 assert fitted.fit(other) == pytest.approx(wanted, abs=1e-9), (name, other)
     gain = link.fits["fractional damping"]["first"].fit("second") - link.fits["whole orders"]["first"].fit("second")
     assert link.gains("fractional damping")["first", "second"] == pytest.approx(gain)
@@ -122,7 +122,7 @@ def test_the_lower_of_two_orders_is_the_elasticity_s_whatever_the_fit_called_it(
         assert found["beta2"][0] < found["mu2"][0]
         # The stiff term of the truth has 170, the other 8.
         assert abs(found["a2"][0]) > abs(found["d2"][0])
-        joint = {**fitted.result.orders, **fitted.result.fit.coefficients}
+        joint = {**fitted.result.orders, **fitted.result.joint.coefficients}
         assert sorted(v for v, *_ in found.values()) == sorted(joint.values())
         ends = sorted((low, high) for _, low, high in found.values())
         assert ends == sorted(tuple(fitted.result.intervals[n]) for n in joint)

@@ -25,8 +25,8 @@ def test_figures_are_the_oracles(seed):
     assert found.error == pytest.approx(oracles.absolute_error(y, prediction), rel=1e-13)
     assert found.rmse == pytest.approx(oracles.root_mean_square(y, prediction), rel=1e-13)
     assert found.nr == pytest.approx(oracles.normalised_residual(y, prediction), rel=1e-12)
-    assert found.fit == pytest.approx(oracles.fit_percent(y, prediction), rel=1e-11)
-    assert found.fit == pytest.approx(100 * (1 - found.nr), rel=1e-12)
+    assert found.joint == pytest.approx(oracles.fit(y, prediction), rel=1e-11)
+    assert found.joint == pytest.approx(100 * (1 - found.nr), rel=1e-12)
 
 
 def test_figures_of_a_perfect_and_of_a_diverged_prediction():
@@ -35,7 +35,7 @@ def test_figures_of_a_perfect_and_of_a_diverged_prediction():
     for bad in (np.inf, np.nan, 1e300):
         found = ftlm.metrics(y, np.array([0.0, bad, 2.0]))
         assert found.rmse == np.inf
-        assert found.fit == -np.inf
+        assert found.joint == -np.inf
         assert found.to_dict()["rmse"] is None
         assert json.dumps(found.to_dict(), allow_nan=False)
     assert ftlm.metrics(y, np.zeros(3)).to_dict() == pytest.approx(
@@ -69,10 +69,10 @@ def test_the_true_model_fits_its_own_run(small_model, small_run):
     found = small_model.compare(small_run)
     assert found.m == 256  # that of the identification
     # What is left is discretization: 40 ms pulses, and 20 ms ones.
-    assert found.fit_percent["y"] > 99.8
+    assert found.fit["y"] > 99.8
     assert found.equation_error["y"].fit > 99.7
     assert found.warnings == ()
-    assert ftlm.compare(small_model, small_run, m=512).fit_percent["y"] > 99.9
+    assert ftlm.compare(small_model, small_run, m=512).fit["y"] > 99.9
 
 
 def test_free_run_and_equation_error_are_the_oracles(small_model, small_run, with_noise):
@@ -86,7 +86,7 @@ def test_free_run_and_equation_error_are_the_oracles(small_model, small_run, wit
         assert figures.error == pytest.approx(oracles.absolute_error(y, prediction), rel=1e-9)
         assert figures.rmse == pytest.approx(oracles.root_mean_square(y, prediction), rel=1e-9)
         assert figures.nr == pytest.approx(oracles.normalised_residual(y, prediction), rel=1e-9)
-        assert figures.fit == pytest.approx(oracles.fit_percent(y, prediction), rel=1e-9)
+        assert figures.fit == pytest.approx(oracles.fit(y, prediction), rel=1e-9)
     np.testing.assert_allclose(found.simulated["y"][0], free, atol=1e-11)
     np.testing.assert_allclose(found.measured["y"][0], y, atol=1e-14)
     assert found.step == [pytest.approx(duration / m)]
@@ -103,7 +103,7 @@ def test_the_true_coupled_model_fits_its_run(coupling, sensor):
     empty = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": np.zeros(n), "z": np.zeros(n)})
     run = ftlm.Model(replace(structure, coupling="simulated")).simulate(empty, tolerance=1e-7)
     found = ftlm.Model(replace(structure, coupling=coupling)).compare(run, m=800)
-    assert all(fit > 99.9 for fit in found.fit_percent.values())
+    assert all(fit > 99.9 for fit in found.fit.values())
     assert all(figures.fit > 99.9 for figures in found.equation_error.values())
     assert found.warnings == ()
 
@@ -111,7 +111,7 @@ def test_the_true_coupled_model_fits_its_run(coupling, sensor):
 @pytest.mark.parametrize("coupling", ["simulated", "measured"])
 def test_the_true_plant_fits_its_run(plant, clean_a, coupling):
     found = plant("A", coupling=coupling).compare(clean_a, m=4999)
-    assert all(fit > 99.8 for fit in found.fit_percent.values()), found.fit_percent
+    assert all(fit > 99.8 for fit in found.fit.values()), found.fit
 
 
 def test_initial_terms_are_fitted_anew_for_every_run(small_model):
@@ -123,7 +123,7 @@ def test_initial_terms_are_fitted_anew_for_every_run(small_model):
     y = np.exp(-0.2 * t) * np.cos(omega * t)
     run = ftlm.Run.from_arrays(step=0.01, inputs={"u": np.zeros(1001)}, outputs={"y": y}, name="whole")
     found = swinging.compare([run.window(0, 5), run.window(5, None)], m=499)
-    assert found.fit_percent["y"] > 99.98
+    assert found.fit["y"] > 99.98
     # Terms of t^0 and t^1, where D y = -0.4 leaves 0.4 y(0) beside y'(0).
     for terms, start in zip(found.initial, (0, 500), strict=True):
         slope = np.exp(-0.2 * t[start]) * (-0.2 * np.cos(omega * t[start]) - omega * np.sin(omega * t[start]))
@@ -131,7 +131,7 @@ def test_initial_terms_are_fitted_anew_for_every_run(small_model):
         assert terms["y"][1.0] == pytest.approx(slope + 0.4 * y[start], abs=2e-3)
     resting = ftlm.Model(replace(structure, initial="rest")).compare(run, m=500)
     assert resting.initial == [{"y": {}}]
-    assert resting.fit_percent["y"] < 1
+    assert resting.fit["y"] < 1
 
 
 def test_several_runs_are_pooled_about_their_own_means(small_model, small_run, with_noise):
@@ -172,7 +172,7 @@ def test_comparison_prints_and_is_json(small_model, small_run, with_noise):
     assert means[3] == "over 64 block pulses per run"
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["m"] == 64
-    assert document["output_error"]["y"]["fit"] == found.fit_percent["y"]
+    assert document["output_error"]["y"]["fit"] == found.fit["y"]
     assert [r["run"] for r in document["runs"]] == ["small, simulated", other.name]
 
 
@@ -268,7 +268,7 @@ def test_an_unstable_model_is_compared_and_said_to_be_useless():
 def test_metrics_of_the_core_are_the_public_ones():
     y, prediction = np.random.default_rng(3).standard_normal((2, 50))
     found = ftlm.metrics(y, prediction)
-    assert _core.metrics(y, y - prediction) == (found.error, found.rmse, found.nr, found.fit)
+    assert _core.metrics(y, y - prediction) == (found.error, found.rmse, found.nr, found.joint)
 
 
 def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monkeypatch):
@@ -300,4 +300,4 @@ def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monk
         assert past.runs_in_motion(model, [from_rest, cut]) == ["cut"]
     assert simulated == ["from rest", "from rest", "cut", "cut"]
     asked = ftlm.Model(replace(model.structure, initial="history"))
-    assert ftlm.compare(asked, cut).fit_percent["y"] > ftlm.compare(model, cut).fit_percent["y"] + 1.0
+    assert ftlm.compare(asked, cut).fit["y"] > ftlm.compare(model, cut).fit["y"] + 1.0

@@ -297,7 +297,7 @@ def test_the_whole_arm_is_recovered_from_its_currents(name):
     )
     structure = ftlm.flexible_link(stage="both", coupling="simulated", cross_stage="inertial", friction=True)
     found = ftlm.identify(run, structure)
-    assert min(found.fit_percent.values()) > 99.5
+    assert min(found.fit.values()) > 99.5
     truth = parameters.model(friction=True)
     held = [
         abs(value - known[n]) < 4.0 * found.standard_errors[n]

@@ -58,5 +58,5 @@ def test_many_terms_in_another_order_end_in_the_same_optimum(seed):
     run, method, fits = modes(seed), ftlm.OutputError(intervals="quadratic"), []
     for written in (terms, terms[::-1]):
         structure = ftlm.equation("D^6 y = " + " + ".join(written), initial="rest")
-        fits.append(ftlm.identify(run, structure, method=method).fit_percent["y"])
+        fits.append(ftlm.identify(run, structure, method=method).fit["y"])
     assert fits == pytest.approx([fits[0]] * 2, abs=1e-9)

@@ -195,14 +195,14 @@ def model_summary(made: FittedModel) -> dict[str, Any]:
     figures += comparison_charts(
         result.comparison, units=result.model.units, label="estimation", points=MAX_CHART_POINTS
     )
-    tables = [parameter_table(result.model, result.fit), *behavior_tables(result.model)]
+    tables = [parameter_table(result.model, result.joint), *behavior_tables(result.model)]
     choice = made.choice
     return {
         "title": title_of(result.model),
         "verdict": judged.to_dict(),
         "box": str(verdict_box(judged)),
         "equations": [str(e) for e in equations_html(result.model, result.comparison.offsets)],
-        "numbers": len(result.fit.names) if result.fit is not None else len(result.coefficients),
+        "numbers": len(result.joint.names) if result.joint is not None else len(result.coefficients),
         "fits": [
             {
                 "output": output,

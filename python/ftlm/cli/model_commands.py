@@ -58,7 +58,7 @@ def compare(
     show(comparison, as_json=as_json)
     if min_fit is not None:
         # Negated so that a fit that is not a number is too low.
-        low = {name: fit for name, fit in comparison.fit_percent.items() if not fit >= min_fit}
+        low = {name: fit for name, fit in comparison.fit.items() if not fit >= min_fit}
         if low:
             listed = ", ".join(f"{name} {fit:.4g} %" for name, fit in low.items())
             print(f"ftlm: fit below {min_fit:g} %: {listed}", file=sys.stderr)

@@ -201,11 +201,11 @@ def result_profiles(
         )
     if "noise_model" in result.settings:
         raise ModelError(f"a fit with {parameter('noise', 'ar')} has no profile; use its standard errors")
-    if result.fit is None or result.task is None:
+    if result.joint is None or result.task is None:
         raise ModelError(
             f"method {result.method!r} has no likelihood to profile; identify by {parameter('method', 'output-error')}"
         )
-    problem = FreeProblem.of(replace(result.task.structure, initial=result.fit.initial))
+    problem = FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
     unknown = [n for n in names if n not in problem.names]
     if unknown:
         others = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
@@ -215,7 +215,7 @@ def result_profiles(
         raise ModelError(f"level = {level} is no probability between 0 and 1, such as 0.95")
     asked = list(dict.fromkeys(names)) or problem.names
     found = profile_intervals(
-        result.fit, problem, result.task.runs, asked, probability, threads=threads, progress=progress
+        result.joint, problem, result.task.runs, asked, probability, threads=threads, progress=progress
     )
     if found.lower_optimum is not None:
         raise ConvergenceError(

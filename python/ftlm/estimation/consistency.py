@@ -157,7 +157,7 @@ class Consistency(ReportMixin):
         if self.not_identifiable and self.consistent is not None:
             out.append(make_finding("not_told_by_part", parameter=", ".join(self.not_identifiable)))
         for name, result in zip(self.names, self.results, strict=True):
-            if result.fit is not None and not result.fit.converged:
+            if result.joint is not None and not result.joint.converged:
                 out.append(make_finding("part_not_converged", run=name))
         out += self.delays
         if any(f.code == "residuals_not_white" for r in self.results for f in r.findings):
@@ -367,7 +367,7 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
         if k == j or piece.sample_times is not None or piece.length <= 2 * MAX_SHIFT_ROWS:
             continue
         # A fit is 100 (1 - NR).
-        own = results[k].fit_percent
+        own = results[k].fit
         left: dict[int, dict[str, float]] = {}
         for rows in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1):
             shifted = piece.with_samples({n: _shift_rows(piece[n], rows) for n in inputs})
@@ -417,10 +417,10 @@ def _cross_validated_fit(result: Identification, piece: Run, own: Identification
     The initial conditions are those of the other segment's own fit.
     """
     if result is own:
-        return dict(result.fit_percent)
+        return dict(result.fit)
     begun = replace(result.model.structure, initial=own.model.structure.initial)
     try:
-        return dict(compare(replace(result.model, structure=begun), piece).fit_percent)
+        return dict(compare(replace(result.model, structure=begun), piece).fit)
     except FtlmError:
         return {}
 
@@ -469,7 +469,7 @@ def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int
     Parameters without an approximately quadratic cost in every segment are left out, because their covariance says
     little. Each is scaled by its standard errors, so that units do not determine the numerical rank.
     """
-    joints = [r.fit for r in results if r.fit is not None]
+    joints = [r.joint for r in results if r.joint is not None]
     if len(joints) < len(results):
         return None, 0
     known = np.array([all(is_quadratic(r, n) for r in results) for n in joints[0].names])

@@ -37,15 +37,15 @@ def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
     tuple or None
         None with fewer than two free orders, or without a known correlation.
     """
-    if result.fit is None:
+    if result.joint is None:
         return None
-    names = list(result.fit.orders)
-    sizes = np.abs(result.fit.correlation[: len(names), : len(names)])
+    names = list(result.joint.orders)
+    sizes = np.abs(result.joint.correlation[: len(names), : len(names)])
     sizes = np.where(np.isfinite(sizes) & ~np.eye(len(names), dtype=bool), sizes, -1.0)
     if len(names) < 2 or sizes.max() < 0:
         return None
     i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(sizes)), sizes.shape))
-    return names[i], names[j], float(result.fit.correlation[i, j])
+    return names[i], names[j], float(result.joint.correlation[i, j])
 
 
 @check_arguments
@@ -74,7 +74,7 @@ def output_error_landscape(
     ModelError
         A name that is no free order.
     """
-    joint, task, pair = result.fit, result.task, orders
+    joint, task, pair = result.joint, result.task, orders
     chosen = correlated_orders(result)
     if pair is None and chosen is not None:
         pair = chosen[:2]

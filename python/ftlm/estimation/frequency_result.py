@@ -336,7 +336,7 @@ class FrequencyIdentification:
         )
 
     @property
-    def fit_percent(self) -> dict[str, float]:
+    def fit(self) -> dict[str, float]:
         """Fit in percent, by output: 100 minus the root mean square error relative to the measured responses."""
         squares: dict[str, list[float]] = {}
         for error in self.errors:

@@ -470,7 +470,7 @@ def _estimate(
         values={n: float(v) for n, v in {**values, **fit.model.coefficients}.items()},
         standard_errors=errors,
         covariance=fit.covariance,
-        fit={n: finite(f) for n, f in comparison.fit_percent.items()},
+        fit={n: finite(f) for n, f in comparison.fit.items()},
         information={} if criteria is None else {n: finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
         findings=tuple(f.to_file() for f in findings) or UNSET,
         intervals=profiles or UNSET,

@@ -75,7 +75,7 @@ class Identification:
         Settings of the estimator.
     findings
         Findings about data, fit and model.
-    fit
+    joint
         Optimum of the joint output error with its covariance; None for the equation-error methods.
     residuals
         Residual tests on the estimation runs; None if these are too short.
@@ -93,7 +93,7 @@ class Identification:
     searches: dict[str, SearchResult]
     settings: dict[str, Any]
     findings: tuple[Finding, ...] = field(default=())
-    fit: JointFit | None = None
+    joint: JointFit | None = None
     residuals: Residuals | None = None
     information: InformationCriteria | None = None
     task: Task | None = field(default=None, repr=False)
@@ -116,9 +116,9 @@ class Identification:
         Available for output error and instrumental variables, robust to colored residuals; with all orders given, of
         the coefficients. Empty for the other equation-error methods.
         """
-        if self.fit is None:
+        if self.joint is None:
             return dict(self.coefficient_errors)
-        return {**self.fit.standard_errors, **self.fit.derived_errors}
+        return {**self.joint.standard_errors, **self.joint.derived_errors}
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
@@ -134,7 +134,7 @@ class Identification:
     @property
     def profiles(self) -> dict[str, ProfileInterval]:
         """95 % profile-likelihood intervals in use; see :meth:`ftlm.Identification.profile`."""
-        return {} if self.fit is None else dict(self.fit.profiles)
+        return {} if self.joint is None else dict(self.joint.profiles)
 
     @property
     def delays(self) -> dict[str, float]:
@@ -160,13 +160,13 @@ class Identification:
     @property
     def _values(self) -> dict[str, float]:
         """Orders, coefficients and estimated delays and limits by name."""
-        fit = {} if self.fit is None else self.fit.values_by_name
+        fit = {} if self.joint is None else self.joint.values_by_name
         return {**self.orders, **fit, **self.coefficients}
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the rows and columns of ``covariance``."""
-        return () if self.fit is None else tuple(self.fit.names)
+        return () if self.joint is None else tuple(self.joint.names)
 
     @property
     def covariance(self) -> Floats:
@@ -174,7 +174,7 @@ class Identification:
 
         Variances are infinite for parameters that the data do not determine, and their covariances NaN.
         """
-        return np.zeros((0, 0)) if self.fit is None else self.fit.covariance
+        return np.zeros((0, 0)) if self.joint is None else self.joint.covariance
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -192,9 +192,9 @@ class Identification:
         return self.comparison.output_error
 
     @property
-    def fit_percent(self) -> dict[str, float]:
+    def fit(self) -> dict[str, float]:
         """Fit of the simulation in percent, by output."""
-        return self.comparison.fit_percent
+        return self.comparison.fit
 
     def physical(self, **known: float) -> dict[str, PhysicalParameter]:
         """Return the physical parameters of a flexible link; see :func:`ftlm.physical_parameters`.
@@ -214,11 +214,11 @@ class Identification:
         ModelError
             A model without coefficient law or intervals, or a name that is no parameter of it.
         """
-        if self.fit is None:
+        if self.joint is None:
             raise ModelError(
                 f"method {self.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
             )
-        return physical_parameters(self.fit, known)
+        return physical_parameters(self.joint, known)
 
     @check_arguments
     def profile(
@@ -349,7 +349,7 @@ class Identification:
             "residuals": None if self.residuals is None else self.residuals.to_dict(),
             "information": None if self.information is None else self.information.to_dict(),
             "searches": {name: s.to_dict() for name, s in self.searches.items()},
-            "choice": None if self.fit is None else self.fit.choice,
+            "choice": None if self.joint is None else self.joint.choice,
             "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
@@ -418,8 +418,8 @@ class Identification:
                 spread += f"   {self.profiles[name]}"
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
             lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
-        if self.fit is not None:
-            lines.append(f"  {self.fit.choice}")
+        if self.joint is not None:
+            lines.append(f"  {self.joint.choice}")
         if errors:
             others = ", but those written out: by profile likelihood" if self.profiles else ""
             lines.append(f"  (value ± standard error; 95 % intervals are ± 1.96 of these{others})")

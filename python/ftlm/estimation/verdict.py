@@ -140,7 +140,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     unstable = any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
     runs = () if validation is None or unstable else (validation,)
     tried = bool(runs) and validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
-    against = _combined_verdict([*result_findings(result)], result.fit_percent, runs, tried)
+    against = _combined_verdict([*result_findings(result)], result.fit, runs, tried)
     if against is not None:
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
@@ -209,7 +209,7 @@ def result_findings(result: Identification) -> Iterator[Finding]:
 def _against_result(result: Identification) -> Iterator[Finding]:
     codes = {f.code for f in result.findings}
     yield from _free_runs(result)
-    errors, joint = result.standard_errors, result.fit
+    errors, joint = result.standard_errors, result.joint
     yield from (f for f in result.findings if f.code == "run_forgets")
     unseen = [n for n, e in errors.items() if not math.isfinite(e)]
     if unseen and "run_forgets" not in codes:
@@ -400,7 +400,7 @@ def has_loop_noise_model(settings: Mapping[str, Any]) -> bool:
 def _is_uncertain(result: Identification, name: str) -> bool:
     """Whether a parameter is poorly determined, by its profile if available."""
     error = result.standard_errors[name]
-    numbers = {**result.coefficients, **({} if result.fit is None else result.fit.coefficients)}
+    numbers = {**result.coefficients, **({} if result.joint is None else result.joint.coefficients)}
     if name in result.orders:
         return error > MAX_ORDER_ERROR or (name in result.profiles and math.isinf(result.profiles[name].high))
     if name not in numbers:

@@ -321,7 +321,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         An identification without a search, or without that one; fewer than two free orders; no matplotlib.
     """
     found: Landscape | Identification | None = result
-    if isinstance(result, Identification) and result.fit is not None:
+    if isinstance(result, Identification) and result.joint is not None:
         found = output_error_landscape(result)
         if found is None:
             raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
@@ -506,11 +506,11 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     """
     if not isinstance(result, Identification):
         raise ModelError(f"result is {type(result).__name__}; give an identification")
-    if result.fit is None:
+    if result.joint is None:
         raise ModelError(
             f"method {result.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
         )
-    names, values = result.fit.names, result.fit.correlation
+    names, values = result.joint.names, result.joint.correlation
     figure, axes = axes_for(ax, 1, row=4.0)
     axis = axes[0, 0]
     drawn = axis.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")

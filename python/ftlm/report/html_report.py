@@ -247,15 +247,15 @@ def identification_page(
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
     bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
-    sections = first_sections(model, findings, compared, bool(others), result.fit, runs, bands)
+    sections = first_sections(model, findings, compared, bool(others), result.joint, runs, bands)
     details = [residual_section(tests, result.information, compared, model.units)]
-    details += correlation_sections(result.fit)
+    details += correlation_sections(result.joint)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
     details.append(frequency_section(model, steps))
     details += _search_sections(result)
     titled = ((f"Initial terms of the simulations, {label}", c) for label, c in compared)
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
-    starts = [starts_table(result.fit)] if result.fit is not None and result.fit.starts else []
+    starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
     sections += [replace(section, collapsed=True) for section in details]
     return write_page(
@@ -471,7 +471,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     """Return the fit percentages of the simulations, one sentence for each data set."""
     sentences = []
     for label, comparison in compared:
-        fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit_percent.items())
+        fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit.items())
         runs = ", ".join(name for name, _, _ in comparison.per_run)
         sentences.append(f"Fit on {label} data ({runs}): {fits}.")
     return " ".join(sentences)
@@ -480,8 +480,8 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
 def estimates_table(result: Identification | None, truth: Mapping[str, float] | None = None) -> Table:
     """Return orders and coefficients of a joint fit with intervals, and true values if known."""
     rows: list[list[Cell]] = []
-    if result is not None and result.fit is not None:
-        for name, value in {**result.orders, **result.fit.coefficients}.items():
+    if result is not None and result.joint is not None:
+        for name, value in {**result.orders, **result.joint.coefficients}.items():
             low, high = result.intervals[name]
             known = [truth.get(name)] if truth else []
             spread = [v if math.isfinite(v) else format_bound(v) for v in (result.standard_errors[name], low, high)]
@@ -548,7 +548,7 @@ def identification_html(result: Identification) -> str:
     parts = [verdict_html(verdict(result))]
     parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
     parts += [table.to_html() for table in behavior_tables(model)]
-    parts.append(parameter_table(model, result.fit).to_html())
+    parts.append(parameter_table(model, result.joint).to_html())
     # One run is enough to see; a report has all.
     figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
     parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # made of escaped parts

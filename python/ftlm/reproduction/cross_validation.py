@@ -54,7 +54,7 @@ class RunFit:
 
     def fit(self, run: str) -> float:
         """Fit of the simulation in percent; minus infinity on overflow."""
-        value = next(iter(self.comparisons[run].fit_percent.values()))
+        value = next(iter(self.comparisons[run].fit.values()))
         return value if math.isfinite(value) else -math.inf
 
     @property
@@ -64,7 +64,7 @@ class RunFit:
         Two terms of the deflection differ only in their orders. The lower order belongs to the elasticity, regardless
         of its name in the fit.
         """
-        joint = self.result.fit
+        joint = self.result.joint
         values = {**self.result.orders, **({} if joint is None else joint.coefficients)}
         letters = {n.rstrip("0123456789"): n for n in values}
         names = {n: n for n in values}

@@ -259,7 +259,7 @@ def demo_details(demo: Demo) -> str:
     lines.append("")
     for stage, results in demo.results.items():
         best = results["output error"]
-        estimates = {**best.orders, **(best.fit.coefficients if best.fit is not None else {})}
+        estimates = {**best.orders, **(best.joint.coefficients if best.joint is not None else {})}
         lines.append(f"Stage {stage}, output error: estimate ± standard error (truth of the simulated arm)")
         for n, v in estimates.items():
             lines.append(f"  {n:<8}{v:>12.6g} ± {best.standard_errors[n]:<9.2g} ({demo.truth[stage][n]:.6g})")

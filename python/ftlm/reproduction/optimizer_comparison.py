@@ -364,7 +364,7 @@ def _order_comparison(
 ) -> OrderComparison:
     """Return the comparison of integer and free orders, in this order."""
     nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in seen)
-    before, after = ({} if c is None else c.fit_percent for c in unseen)
+    before, after = ({} if c is None else c.fit for c in unseen)
     gains = {o: after[o] - before[o] for o in nr if o in before and math.isfinite(after[o] - before[o])}
     free = fits[1]
     assert free is not None
@@ -382,7 +382,7 @@ def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None
         sizes = rival.candidates, rival.increment
         contests.append(Contest(arm, output, *sizes, errors, rival.genetic_run.errors, rival.evolution_run.errors))
     both = [stage.candidates[n] for n in ("integer, identified", "output error")]
-    if both[1].result is not None and both[1].result.fit is not None:
+    if both[1].result is not None and both[1].result.joint is not None:
         seen, unseen, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
         freed.append(_order_comparison(arm, stage.number, seen, unseen, fits))
     trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else []

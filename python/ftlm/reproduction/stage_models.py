@@ -250,7 +250,7 @@ class StageWork:
         derived = self.dropped_derivative(joint.model)
         self.begin("the landscape of its orders", "landscape")
         landscape = None
-        if joint.result is not None and joint.result.fit is not None:
+        if joint.result is not None and joint.result.joint is not None:
             landscape = output_error_landscape(joint.result)
         return Stage(self.number, candidates, traces, weak, ends, rivals, near, by_equation, derived, landscape)
 

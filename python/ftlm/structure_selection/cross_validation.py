@@ -54,7 +54,7 @@ class Fold:
             return self.runs
         return tuple(mask_outputs(r, outputs, self.rows) if r is self.validation_run else r for r in self.runs)
 
-    def fit_percent(self, model: Model) -> dict[str, float]:
+    def fit(self, model: Model) -> dict[str, float]:
         """Return the fit of a simulation on the validation data in percent, by output.
 
         Initial terms are those of the estimation data of the same run.
@@ -63,7 +63,7 @@ class Fold:
         """
         outputs = model.outputs
         if self.rows is None:
-            return dict(compare(model, self.validation_run).fit_percent)
+            return dict(compare(model, self.validation_run).fit)
         # Later rows tell nothing of motion from before the start that has died away by then.
         moving = self.rows[0] == 0 and model.structure.initial != "rest"
         before = compare(
@@ -323,7 +323,7 @@ def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Mode
 def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
     """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
     model = model_of(structure, joint, folds.runs)
-    estimation = compare(model, list(folds.runs)).fit_percent
+    estimation = compare(model, list(folds.runs)).fit
     grows = structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
     start = joint.values_by_name
     # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
@@ -333,7 +333,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         runs = fold.estimation_runs(structure.outputs)
         try:
             own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
-            validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
+            validation[fold.name] = fold.fit(model_of(structure, own, folds.runs))
         except FtlmError as error:
             # What is wrong is wrong with what is left, not with the runs as they were given.
             raise type(error)(f"without {fold.name}: {error}") from error
@@ -392,7 +392,7 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
 
 def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
     """Return a trial with a fit on all runs on grids refined until converged."""
-    estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit_percent
+    estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit
     return replace(
         trial,
         joint=joint,

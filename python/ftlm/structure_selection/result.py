@@ -89,9 +89,9 @@ class Selection(ReportMixin):
         return self.best.verdict if self.validated is None else self.validated.verdict
 
     @property
-    def fit_percent(self) -> dict[str, float]:
+    def fit(self) -> dict[str, float]:
         """Fit of the simulation on the estimation runs in percent, by output."""
-        return self.best.fit_percent
+        return self.best.fit
 
     def validate(self, runs: Run | Sequence[Run]) -> Validation:
         """Compare the model with runs that took no part in the selection; see :meth:`ftlm.Identification.validate`."""

@@ -111,8 +111,8 @@ def select(
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
         ``"auto"``: one output, every input, integer orders 1 to 4 with zeros, delays, direct feedthrough, an
-        integrator, an output level and a drift, then fractional orders. These are chosen if they predict better, or as well
-        with a Schwarz criterion lower by 10. Feedthrough is not tried where an input answers the output (a closed
+        integrator, an output level and a drift, then fractional orders. These are chosen if they predict better, or as
+        well with a Schwarz criterion lower by 10. Feedthrough is not tried where an input answers the output (a closed
         loop): the answer of a controller within a row would be taken for it.
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
@@ -241,8 +241,8 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
     best, winner = ranked[0], _winner([ranked[k] for k in eligible])
     found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
     findings: list[Finding] = []
-    if winner.joint is not None and found.fit is not None and found.fit.noise:
-        lower = [o for o, v in found.fit.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
+    if winner.joint is not None and found.joint is not None and found.joint.noise:
+        lower = [o for o, v in found.joint.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
         if lower:
             findings.append(make_finding("other_optimum", output=", ".join(lower)))
     if winner.validation_fit < MIN_VALIDATION_FIT:

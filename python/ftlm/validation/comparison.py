@@ -187,7 +187,7 @@ class Comparison:
         return texts(self.findings)
 
     @property
-    def fit_percent(self) -> dict[str, float]:
+    def fit(self) -> dict[str, float]:
         """Fit of the simulation in percent, by output."""
         return {name: figures.fit for name, figures in self.output_error.items()}
 
