@@ -54,7 +54,7 @@ def test_simulation_and_comparison_are_scipys(zeta, per_period, through):
         assert model.compare(run).fit["y"] > 100 - 1e-3
         noisy = y + 0.1 * np.std(y) * np.random.default_rng(2).standard_normal(rows)
         found = model.compare(run_of(u, noisy, step, kind)).output_error["y"]
-        assert found.joint == pytest.approx(nrmse_fit(noisy, y), abs=1e-3)
+        assert found.fit == pytest.approx(nrmse_fit(noisy, y), abs=1e-3)
         assert found.rmse == pytest.approx(np.sqrt(np.mean((noisy - y) ** 2)), rel=1e-5)
 
 

@@ -25,8 +25,8 @@ def test_figures_are_the_oracles(seed):
     assert found.error == pytest.approx(oracles.absolute_error(y, prediction), rel=1e-13)
     assert found.rmse == pytest.approx(oracles.root_mean_square(y, prediction), rel=1e-13)
     assert found.nr == pytest.approx(oracles.normalised_residual(y, prediction), rel=1e-12)
-    assert found.joint == pytest.approx(oracles.fit(y, prediction), rel=1e-11)
-    assert found.joint == pytest.approx(100 * (1 - found.nr), rel=1e-12)
+    assert found.fit == pytest.approx(oracles.fit(y, prediction), rel=1e-11)
+    assert found.fit == pytest.approx(100 * (1 - found.nr), rel=1e-12)
 
 
 def test_figures_of_a_perfect_and_of_a_diverged_prediction():
@@ -35,7 +35,7 @@ def test_figures_of_a_perfect_and_of_a_diverged_prediction():
     for bad in (np.inf, np.nan, 1e300):
         found = ftlm.metrics(y, np.array([0.0, bad, 2.0]))
         assert found.rmse == np.inf
-        assert found.joint == -np.inf
+        assert found.fit == -np.inf
         assert found.to_dict()["rmse"] is None
         assert json.dumps(found.to_dict(), allow_nan=False)
     assert ftlm.metrics(y, np.zeros(3)).to_dict() == pytest.approx(
@@ -268,7 +268,7 @@ def test_an_unstable_model_is_compared_and_said_to_be_useless():
 def test_metrics_of_the_core_are_the_public_ones():
     y, prediction = np.random.default_rng(3).standard_normal((2, 50))
     found = ftlm.metrics(y, prediction)
-    assert _core.metrics(y, y - prediction) == (found.error, found.rmse, found.nr, found.joint)
+    assert _core.metrics(y, y - prediction) == (found.error, found.rmse, found.nr, found.fit)
 
 
 def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monkeypatch):

@@ -192,7 +192,7 @@ def test_each_rule_finds_its_own_fault(found, checked):
     far = replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=math.inf)})
     never = verdict(worse(found, comparison=far), checked)
     assert (never.level, never.reason) == ("do not use", "the simulation overflows")
-    stuck = verdict(worse(found, fit=replace(found.joint, converged=False)), checked)
+    stuck = verdict(worse(found, joint=replace(found.joint, converged=False)), checked)
     assert (stuck.level, stuck.reason) == ("with care", "the fit has not converged")
     short = verdict(worse(found, residuals=None), checked)
     assert short.reason == "the runs are too short for residual tests"
@@ -204,11 +204,11 @@ def test_a_number_is_vague_by_its_own_size(found, checked):
     # Half of a1 is the limit: 0.3 of 0.6.
     for share, vague in ((0.4, False), (0.6, True)):
         spread[a1, a1] = (share * found.coefficients["a1"]) ** 2
-        judged = verdict(worse(found, fit=replace(found.joint, covariance=spread, profiles={})), checked)
+        judged = verdict(worse(found, joint=replace(found.joint, covariance=spread, profiles={})), checked)
         assert judged.trusted != vague
         assert not vague or judged.reason.startswith("poorly identifiable from the runs: a1 = -0.6")
     spread[a1, a1], spread[alpha, alpha] = 0.0, 0.3**2
-    judged = verdict(worse(found, fit=replace(found.joint, covariance=spread, profiles={})), checked)
+    judged = verdict(worse(found, joint=replace(found.joint, covariance=spread, profiles={})), checked)
     assert judged.reason == f"poorly identifiable from the runs: alpha = {found.orders['alpha']:.3g} ± 0.3"
 
 
@@ -220,7 +220,7 @@ def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, chec
         ("alpha", 1.5, math.inf, f"poorly identifiable from the runs: alpha = {found.orders['alpha']:.3g} ± "),
     ):
         open_ended = replace(found.joint, profiles={name: ProfileInterval(low, high, 0.95)})
-        judged = verdict(worse(found, fit=open_ended, model=late), checked)
+        judged = verdict(worse(found, joint=open_ended, model=late), checked)
         assert judged.reason.startswith(reason)
         assert judged.level == ("with care" if reason else "trust")
 
@@ -367,7 +367,7 @@ def test_a_run_in_motion_says_so(found):
 def test_what_may_not_be_used_comes_before_what_needs_care(found):
     poor = worse(
         found,
-        fit=replace(found.joint, converged=False),
+        joint=replace(found.joint, converged=False),
         comparison=replace(found.comparison, output_error={"y": replace(found.output_error["y"], nr=0.8, fit=20.0)}),
     )
     judged = poor.verdict
