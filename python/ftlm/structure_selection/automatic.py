@@ -179,10 +179,7 @@ class AutomaticSelection:
         probes = self._fit([probe, replace(probe, offset="level")])
         offset = "level" if _gain(probes, lambda f: f.offset == "level") > MIN_BIC_DECREASE else "none"
         forms = [IntegerOrderForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
-        fits = self._fit_zeros(forms, probes)
-        if self._is_delayed(fits, offset):
-            fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
-        fits = self._fit_neighbors(fits)
+        fits = self._fit_neighbors(self._fit_delayed(self._fit_zeros(forms, probes), offset))
         # A zero less may be better within an order although a higher order fits the noise.
         while fewer := [
             form
@@ -233,18 +230,21 @@ class AutomaticSelection:
         """Penalty of one zero of every input in the criterion."""
         return len(self.runs[0].inputs) * math.log(fitted.joint.samples)
 
-    def _is_delayed(self, fits: Sequence[FittedForm], offset: str) -> bool:
-        """Whether a delay lowers the criterion of a low order without or with a zero."""
+    def _fit_delayed(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
+        """Add the fits of delayed forms, all of them if a delay lowers the criterion of the first or second order."""
         plain, late = (delays_of_inputs(self.runs, self.delays, delayed=d) for d in (False, True))
         if plain == late:
-            return False
-        every = _rank([*fits, *self._fit([IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])])
-        known = {f.form: f.bic for f in every if f.form is not None}
-        return any(
+            return fits
+        delayed = [IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in range(1, MAX_ORDER)]
+        fits = _rank([*fits, *self._fit(delayed[:2])])
+        known = {f.form: f.bic for f in fits if f.form is not None}
+        if not any(
             bic < known.get(replace(form, delayed=False), math.inf) - MIN_BIC_DECREASE
             for form, bic in known.items()
             if form.delayed
-        )
+        ):
+            return fits
+        return self._fit_zeros(delayed, fits)
 
     def _validate(self, ahead: Sequence[FittedForm]) -> FittedForm | None:
         """Validate fits; return the one with the best prediction."""
