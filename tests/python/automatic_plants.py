@@ -134,3 +134,35 @@ PLANTS = {
         ("D^3 y = a2 D^2 y + a1 D^1 y + a0 y + b0 u(t - T)",),
     ),
 }
+
+
+def drawn_plants(count: int, seed: int) -> dict[str, Plant]:
+    """Return random plants: two of three of integer orders 1 to 4, half of these with a dead time, one fractional."""
+    g = np.random.default_rng(seed)
+    found = {}
+    for number in range(count):
+        step, samples = 0.02, int(g.integers(600, 2000))
+        if number % 3 == 2:
+            order, damped, stiff = g.uniform(0.4, 1.9), g.uniform(0.1, 0.35), 10 ** g.uniform(0.3, 1.5)
+            loss = g.uniform(0.1, 0.6) * stiff ** (1 - damped)
+            response = fractional_response(_two_terms(order, damped * order, loss, stiff))
+            words = f"order {order:.2f}"
+        else:
+            order = int(g.integers(1, 5))
+            pairs = [(10 ** g.uniform(0, 1.2), 10 ** g.uniform(-1.5, -0.2)) for _ in range(order // 2)]
+            denominator = np.ones(1)
+            for w, damping in pairs:
+                denominator = np.polymul(denominator, [1.0, 2 * damping * w, w * w])
+            if order % 2:
+                denominator = np.polymul(denominator, [1.0, 10 ** g.uniform(0, 1)])
+            zeros = -(10 ** g.uniform(0, 1, int(g.integers(0, order)))) * g.choice([1, 1, -1])
+            numerator = np.poly(zeros) * denominator[-1] / abs(np.prod(zeros))
+            delay = step * g.uniform(0.5, 20) if g.uniform() < 0.5 else 0.0
+            response = integer_response(np.atleast_1d(numerator).tolist(), denominator.tolist(), delay)
+            words = f"order {order}, {zeros.size} zeros" + (f", {delay:.2f} s late" if delay else "")
+        found[f"{number + 1}: {words}"] = Plant(step, samples, int(g.integers(20, 60)), response, ())
+    return found
+
+
+def _two_terms(order: float, damped: float, loss: float, stiff: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda s: stiff / (s**order + loss * s**damped + stiff)
