@@ -105,6 +105,35 @@ def test_a_given_delay_narrows_auto() -> None:
         ftlm.select(run, ftlm.equation("D y = a y + b u"), delay={"u": 0.1})
 
 
+def two_outputs(late: int) -> ftlm.Run:
+    """A resonance beside a lag that may come late, of one input."""
+    (swing, _), (lag, _) = (
+        record([40.0], [1.0, 3.0, 40.0], seed=1, hold=20),
+        record([7.0], [1.0, 4.0], seed=1, hold=20, late=late),
+    )
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": lag["u"]}, outputs={"y": swing["y"], "z": lag["y"]})
+
+
+def test_each_output_has_its_own_structure() -> None:
+    found = ftlm.select(two_outputs(0), "auto", threads=1)
+    first, second = found.winner.structure.equations
+    assert str(first) == "D^2 y = a1_y D^1 y + a0_y y + b0_y u"
+    assert str(second) == "D^1 z = a0_z z + b0_z u"
+    assert found.best.model.coefficients["a0_y"] == pytest.approx(-40, rel=0.02)
+    assert found.best.model.coefficients["a0_z"] == pytest.approx(-4, rel=0.02)
+    assert set(found.fit) == {"y", "z"}
+    assert {o for t in found.trials for o in t.structure.outputs} == {"y", "z"}
+    assert "Schwarz" in str(found)
+
+
+def test_outputs_with_different_delays_have_no_free_delay_in_one_structure() -> None:
+    found = ftlm.select(two_outputs(6), "auto", threads=1)
+    assert not found.winner.structure.free_inputs
+    assert "The outputs do not have the same delay" in found.reason
+    # A higher order takes the place of the delay.
+    assert found.fit["z"] > 95
+
+
 def test_identify_and_select_find_the_same_model_by_auto(tmp_path: Path) -> None:
     run, _ = record([7.0], [1.0, 4.0], seed=1, hold=20, late=6)
     run.to_csv(tmp_path / "motor.csv")

@@ -26,7 +26,7 @@ from ftlm.structure_selection.cross_validation import (
     validation_score_bound,
 )
 from ftlm.structure_selection.result import format_fit
-from ftlm.structure_selection.select import _predicts_equally, _rank_trials, _reason, automatic_output
+from ftlm.structure_selection.select import _predicts_equally, _rank_trials, _reason, automatic_problems
 from ftlm.structure_selection.stepwise import (
     CandidateEvaluator,
     FittedVariant,
@@ -278,17 +278,27 @@ def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival
         assert said.numbers["gain"] == pytest.approx(np.median(gains))
 
 
-def test_auto_is_of_one_output_with_inputs(runs):
-    assert automatic_output(runs) == "y"
-    made = IntegerOrderForm(2, 1, delayed=True, integrator=True).structure(runs, "y")
+def test_auto_is_of_outputs_that_something_drives(runs):
+    (problem,) = automatic_problems(runs)
+    made = IntegerOrderForm(2, 1, delayed=True, integrator=True).structure(problem)
     assert str(made.without_input_nonlinearities()) == "D^2 y = a1 D^1 y + b1 D^1 u + b0 u"
     assert list(made.free_delays) == ["u"]
-    with pytest.raises(ftlm.ModelError, match="the outputs y, z; structure='auto' is of one"):
-        automatic_output(
-            [ftlm.Run.from_arrays(step=1, inputs={"u": [0, 1, 2]}, outputs={"y": [0, 1, 2], "z": [0, 1, 2]})]
-        )
-    with pytest.raises(ftlm.ModelError, match="the runs have no input"):
-        automatic_output([ftlm.Run.from_arrays(step=1, inputs={}, outputs={"y": [0, 1, 2]})])
+    pair = [ftlm.Run.from_arrays(step=1, inputs={"u": [0, 1, 2]}, outputs={"y": [0, 1, 2], "z": [0, 1, 2]})]
+    first, second = automatic_problems(pair, driven_by={"z": ["y"]})
+    assert (first.drivers, second.drivers) == (("u",), ("y",))
+    # An output is measured when it acts.
+    assert str(IntegerOrderForm(1, 0, delayed=True).structure(second)) == "D^1 z = a0_z z + b0_z y"
+    for asked, words in (
+        ({"x": ["u"]}, "'x' is no output"),
+        ({"z": ["z"]}, "'z' does not drive z"),
+        ({"z": []}, "nothing drives z"),
+    ):
+        with pytest.raises(ftlm.ModelError, match=words):
+            automatic_problems(pair, driven_by=asked)
+    with pytest.raises(ftlm.ModelError, match="nothing drives y"):
+        automatic_problems([ftlm.Run.from_arrays(step=1, inputs={}, outputs={"y": [0, 1, 2]})])
+    with pytest.raises(ftlm.ModelError, match="driven_by= is used with 'auto'"):
+        ftlm.select(runs, ftlm.equation("D y = a y + b u"), driven_by={"y": ["u"]})
 
 
 @pytest.mark.slow

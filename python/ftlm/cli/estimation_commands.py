@@ -75,7 +75,7 @@ from ftlm.structure.structure import Structure
 from ftlm.structure_selection import select as choice
 from ftlm.structure_selection.automatic import IntegerOrderForm
 from ftlm.structure_selection.result import Selection
-from ftlm.structure_selection.select import automatic_output
+from ftlm.structure_selection.select import automatic_problems
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads
 
@@ -118,7 +118,11 @@ def select_structure(
     if automatic and shape.only is not None:
         runs = [run.select([shape.only, *run.inputs]) for run in runs]
     tried = [candidates] if isinstance(candidates, Structure) else candidates
-    grown = [IntegerOrderForm(4, 3).structure(runs, automatic_output(runs))] if isinstance(tried, str) else tried
+    grown = (
+        [IntegerOrderForm(4, 3).structure(problem) for problem in automatic_problems(runs)]
+        if isinstance(tried, str)
+        else tried
+    )
     seconds = sum(fit_seconds(runs, one, threads) for one in grown)
     with Progress("fitting candidates", quiet=quiet) as progress:
         progress.expect("choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if listed else STEPWISE_TIME_FACTORS))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import TypeAlias
 
 from ftlm.data.run import Run
@@ -38,7 +37,6 @@ INITIAL_FRACTIONAL_ORDERS = (0.5, 0.8, 1.2, 1.7)
 
 #: Delay of inputs by name [s]: a number, or (lower, upper) of one to estimate.
 Delays: TypeAlias = Mapping[str, float | tuple[float, float]]
-NO_DELAYS: Delays = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -71,39 +69,67 @@ class IntegerOrderForm:
         """Whether the output jumps with its inputs."""
         return self.zeros >= self.order
 
-    def structure(self, runs: Sequence[Run], output: str, delays: Delays = NO_DELAYS) -> Structure:
-        """Return the structure of the form for one output of runs, with given delays as :func:`delays_of_inputs`."""
-        names = list(runs[0].inputs)
+    def structure(self, problem: OutputProblem) -> Structure:
+        """Return the structure of the form for one output, with given delays as :meth:`OutputProblem.input_delays`."""
+        output, end = problem.output, problem.suffix
         powers = range(self.order - 1, int(self.integrator) - 1, -1)
-        own = [f"a{k} {_derivative(k, output)}" for k in powers]
+        own = [f"a{k}{end} {_derivative(k, output)}" for k in powers]
         driving = [
-            f"b{_number(names, name)}{k} {_derivative(k, name)}" for name in names for k in range(self.zeros, -1, -1)
+            f"b{number}{k}{end} {_derivative(k, name)}"
+            for number, name in problem.numbered_drivers
+            for k in range(self.zeros, -1, -1)
         ]
         text = f"{_derivative(self.order, output)} = {' + '.join([*own, *driving])}"
-        return equation(text, delay=delays_of_inputs(runs, delays, delayed=self.delayed), offset=self.offset)
+        return equation(text, delay=problem.input_delays(delayed=self.delayed), offset=self.offset)
 
 
 def _derivative(order: int, name: str) -> str:
     return {0: name, 1: f"D {name}"}.get(order, f"D^{order} {name}")
 
 
-def _number(names: Sequence[str], name: str) -> str:
-    """Number of an input in the names of its coefficients; empty for a single input."""
-    return f"{names.index(name) + 1}_" if len(names) > 1 else ""
+@dataclass(frozen=True)
+class OutputProblem:
+    """One output of some runs, whose structure is selected.
 
-
-def delays_of_inputs(runs: Sequence[Run], given: Delays, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
-    """Return the delays [s] of inputs: a number, or an interval of one to estimate.
-
-    Given delays precede those of all inputs of a delayed form. A form that is not delayed has the given ones that 0
-    is none of.
+    Parameters
+    ----------
+    runs
+        Estimation runs.
+    output
+        The output.
+    drivers
+        Signals that drive it: inputs, and other outputs, which act as measured.
+    delays
+        Given delays.
+    suffix
+        End of all names of coefficients and orders, which tells several outputs apart.
     """
-    if not delayed:
-        return {n: d for n, d in given.items() if (d[0] if isinstance(d, tuple) else d) > 0.0}
-    limit = min(min(MAX_DELAY_SAMPLES, run.length * MAX_DELAY_SHARE) * run.step for run in runs)
-    # Three digits, since the range is a part of the structure's name.
-    longest = float(f"{limit:.3g}")
-    return {**dict.fromkeys(runs[0].inputs, (0.0, longest)), **given}
+
+    runs: Sequence[Run]
+    output: str
+    drivers: tuple[str, ...]
+    delays: Delays = field(default_factory=dict)
+    suffix: str = ""
+
+    @property
+    def numbered_drivers(self) -> list[tuple[str, str]]:
+        """Driving signals with their numbers in the names of coefficients; empty for a single one."""
+        return [(f"{k}_" if len(self.drivers) > 1 else "", name) for k, name in enumerate(self.drivers, 1)]
+
+    def input_delays(self, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
+        """Return the delays [s] of the driving inputs: a number, or an interval of one to estimate.
+
+        Given delays precede those of all inputs of a delayed form. A form that is not delayed has the given ones that 0
+        is none of.
+        """
+        inputs = [n for n in self.drivers if n in self.runs[0].inputs]
+        given = {n: d for n, d in self.delays.items() if n in inputs}
+        if not delayed:
+            return {n: d for n, d in given.items() if (d[0] if isinstance(d, tuple) else d) > 0.0}
+        limit = min(min(MAX_DELAY_SAMPLES, run.length * MAX_DELAY_SHARE) * run.step for run in self.runs)
+        # Three digits, since the range is a part of the structure's name.
+        longest = float(f"{limit:.3g}")
+        return {**dict.fromkeys(inputs, (0.0, longest)), **given}
 
 
 @dataclass(frozen=True)
@@ -132,20 +158,14 @@ class AutomaticSelection:
 
     Parameters
     ----------
-    runs
-        Estimation runs.
-    output
-        The output.
+    problem
+        The output, and what drives it.
     evaluator
         Evaluator of the candidates.
-    delays
-        Given delays.
     """
 
-    runs: Sequence[Run]
-    output: str
+    problem: OutputProblem
     evaluator: CandidateEvaluator
-    delays: Delays = field(default_factory=dict)
     #: Inputs that depend on the output: the controller's answer within a row would be taken for direct feedthrough.
     feedback: tuple[str, ...] = field(default=(), init=False)
 
@@ -166,9 +186,7 @@ class AutomaticSelection:
 
     def _fit(self, forms: Sequence[IntegerOrderForm]) -> list[FittedForm]:
         """Fit forms, best first; a form that cannot be fitted becomes a failed trial."""
-        return self._fit_structures(
-            [(f.structure(self.runs, self.output, self.delays), f, []) for f in dict.fromkeys(forms)]
-        )
+        return self._fit_structures([(f.structure(self.problem), f, []) for f in dict.fromkeys(forms)])
 
     def _fit_structures(
         self, items: Sequence[tuple[Structure, IntegerOrderForm | None, list[dict[str, float]]]]
@@ -189,9 +207,7 @@ class AutomaticSelection:
         probes = self._fit([probe, replace(probe, offset="level")])
         offset = "level" if _gain(probes, lambda f: f.offset == "level") > MIN_BIC_DECREASE else "none"
         forms = [IntegerOrderForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
-        fits = self._fit_zeros(forms, probes)
-        if self._is_delayed(fits, offset):
-            fits = self._fit_zeros([replace(f, delayed=True) for f in forms[:-1]], fits)
+        fits = self._fit_delayed(self._fit_zeros(forms, probes), offset)
         self.feedback = self._inputs_in_loop(fits)
         fits = self._fit_neighbors(fits)
         # A zero less may be better within an order although a higher order fits the noise.
@@ -215,14 +231,16 @@ class AutomaticSelection:
         if not fits:
             return ()
         best = fits[0]
-        residuals = [part[self.output] for part in best.joint.residuals]
+        problem, end = self.problem, self.problem.suffix
+        residuals = [part[problem.output] for part in best.joint.residuals]
         # Residuals are those of the inner samples.
-        signals = {n: [compared_values(r, best.structure, n)[1:-1] for r in self.runs] for n in self.runs[0].inputs}
-        names, coefficients = list(signals), best.joint.coefficients
+        signals = {n: [compared_values(r, best.structure, n)[1:-1] for r in problem.runs] for n in problem.drivers}
+        coefficients = best.joint.coefficients
         found = []
-        for name, values in signals.items():
+        for number, name in problem.numbered_drivers:
+            values = signals[name]
             test = feedback_test(residuals, values, [v for n, v in signals.items() if n != name])
-            gain = -coefficients.get("a0", -1.0) * coefficients[f"b{_number(names, name)}0"]
+            gain = -coefficients.get(f"a0{end}", -1.0) * coefficients[f"b{number}0{end}"]
             if test.has_feedback or (test.state == "undecided" and test.same_row * math.copysign(1.0, gain) < -1.0):
                 found.append(name)
         return tuple(found)
@@ -263,21 +281,23 @@ class AutomaticSelection:
         return _rank([*full, *self._fit(fewer)])
 
     def _penalty(self, fitted: FittedForm) -> float:
-        """Penalty of one zero of every input in the criterion."""
-        return len(self.runs[0].inputs) * math.log(fitted.joint.samples)
+        """Penalty of one zero of every driving signal in the criterion."""
+        return len(self.problem.drivers) * math.log(fitted.joint.samples)
 
-    def _is_delayed(self, fits: Sequence[FittedForm], offset: str) -> bool:
-        """Whether a delay lowers the criterion of a low order without or with a zero."""
-        plain, late = (delays_of_inputs(self.runs, self.delays, delayed=d) for d in (False, True))
-        if plain == late:
-            return False
-        every = _rank([*fits, *self._fit([IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in (1, 2)])])
-        known = {f.form: f.bic for f in every if f.form is not None}
-        return any(
+    def _fit_delayed(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
+        """Add the fits of delayed forms, all of them if a delay lowers the criterion of the first or second order."""
+        if self.problem.input_delays(delayed=False) == self.problem.input_delays(delayed=True):
+            return fits
+        delayed = [IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in range(1, MAX_ORDER)]
+        fits = _rank([*fits, *self._fit(delayed[:2])])
+        known = {f.form: f.bic for f in fits if f.form is not None}
+        if not any(
             bic < known.get(replace(form, delayed=False), math.inf) - MIN_BIC_DECREASE
             for form, bic in known.items()
             if form.delayed
-        )
+        ):
+            return fits
+        return self._fit_zeros(delayed, fits)
 
     def _validate(self, ahead: Sequence[FittedForm]) -> FittedForm | None:
         """Validate fits; return the one with the best prediction."""
@@ -294,24 +314,24 @@ class AutomaticSelection:
         They have the offset of the best one of integer orders. If that has a delay, the best of them gets one as well.
         """
         form = best.form if best is not None and best.form is not None else IntegerOrderForm(1, 0)
-        y, frequency = self.output, _frequency(fits, form.offset)
-        names = list(self.runs[0].inputs)
-        inputs = [(_number(names, name), name) for name in names]
-        driving = " + ".join(f"b{number}0 {name}" for number, name in inputs)
-        direct = " + ".join(f"b{number}1 D^alpha {name}" for number, name in inputs)
+        y, end, frequency = self.problem.output, self.problem.suffix, _frequency(fits, form.offset, self.problem.suffix)
+        drivers = self.problem.numbered_drivers
+        highest, own = f"D^alpha{end} {y}", f"a0{end} {y}"
+        damping = f"a1{end} D^mu{end} {y}"
+        driving = " + ".join(f"b{number}0{end} {name}" for number, name in drivers)
+        direct = " + ".join(f"b{number}1{end} D^alpha{end} {name}" for number, name in drivers)
         texts = {
-            f"D^alpha {y} = a0 {y} + {driving}": INITIAL_FRACTIONAL_ORDERS,
-            f"D^alpha {y} = a1 D^mu {y} + a0 {y} + {driving}": INITIAL_FRACTIONAL_ORDERS[1:],
-            f"D^alpha {y} = {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
+            f"{highest} = {own} + {driving}": INITIAL_FRACTIONAL_ORDERS,
+            f"{highest} = {damping} + {own} + {driving}": INITIAL_FRACTIONAL_ORDERS[1:],
+            f"{highest} = {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
         }
         if not self.feedback:
-            texts[f"D^alpha {y} = {direct} + {driving}"] = INITIAL_FRACTIONAL_ORDERS[:2]
+            texts[f"{highest} = {direct} + {driving}"] = INITIAL_FRACTIONAL_ORDERS[:2]
         if form.order == FRACTIONAL_DAMPING_ORDER:
-            texts[f"D^2 {y} = a1 D^mu {y} + a0 {y} + {driving}"] = (2.0,)
+            texts[f"D^2 {y} = {damping} + {own} + {driving}"] = (2.0,)
 
         def structure(text: str, *, delayed: bool = False) -> Structure:
-            delays = delays_of_inputs(self.runs, self.delays, delayed=delayed)
-            return equation(text, delay=delays, offset=form.offset)
+            return equation(text, delay=self.problem.input_delays(delayed=delayed), offset=form.offset)
 
         late = {} if best is None else {n: v for n, v in values_of(best.joint).items() if n.startswith("delay_")}
 
@@ -321,7 +341,8 @@ class AutomaticSelection:
             gains = dict.fromkeys(of.coefficient_names, frequency**alpha)
             delays = {i.name: late.get(i.name, i.bounds[0]) for i in of.free_inputs}
             names = (*of.order_names, *of.coefficient_names)
-            return {n: v for n, v in {**gains, **known}.items() if n in names} | delays
+            values = {**gains, **{n + end: v for n, v in known.items()}}
+            return {n: v for n, v in values.items() if n in names} | delays
 
         items = [(structure(t), orders) for t, orders in texts.items()]
         found = self._fit_structures([(s, None, [start(s, a) for a in orders]) for s, orders in items])
@@ -362,7 +383,7 @@ def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -
     return min(without, default=math.inf) - min(with_it) if with_it else 0.0
 
 
-def _frequency(fits: Sequence[FittedForm], offset: str) -> float:
+def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
     """Frequency [rad/s] of a lag of first order, or of a resonance if that explains more."""
     for order in (2, 1):
         for item in fits:
@@ -371,8 +392,8 @@ def _frequency(fits: Sequence[FittedForm], offset: str) -> float:
                 offset,
                 False,
             ):
-                size = abs(item.joint.coefficients.get("a0", 0.0))
-                damping = abs(item.joint.coefficients.get("a1", 0.0))
+                size = abs(item.joint.coefficients.get(f"a0{suffix}", 0.0))
+                damping = abs(item.joint.coefficients.get(f"a1{suffix}", 0.0))
                 if order == 1 and size > 0.0:
                     return size
                 if size > 0.0 and damping < 2.0 * math.sqrt(size):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ftlm.data.run import Run, as_runs
+from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
@@ -17,7 +17,7 @@ from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.simulate import simulate
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import Initial, Structure
 from ftlm.utils.linalg import vector_norm
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import variance_inflation
@@ -36,7 +36,7 @@ MIN_FIT_PERCENT = -100.0
 class Fold:
     """Estimation runs and validation data: another run, or samples of a run that are masked in the fit."""
 
-    runs: tuple[Run, ...]
+    runs: Runs
     validation_run: Run
     rows: tuple[int, int] | None = None
 
@@ -48,11 +48,11 @@ class Fold:
         step = self.validation_run.step
         return f"{self.validation_run.name} {self.rows[0] * step:g}-{self.rows[1] * step:g} s"
 
-    def estimation_runs(self, outputs: Sequence[str]) -> tuple[Run, ...]:
+    def estimation_runs(self, outputs: Sequence[str]) -> Runs:
         """Runs for the fit, with the validation samples of the given outputs masked."""
         if self.rows is None:
             return self.runs
-        return tuple(mask_outputs(r, outputs, self.rows) if r is self.validation_run else r for r in self.runs)
+        return Runs(mask_outputs(r, outputs, self.rows) if r is self.validation_run else r for r in self.runs)
 
     def fit(self, model: Model) -> dict[str, float]:
         """Return the fit of a simulation on the validation data in percent, by output.
@@ -110,7 +110,7 @@ class Folds:
         Description of the validation.
     """
 
-    runs: tuple[Run, ...]
+    runs: Runs
     parts: tuple[Fold, ...]
     description: str
 
@@ -125,7 +125,7 @@ class Folds:
         DataError
             Runs that do not fit together, or that are too short to be cut.
         """
-        every = tuple(as_runs(runs))
+        every = as_runs(runs)
         if not isinstance(validation, (str, Run)) and not validation:
             raise ModelError(
                 "validation = [] has no run to validate on; give one that is not fitted to, or use 'runs' or 'blocks'"
@@ -148,7 +148,7 @@ class Folds:
                     f"more, give {parameter('validation')} a run of its own, or use "
                     f"{parameter('validation', 'blocks')}"
                 )
-            parts = [Fold(tuple(r for k, r in enumerate(every) if k != out), every[out]) for out in range(len(every))]
+            parts = [Fold(Runs(r for k, r in enumerate(every) if k != out), every[out]) for out in range(len(every))]
             return cls(every, tuple(parts), f"each of {len(every)} runs by the others")
         if validation != "blocks":
             raise ModelError(f"{setting('validation')} {validation!r} is not known; use 'runs', 'blocks', or a run")
@@ -307,23 +307,18 @@ def log_residual_power(joint: JointFit) -> float:
     return float(np.mean([2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()]))
 
 
-def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Model:
-    """Return a fit as a model."""
+def model_of(structure: Structure, joint: JointFit, initial: Initial) -> Model:
+    """Return a fit as a model with fixed initial conditions."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
-    made = (
-        fix_initial_conditions(structure, runs)
-        .with_orders(joint.orders)
-        .with_coefficients(numbers)
-        .with_inputs(joint.inputs)
-    )
-    return Model(made, orders=joint.orders)
+    made = replace(structure, initial=initial).with_orders(joint.orders).with_coefficients(numbers)
+    return Model(made.with_inputs(joint.inputs), orders=joint.orders)
 
 
 def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
     """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
-    model = model_of(structure, joint, folds.runs)
-    estimation = compare(model, list(folds.runs)).fit
+    model = model_of(structure, joint, joint.initial)
+    estimation = compare(model, folds.runs).fit
     grows = structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
     start = joint.values_by_name
     # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
@@ -333,7 +328,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         runs = fold.estimation_runs(structure.outputs)
         try:
             own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
-            validation[fold.name] = fold.fit(model_of(structure, own, folds.runs))
+            validation[fold.name] = fold.fit(model_of(structure, own, joint.initial))
         except FtlmError as error:
             # What is wrong is wrong with what is left, not with the runs as they were given.
             raise type(error)(f"without {fold.name}: {error}") from error
@@ -392,7 +387,7 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
 
 def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
     """Return a trial with a fit on all runs on grids refined until converged."""
-    estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit
+    estimation = compare(model_of(trial.structure, joint, joint.initial), folds.runs).fit
     return replace(
         trial,
         joint=joint,

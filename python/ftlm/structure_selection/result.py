@@ -180,7 +180,8 @@ class Selection(ReportMixin):
                 "The choice",
                 paragraphs=[self.reason, f"Validation data: {self.validation}. {self.fitted} candidates fitted."],
                 warnings=list(self.warnings),
-                figures=[self.figure()],
+                # Fits of different outputs are not compared.
+                figures=[self.figure()] if len({t.structure.outputs for t in self.trials}) == 1 else [],
             ),
             Section("Candidates", tables=[self.table()]),
             Section("The chosen structure on all runs", paragraphs=self.best.summary(self.validated).splitlines()),

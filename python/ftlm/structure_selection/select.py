@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -19,7 +19,13 @@ from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degene
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.structure import Structure
-from ftlm.structure_selection.automatic import AutomaticSelection, Delays, IntegerOrderForm, is_fractional
+from ftlm.structure_selection.automatic import (
+    AutomaticSelection,
+    Delays,
+    IntegerOrderForm,
+    OutputProblem,
+    is_fractional,
+)
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
 from ftlm.structure_selection.cross_validation import Folds, Trial, scatter_factor, schwarz_criterion
@@ -33,7 +39,8 @@ from ftlm.structure_selection.stepwise import (
 )
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import check_threads
+from ftlm.utils.statistics import NORMAL_99
+from ftlm.utils.validation import check_threads, nearest
 
 #: Mean fit [%] of validation data below which a candidate is not the machine.
 MIN_VALIDATION_FIT = 50.0
@@ -41,26 +48,40 @@ MIN_VALIDATION_FIT = 50.0
 INTEGER_TOLERANCE = 1e-9
 
 
-def automatic_output(runs: Sequence[Run]) -> str:
-    """Return the only output of runs with inputs, for an automatic structure.
+def automatic_problems(
+    runs: Sequence[Run], delays: Delays | None = None, driven_by: Mapping[str, Sequence[str]] | None = None
+) -> list[OutputProblem]:
+    """Return the outputs of runs whose structure is selected automatically, each with what drives it.
 
     Raises
     ------
     ModelError
-        Several outputs, or no input.
+        An output that nothing drives, or a signal that is none of the runs or drives itself.
     """
-    first = runs[0]
-    outputs = list(first.outputs)
-    if len(outputs) != 1:
-        raise ModelError(
-            f"the runs have the outputs {', '.join(outputs)}; {parameter('structure', 'auto')} is of one: use "
-            "run.select([…]), or name it in a structure in words"
-        )
-    if not first.inputs:
-        raise ModelError(
-            f"the runs have no input, and {parameter('structure', 'auto')} needs one; name inputs when loading"
-        )
-    return outputs[0]
+    first, asked = runs[0], dict(driven_by or {})
+    for output, drivers in asked.items():
+        if output not in first.outputs:
+            raise ModelError(
+                f"{parameter('driven_by')}: {output!r} is no output{nearest(output, first.outputs)}; the runs have "
+                f"{', '.join(first.outputs)}"
+            )
+        for name in drivers:
+            if name not in first or name == output:
+                raise ModelError(
+                    f"{parameter('driven_by')}: {name!r} does not drive {output}; name an input or another output of "
+                    f"the runs: {', '.join(n for n in first.signals if n != output)}"
+                )
+    found = []
+    for output in first.outputs:
+        drivers = tuple(dict.fromkeys(asked.get(output, first.inputs)))
+        if not drivers:
+            raise ModelError(
+                f"nothing drives {output}, and {parameter('structure', 'auto')} needs an input; name inputs when "
+                "loading"
+            )
+        suffix = f"_{output}" if len(first.outputs) > 1 else ""
+        found.append(OutputProblem(runs, output, drivers, dict(delays or {}), suffix))
+    return found
 
 
 #: Difference of Schwarz criteria that is not significant; doi:10.1080/01621459.1995.10476572.
@@ -85,6 +106,7 @@ def select(
     *,
     validation: str | Run | Sequence[Run] | None = None,
     delay: Delays | None = None,
+    driven_by: Mapping[str, Sequence[str]] | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     store: str | os.PathLike[str] | None = None,
@@ -110,16 +132,21 @@ def select(
         One run or several with the same names and units.
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
-        ``"auto"``: one output, every input, integer orders 1 to 4 with zeros, delays, direct feedthrough, an
-        integrator, an output level and a drift, then fractional orders. These are chosen if they predict better, or as
-        well with a Schwarz criterion lower by 10. Feedthrough is not tried where an input answers the output (a closed
-        loop): the answer of a controller within a row would be taken for it.
+        ``"auto"``: every input, integer orders 1 to 4 with zeros, delays, direct feedthrough, an integrator, an output
+        level and a drift, then fractional orders. These are chosen if they predict better, or as well with a Schwarz
+        criterion lower by 10. Feedthrough is not tried where an input answers the output (a closed loop): the answer of
+        a controller within a row would be taken for it. Each output has its own selection, and the chosen equations are
+        identified together.
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
         quarter of every run by a fit on the rest, the default for one run. Or separate validation runs.
     delay
         With ``"auto"``: the delay of inputs by name [s], a number or (lower, upper) bounds of one to estimate. By
-        default no delay and delays of up to 60 samples are compared.
+        default no delay and delays of up to 60 samples are compared. An input has one delay: if it is not the same in
+        the equations of several outputs, equations without a free delay are chosen.
+    driven_by
+        With ``"auto"``: the signals that drive an output by its name, by default all inputs. Other outputs act as
+        measured.
     threads
         Number of candidates fitted concurrently, by default all cores; the result does not depend on it.
     progress
@@ -170,17 +197,23 @@ def select(
     every = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
     if isinstance(candidates, str) and candidates != "auto":
         raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
-    output = automatic_output(folds.runs) if isinstance(candidates, str) else None
+    sought = automatic_problems(folds.runs, delay, driven_by) if isinstance(candidates, str) else []
     searched = [candidates] if isinstance(candidates, Structure) else []
     idle = [describe_structure(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
     if idle:
         raise ModelError(
             f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
         )
-    if delay and output is None:
+    if delay and not sought:
         raise ModelError(f"{parameter('delay')} is used with 'auto'; give the delays to ftlm.equation instead")
-    delays = dict(delay or {})
-    automatic = [] if output is None else [IntegerOrderForm(2, 1, bool(delay)).structure(folds.runs, output, delays)]
+    if driven_by and not sought:
+        raise ModelError(f"{parameter('driven_by')} is used with 'auto'; give the terms to ftlm.equation instead")
+    if delay and (unknown := [n for n in delay if n not in folds.runs[0].inputs]):
+        raise ModelError(
+            f"{parameter('delay')}: {unknown[0]!r} is no input{nearest(unknown[0], folds.runs[0].inputs)}; the runs "
+            f"have {', '.join(folds.runs[0].inputs)}"
+        )
+    automatic = [IntegerOrderForm(2, 1, bool(delay)).structure(problem) for problem in sought]
     for structure in (*searched, *every.values(), *automatic):
         # Refused here, once, and not as a failure of every candidate.
         prepare(
@@ -191,39 +224,53 @@ def select(
             gaps=True,
         )
     if store is None:
-        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, output, delays)
+        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, sought)
     judges = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
     asked = Request.of(folds.runs, [searched, every, *automatic], judges, folds.description)
     with Store(store, asked) as kept:
-        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every, output, delays)
+        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every, sought)
 
 
 def _run_selection(
     work: CandidateEvaluator,
     searched: Sequence[Structure],
     every: Mapping[str, Structure],
-    output: str | None,
-    delays: Delays,
+    sought: Sequence[OutputProblem],
 ) -> Selection:
-    """Evaluate nested and listed structures, or automatic ones of an output, and choose."""
-    if output is not None:
-        AutomaticSelection(work.folds.runs, output, work, delays).run()
+    """Evaluate nested and listed structures, or automatic ones of outputs, and choose."""
+    if sought:
+        choices = []
+        for problem in sought:
+            work.trials = []
+            AutomaticSelection(problem, work).run()
+            choices.append(_choose(work, prefers_integer_orders=True))
+        return _identify_choice(work, choices[0] if len(choices) == 1 else _combine_choices(work, choices))
     for structure in searched:
         select_stepwise(NestedStructures(structure), work)
     if every:
         evaluate_list(every, work)
-    return _choose(work, work.folds, prefers_integer_orders=output is not None)
+    return _identify_choice(work, _choose(work, prefers_integer_orders=False))
 
 
-def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: bool) -> Selection:
-    """Rank the trials, choose one, and identify its structure.
+@dataclass(frozen=True)
+class Choice:
+    """Ranked trials, the chosen one, the reason, and the choices of single outputs that it combines."""
+
+    ranked: tuple[Trial, ...]
+    winner: Trial
+    reason: str
+    parts: tuple[Choice, ...] = ()
+
+
+def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice:
+    """Rank the trials and choose one.
 
     If integer orders are preferred, fractional ones are chosen only as :func:`_eligible_indices` says.
     """
     there = [t for t in work.trials if t.joint is not None]
     if not there:
         why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
-        raise ConvergenceError(f"no candidate can be fitted to {folds.description}{why}")
+        raise ConvergenceError(f"no candidate can be fitted to {work.folds.description}{why}")
     kept: dict[str, Trial] = {}
     for trial in work.trials:
         key = signature(trial.structure)
@@ -239,6 +286,71 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
     ranked = _with_criteria(ranked)
     eligible, words = _eligible_indices(ranked, near) if prefers_integer_orders else (near, "")
     best, winner = ranked[0], _winner([ranked[k] for k in eligible])
+    return Choice(tuple(ranked), winner, _reason(winner, best, ranked) + words)
+
+
+def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Choice:
+    """Return the choice of one structure with the equations of several outputs.
+
+    An input has one delay in a structure. If the outputs do not agree on it, their best candidates without a free delay
+    are combined.
+    """
+    agreed = _have_common_delays([c.winner for c in choices])
+    if not agreed:
+        choices = [_without_free_delays(choice) for choice in choices]
+    winners = [c.winner for c in choices]
+    structures = [w.structure for w in winners]
+    made = replace(
+        structures[0],
+        equations=tuple(e for s in structures for e in s.equations),
+        order_values={n: v for s in structures for n, v in s.order_values.items()},
+        delay={n: v for s in structures for n, v in s.delay.items()},
+        free_delays={n: v for s in structures for n, v in s.free_delays.items()},
+        offset=max((s.offset for s in structures), key=("none", "level", "ramp").index),
+    )
+    if any(w.joint is not None and w.joint.initial != "rest" for w in winners):
+        made = replace(made, initial="caputo")
+    start = {n: v for w in winners for n, v in w.values.items()}
+    trial = work.validate(describe_structure(made), made, work.fit_candidate(made, [start]), fine=True)
+    reason = " ".join(c.reason for c in choices)
+    if not agreed:
+        reason += (
+            " The outputs do not have the same delay, and an input has one: the equations have no free delay. Select "
+            "each output on its own for its delay."
+        )
+    if trial.failed is not None:
+        raise ConvergenceError(f"{trial.name} cannot be fitted to {work.folds.description}; {trial.failed}")
+    return Choice((trial, *(t for c in choices for t in c.ranked)), trial, reason, tuple(choices))
+
+
+def _have_common_delays(winners: Sequence[Trial]) -> bool:
+    """Whether the estimated delays of each input agree within their errors, and no equation lacks them."""
+    for name in {i.name for w in winners for i in w.structure.free_inputs}:
+        signal = next(i.signal for w in winners for i in w.structure.free_inputs if i.name == name)
+        driven = [w for w in winners if signal in w.structure.signals]
+        if any(name not in w.values for w in driven):
+            return False
+        values = np.array([w.values[name] for w in driven])
+        errors = np.array([w.errors[name] for w in driven])
+        apart = np.abs(values[:, None] - values) > NORMAL_99 * np.hypot(errors[:, None], errors)
+        if np.any(apart):
+            return False
+    return True
+
+
+def _without_free_delays(choice: Choice) -> Choice:
+    """Return the choice among candidates without a free delay; the same one if it has none or there is no other."""
+    ranked = [t for t in choice.ranked if t.failed is None and not t.structure.free_inputs]
+    if not choice.winner.structure.free_inputs or not ranked:
+        return choice
+    near = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], ranked[0])]
+    winner = _winner([ranked[k] for k in near])
+    return replace(choice, winner=winner, reason=_reason(winner, ranked[0], ranked))
+
+
+def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
+    """Identify the chosen structure on all runs, and add what is to be said about the choice."""
+    folds, winner = work.folds, choice.winner
     found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
     findings: list[Finding] = []
     if winner.joint is not None and found.joint is not None and found.joint.noise:
@@ -250,14 +362,15 @@ def _choose(work: CandidateEvaluator, folds: Folds, *, prefers_integer_orders: b
     worse = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
     if worse:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
-    findings += _fractional_order_findings(winner, ranked, found)
+    for part in choice.parts or (choice,):
+        findings += _fractional_order_findings(part.winner, part.ranked, found)
     unseen = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
     return Selection(
-        tuple(ranked),
-        ranked.index(winner),
+        choice.ranked,
+        choice.ranked.index(winner),
         found,
         folds.description,
-        _reason(winner, best, ranked) + words,
+        choice.reason,
         work.done_count,
         tuple(findings),
         None if not unseen else found.validate(unseen),
