@@ -302,13 +302,11 @@ def fit_with_initial_conditions(
         raced = None if alone else run_multistart(runs, asked, threads, progress)
         many = fit_initial_terms(start, refine=False, raced=raced)
         kept = _simplify_initial_terms(many, runs, structure, loss, refine=False)
-        if kept.unstable_optimum is None and many.unstable_optimum is None:
-            asked = replace(structure, initial=kept.initial)
-            fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
-            fine = replace(fine, starts=many.starts, origin=many.origin)
-            return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
-        # Where a simulation may grow, the starts of the race are asked on every grid.
-        return _simplify_initial_terms(fit_initial_terms(start, raced=raced), runs, structure, loss, refine=True)
+        asked = replace(structure, initial=kept.initial)
+        fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
+        unstable = fine.unstable_optimum or kept.unstable_optimum or many.unstable_optimum
+        fine = replace(fine, starts=many.starts, origin=many.origin, unstable_optimum=unstable)
+        return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
     joint = fit_initial_terms(start)
     if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
         return joint
