@@ -403,6 +403,23 @@ def test_a_level_that_drifts_is_named_with_its_remedy():
     assert said[0].remedy.startswith("offset='ramp'")
     found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS, offset="ramp"))
     assert gain_of(found) == pytest.approx(1.0, rel=0.02)
+    # Without the line it is named with what it changes.
+    plain = ftlm.identify(run_of(u, y), ftlm.equation(WORDS))
+    (drift,) = [f for f in plain.findings if f.code == "drift_fits"]
+    assert drift.numbers["ratio"] < 0.01
+    assert drift.numbers["other_value"] == pytest.approx(found.parameters[drift.parameter].value, rel=1e-3)
+    assert "offset_missing" not in codes(plain)
+    assert any("the level of y drifts" in reason for reason in plain.verdict.reasons)
+
+
+def test_colored_noise_is_no_drift():
+    u = np.repeat(np.random.default_rng(4).choice([-1.0, 1.0], 60), 10)
+    for seed in range(5):
+        noise = lfilter([1.0], [1.0, -0.98], np.random.default_rng(seed).standard_normal(600))
+        y = plant([1.0], [3.0, 1.0], u) + 0.1 * noise / np.std(noise)
+        found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS))
+        assert "noise_coloured" in codes(found)
+        assert "drift_fits" not in codes(found)
 
 
 @pytest.mark.parametrize(("name", "start"), [("fractional and a lag", "rest"), ("fractional", "rest")])

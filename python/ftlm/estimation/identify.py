@@ -17,7 +17,11 @@ from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.alternative_assumptions import intersample_findings, undetermined_start_findings
+from ftlm.estimation.alternative_assumptions import (
+    drift_findings,
+    intersample_findings,
+    undetermined_start_findings,
+)
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
@@ -398,6 +402,9 @@ def assess_fit(fit: Fit) -> Identification:
         findings += arm_findings(fit.task.structure, findings)
         if any(f.code in (*LEFT_OUT_CODES, "noise_coloured") for f in findings):
             findings += intersample_findings(fit)
+            drift = drift_findings(fit)
+            # A constant is a part of the line.
+            findings = [*(f for f in findings if not drift or f.code != "offset_missing"), *drift]
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
     result = Identification(
