@@ -664,7 +664,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "history",
         LEVEL_FACT,
         "{run}: the first values look like rest, but the residuals of a fit from rest show nonzero initial "
-        "conditions|; {ask[initial is history]} was used",
+        "conditions|, which are estimated with the model",
     ),
     "simulated_from_rest": FindingKind(
         "history",

@@ -380,6 +380,23 @@ def test_an_output_that_hardly_moves_at_first_was_at_rest(cut):
         assert ftlm.identify(run, structure).settings["initial"] == "rest"
 
 
+def test_quiet_rows_of_a_slow_motion_are_refuted():
+    record = panel_record("two lags", "pulse", "motion", 412)
+    structure = ftlm.equation(TWO_POLES)
+    assert rest_evidence(record, structure).rows == 15
+    found = ftlm.identify(record, structure)
+    assert panel_gain(found) == pytest.approx(2.0, rel=0.01)
+    assert "looked_like_rest" in codes(found)
+    assert "rests_at_level" not in codes(found)
+    # The model says so to comparisons.
+    assert found.model.structure.initial == "caputo"
+    assert found.model.compare(record).fit_percent == pytest.approx(found.fit_percent)
+    # A lag that the structure lacks refutes no rest.
+    wrong = ftlm.identify(panel_record("two lags", "pulse", "level", 411), ftlm.equation(FRACTIONAL))
+    assert "looked_like_rest" not in codes(wrong)
+    assert "rests_at_level" in codes(wrong)
+
+
 def test_a_mode_with_few_samples_a_period_is_named():
     g = np.random.default_rng(1)
     u = np.repeat(g.choice([-1.0, 1.0], 200), 3)

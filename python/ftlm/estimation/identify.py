@@ -45,6 +45,7 @@ from ftlm.estimation.nuisance_parameters import (
     OffsetTest,
     fit_score,
     fit_without_history,
+    has_colored_residuals,
     offset_test,
     output_sensitivities,
     unrequested_offset_findings,
@@ -57,7 +58,7 @@ from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import check_linear, default_m
-from ftlm.simulation.initial_conditions import START_SETTINGS
+from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
 from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
@@ -78,6 +79,8 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_fin
 
 #: Initial terms of fits with a level.
 LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
+#: Offsets of fits in motion of runs that looked like rest.
+MOTION_OFFSETS: tuple[Literal["none"], Literal["level"]] = ("none", "level")
 #: Mean of an output, in its standard deviations, from which on it shows a level.
 LEVEL_DEVIATIONS = 3.0
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
@@ -151,6 +154,9 @@ class Hypotheses:
 def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
     """Fit a structure, with a level of the outputs if the runs prefer one, and with findings on offsets."""
     fit = hypotheses.fit(structure)
+    moved = _fit_in_motion(fit, structure, hypotheses)
+    if moved is not None:
+        return moved
     # In a model that is not linear a constant is no sensitivity alone: it decides where a body rests.
     if fit.task.structure.offset != "none" or not structure.is_linear or not _is_testable(fit.task.runs):
         return hypotheses.take(structure, fit)
@@ -159,12 +165,45 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     if level is not None:
         return level
     said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
-    moved = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
-    level = _fit_with_level(fit, structure, hypotheses, shown=False) if said and moved and not shown else None
+    started = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
+    level = _fit_with_level(fit, structure, hypotheses, shown=False) if said and started and not shown else None
     if level is not None:
         return level
     fit = hypotheses.take(structure, fit)
     return replace(fit, findings=[*fit.findings, *said])
+
+
+def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
+    """Return the fit with initial values of runs whose first rows look like rest, if the runs clearly refute it.
+
+    Few quiet rows do not tell a slow motion from rest. Without color the residuals refute nothing.
+    """
+    joint, runs = fit.joint, fit.task.runs
+    automatic = structure.initial == "auto" and structure.offset == "none" and structure.is_linear
+    if joint is None or not automatic or joint.initial != "rest" or not has_colored_residuals(joint):
+        return None
+    evidence = [rest_evidence(run, structure) for run in runs]
+    if any(known is not None and known.rows == 0 for known in evidence):
+        # A constant input never tells.
+        return None
+    least, chosen = fit_score(joint, joint) - START_SETTINGS.history_margin, None
+    for offset in MOTION_OFFSETS:
+        asked = replace(structure, initial="caputo", offset=offset)
+        try:
+            other = hypotheses.refit(asked, fit)
+        except FtlmError:
+            continue
+        levels = len(runs) * len(fit.model.outputs) * (offset == "level")
+        if other.joint is None or other.joint.unstable_optimum is not None:
+            continue
+        score = fit_score(other.joint, joint, levels)
+        if score < least:
+            least, chosen = score, (asked, other)
+    if chosen is None:
+        return None
+    whole = hypotheses.take(*chosen)
+    said = make_finding("looked_like_rest", run=", ".join(r.name for r in runs))
+    return replace(whole, findings=[*whole.findings, said])
 
 
 def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, shown: bool) -> Fit | None:
