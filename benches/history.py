@@ -9,6 +9,7 @@ rest, or after a wait that lets a past fade). Seeds are 0 to ``--seeds`` less on
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -187,6 +188,23 @@ BASES = {
 }
 
 
+#: Sizes of a past input to choose from, in units of the root mean square of the run's.
+SIZES = (0.03, 0.1, 0.3, 1.0, 3.0)
+#: Length of the past, in lengths of the run.
+PAST = 4
+
+
+def octaves(answer: np.ndarray, every: int) -> np.ndarray:
+    """What a past input that is constant on octaves of time leaves, by the response to a step over all of the past.
+
+    The first octave is one sample long; one column an octave, pulse means of the run.
+    """
+    m = answer.size // (1 + PAST)
+    edges = [0, *(every << k for k in range((PAST * m // every - 1).bit_length())), PAST * m]
+    after = [answer[edge : edge + m] for edge in edges]
+    return np.array([late - early for early, late in itertools.pairwise(after)])
+
+
 def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float, np.ndarray, np.ndarray, int]]:
     """Of each basis: misfit over noise, bias and cost of each number in standard errors, and how many terms it has."""
     rows, over, step = 500, 4, 0.05
@@ -220,6 +238,15 @@ def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float,
             columns.append(samples(ends[0] - ends[1]) / 2e-4)
         return np.array(columns).T
 
+    def past_answers(numbers: np.ndarray) -> np.ndarray:
+        solved, drive = system(numbers, (1 + PAST) * m)
+        return np.array([samples(row) for row in octaves(times(solved, np.cumsum(drive)), over)]).T
+
+    def sensitivities(x: np.ndarray) -> np.ndarray:
+        return np.array(
+            [(past_answers(truth + move) - past_answers(truth - move)) @ x / 2e-4 for move in 1e-4 * np.eye(truth.size)]
+        ).T
+
     solved, drive = system(truth, 2 * m)
     y = times(solved, times(drive, u))[m:]
     sigma = noise * np.std(y)
@@ -245,6 +272,27 @@ def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float,
         found = np.sqrt(np.diag(covariance))
         bias = covariance @ (sensitive.T @ missed) / (sigma * found)
         out[name] = (float(np.linalg.norm(missed) / sigma), bias, found / errors, len(basis))
+    # A past under a prior, whose size has the largest likelihood on one record with noise.
+    columns = past_answers(truth)
+    record = rest + sigma * np.random.default_rng([seed, 3]).standard_normal(rest.size)
+    best = np.inf
+    for size in SIZES:
+        ratio = (size * np.sqrt(np.mean(u[m:] ** 2)) / sigma) ** 2
+        inner = np.eye(columns.shape[1]) + ratio * columns.T @ columns
+        x = ratio * np.linalg.solve(inner, columns.T @ record)
+        deviance = (record @ record - record @ columns @ x) / sigma**2 + np.linalg.slogdet(inner)[1]
+        if deviance < best:
+            best, chosen = deviance, (ratio, inner, x)
+    ratio, inner, x = chosen
+
+    def whitened(v: np.ndarray) -> np.ndarray:
+        return v - columns @ (ratio * np.linalg.solve(inner, columns.T @ v))
+
+    sensitive = alone + sensitivities(x)
+    covariance = np.linalg.inv(sensitive.T @ whitened(sensitive))
+    found, missed = np.sqrt(np.diag(covariance)), whitened(rest)
+    bias = covariance @ (sensitive.T @ missed) / (sigma * found)
+    out["octaves of the past, prior"] = (float(np.linalg.norm(missed) / sigma), bias, found / errors, columns.shape[1])
     return out
 
 
@@ -256,7 +304,7 @@ def bases(plants: list[str], seeds: int) -> Iterator[str]:
     for name in plants:
         with ProcessPoolExecutor(PROCESSES) as pool:
             tables = list(pool.map(partial(left, motion.PLANTS[name], noise=0.01), range(seeds)))
-        for basis in BASES:
+        for basis in tables[0]:
             misfit, bias, cost, terms = zip(*(table[basis] for table in tables), strict=True)
             worst = float(np.max(np.sqrt(np.mean(np.array(bias) ** 2, axis=0))))
             price = np.median(np.array(cost), axis=0)

@@ -59,6 +59,7 @@ CHANGED_LEVELS = (
         "other_intersample_fits",
         "an input that was not constant between samples, or not linear, as it was taken",
     ),
+    ("none", "drift_fits", "levels that drift, which bias every parameter"),
     ("none", "moves_before_input", "an output that leaves its level before its input changes"),
 )
 

@@ -594,6 +594,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "an unknown constant in the equation of {output} explains {share:.2g} % of the residuals| ({test}): "
         "a sensor's zero, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
     ),
+    "drift_fits": FindingKind(
+        "offset",
+        LEVEL_WITH_CARE,
+        "the level of {output} drifts: with a line in time the sum of squared residuals is {ratio:.3g} times as "
+        "large, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
+        "the level of {output} drifts: with a line in time {parameter} is {other_value:.4g}, not {value:.4g}",
+        "let the sensor settle, or estimate the line with the model: {ask[offset is ramp]}",
+        prefix="{run}: ",
+    ),
     "constant_instead_of_past": FindingKind(
         "offset",
         LEVEL_FACT,
@@ -655,7 +664,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "history",
         LEVEL_FACT,
         "{run}: the first values look like rest, but the residuals of a fit from rest show nonzero initial "
-        "conditions|; {ask[initial is history]} was used",
+        "conditions|, which are estimated with the model",
     ),
     "simulated_from_rest": FindingKind(
         "history",

@@ -380,6 +380,23 @@ def test_an_output_that_hardly_moves_at_first_was_at_rest(cut):
         assert ftlm.identify(run, structure).settings["initial"] == "rest"
 
 
+def test_quiet_rows_of_a_slow_motion_are_refuted():
+    record = panel_record("two lags", "pulse", "motion", 412)
+    structure = ftlm.equation(TWO_POLES)
+    assert rest_evidence(record, structure).rows == 15
+    found = ftlm.identify(record, structure)
+    assert panel_gain(found) == pytest.approx(2.0, rel=0.01)
+    assert "looked_like_rest" in codes(found)
+    assert "rests_at_level" not in codes(found)
+    # The model says so to comparisons.
+    assert found.model.structure.initial == "caputo"
+    assert found.model.compare(record).fit_percent == pytest.approx(found.fit_percent)
+    # A lag that the structure lacks refutes no rest.
+    wrong = ftlm.identify(panel_record("two lags", "pulse", "level", 411), ftlm.equation(FRACTIONAL))
+    assert "looked_like_rest" not in codes(wrong)
+    assert "rests_at_level" in codes(wrong)
+
+
 def test_a_mode_with_few_samples_a_period_is_named():
     g = np.random.default_rng(1)
     u = np.repeat(g.choice([-1.0, 1.0], 200), 3)
@@ -403,6 +420,23 @@ def test_a_level_that_drifts_is_named_with_its_remedy():
     assert said[0].remedy.startswith("offset='ramp'")
     found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS, offset="ramp"))
     assert gain_of(found) == pytest.approx(1.0, rel=0.02)
+    # Without the line it is named with what it changes.
+    plain = ftlm.identify(run_of(u, y), ftlm.equation(WORDS))
+    (drift,) = [f for f in plain.findings if f.code == "drift_fits"]
+    assert drift.numbers["ratio"] < 0.01
+    assert drift.numbers["other_value"] == pytest.approx(found.parameters[drift.parameter].value, rel=1e-3)
+    assert "offset_missing" not in codes(plain)
+    assert any("the level of y drifts" in reason for reason in plain.verdict.reasons)
+
+
+def test_colored_noise_is_no_drift():
+    u = np.repeat(np.random.default_rng(4).choice([-1.0, 1.0], 60), 10)
+    for seed in range(5):
+        noise = lfilter([1.0], [1.0, -0.98], np.random.default_rng(seed).standard_normal(600))
+        y = plant([1.0], [3.0, 1.0], u) + 0.1 * noise / np.std(noise)
+        found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS))
+        assert "noise_coloured" in codes(found)
+        assert "drift_fits" not in codes(found)
 
 
 @pytest.mark.parametrize(("name", "start"), [("fractional and a lag", "rest"), ("fractional", "rest")])

@@ -1,10 +1,11 @@
-"""Estimates under other assumptions on the start of a run and on its inputs between samples."""
+"""Estimates under other assumptions on the start of a run, on its level and on its inputs between samples."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -94,17 +95,42 @@ def intersample_findings(fit: Fit) -> list[Finding]:
             continue
         if not fit_score(refit, joint) + START_SETTINGS.history_margin < fit_score(joint, joint):
             continue
-        ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
-        values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
-        moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
-        if not moves or not max(moves.values()) > 1.0:
+        numbers = _largest_change(joint, refit)
+        if numbers is None:
             continue
-        most = max(moves, key=lambda n: moves[n])
-        numbers = {"value": values[most], "error": errors[most], "other_value": others[most], "ratio": ratio}
         words = {"taken": _BETWEEN_SAMPLES[runs[0].intersample[name]], "other": _BETWEEN_SAMPLES[other]}
-        about = {"run": ", ".join(r.name for r in runs), "input": name, "parameter": most, "kind": other}
+        about = {"run": ", ".join(r.name for r in runs), "input": name, "kind": other}
         findings.append(make_finding("other_intersample_fits", **about, **numbers, **words))
     return findings
+
+
+def drift_findings(fit: Fit) -> list[Finding]:
+    """Return a finding if the runs clearly prefer levels that drift: a line in time beside the model."""
+    joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
+    if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
+        return []
+    try:
+        asked = replace(structure, initial=joint.initial, offset="ramp")
+        refit = fit_output_error(runs, asked, near=joint, refine=False)
+    except FtlmError:
+        return []
+    numbers = _largest_change(joint, refit)
+    if numbers is None or not fit_score(refit, joint) + START_SETTINGS.history_margin < fit_score(joint, joint):
+        return []
+    about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
+    return [make_finding("drift_fits", **about, **numbers)]
+
+
+def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any] | None:
+    """Return the ratio of the sums of squares of two fits and the parameter that differs most; None if none does."""
+    ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
+    values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
+    moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
+    if not moves or not max(moves.values()) > 1.0:
+        return None
+    most = max(moves, key=lambda n: moves[n])
+    known = {"value": values[most], "error": errors[most], "other_value": others[most]}
+    return {"parameter": most, "ratio": ratio, **known}
 
 
 def _changes_often(runs: Sequence[Run], name: str) -> bool:

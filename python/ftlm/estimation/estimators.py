@@ -175,11 +175,12 @@ def estimate_output_error(
     begin: Model | Mapping[str, float] | None = None,
     more: Mapping[str, float] | None = None,
     alone: bool = False,
+    fitted: JointFit | None = None,
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
     `answers` are the inputs explained by a reference and serve as instruments. With `alone`, `begin` is the only
-    initial guess.
+    initial guess. `fitted` is the joint fit of the task if it exists.
     """
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -194,7 +195,7 @@ def estimate_output_error(
         begins = warm_starts(free, given)
     # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
     course = ShareTracker(progress)
-    joint = fit_with_initial_conditions(
+    joint = fitted or fit_with_initial_conditions(
         answers or task.runs,
         structure,
         start,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import msgspec
@@ -16,7 +17,11 @@ from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.alternative_assumptions import intersample_findings, undetermined_start_findings
+from ftlm.estimation.alternative_assumptions import (
+    drift_findings,
+    intersample_findings,
+    undetermined_start_findings,
+)
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
@@ -40,11 +45,12 @@ from ftlm.estimation.nuisance_parameters import (
     OffsetTest,
     fit_score,
     fit_without_history,
+    has_colored_residuals,
     offset_test,
     output_sensitivities,
     unrequested_offset_findings,
 )
-from ftlm.estimation.output_error import parameter_set
+from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import WHOLE_RUN_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
@@ -52,7 +58,7 @@ from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.simulation.discretization import check_linear, default_m
-from ftlm.simulation.initial_conditions import START_SETTINGS
+from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
 from ftlm.structure.structure import History, Offset, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
@@ -73,6 +79,8 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_fin
 
 #: Initial terms of fits with a level.
 LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
+#: Offsets of fits in motion of runs that looked like rest.
+MOTION_OFFSETS: tuple[Literal["none"], Literal["level"]] = ("none", "level")
 #: Mean of an output, in its standard deviations, from which on it shows a level.
 LEVEL_DEVIATIONS = 3.0
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
@@ -80,13 +88,15 @@ LEVEL_DEVIATIONS = 3.0
 MAX_OFFSET_TEST_SAMPLES = 400_000
 
 
-def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit:
+def fit_with_offset_decision(
+    runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit], hypotheses: Hypotheses
+) -> Fit:
     """Fit a structure; under ``offset="auto"`` with a constant if the offset test is significant.
 
     The constant is fitted first, because a fit that lacks a needed constant may end anywhere.
     """
     if structure.offset != "auto":
-        fit = _fit_with_level_decision(structure, estimate)
+        fit = _fit_with_level_decision(structure, hypotheses)
         if structure.initial != "auto" or structure.offset != "none":
             return fit
         return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit)])
@@ -109,32 +119,105 @@ def fit_with_offset_decision(runs: Sequence[Run], structure: Structure, estimate
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
 
 
-def _fit_with_level_decision(structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit:
+@dataclass(frozen=True)
+class Hypotheses:
+    """Fits of several starts of a run, of which one is taken.
+
+    Parameters
+    ----------
+    fit
+        Fits a structure.
+    complete
+        Returns the fit of a structure with all its intervals from its joint fit; None if :attr:`fit` has them.
+    """
+
+    fit: Callable[[Structure], Fit]
+    complete: Callable[[Structure, JointFit | None], Fit] | None = None
+
+    def take(self, structure: Structure, fit: Fit) -> Fit:
+        """Return the complete fit of a structure."""
+        return fit if self.complete is None else self.complete(structure, fit.joint)
+
+    def refit(self, structure: Structure, fit: Fit) -> Fit:
+        """Return the fit of a structure from the optimum of another one that differs in its start alone."""
+        joint = fit.joint
+        if joint is None or self.complete is None:
+            return self.fit(structure)
+        loss: Loss = "squares" if joint.robust is None else "huber"
+        known = {n: v[0] for n, v in structure.order_values.items() if len(v) == 1}
+        # The grid of a fit is the finer one of the two that its step was refined on.
+        coarser = replace(joint, refinement=max(joint.refinement // 2, 1))
+        near = fit_output_error(fit.task.runs, structure.with_orders(known), near=coarser, loss=loss)
+        return replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
+
+
+def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
     """Fit a structure, with a level of the outputs if the runs prefer one, and with findings on offsets."""
-    fit = estimate(structure)
+    fit = hypotheses.fit(structure)
+    moved = _fit_in_motion(fit, structure, hypotheses)
+    if moved is not None:
+        return moved
     # In a model that is not linear a constant is no sensitivity alone: it decides where a body rests.
     if fit.task.structure.offset != "none" or not structure.is_linear or not _is_testable(fit.task.runs):
-        return fit
+        return hypotheses.take(structure, fit)
     shown = _shows_level(fit)
-    level = _fit_with_level(fit, structure, estimate) if shown else None
+    level = _fit_with_level(fit, structure, hypotheses, shown=True) if shown else None
     if level is not None:
         return level
     said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
-    moved = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
-    level = _fit_with_level(fit, structure, estimate) if said and moved and not shown else None
-    return level or replace(fit, findings=[*fit.findings, *said])
+    started = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
+    level = _fit_with_level(fit, structure, hypotheses, shown=False) if said and started and not shown else None
+    if level is not None:
+        return level
+    fit = hypotheses.take(structure, fit)
+    return replace(fit, findings=[*fit.findings, *said])
 
 
-def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structure], Fit]) -> Fit | None:
+def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
+    """Return the fit with initial values of runs whose first rows look like rest, if the runs clearly refute it.
+
+    Few quiet rows do not tell a slow motion from rest. Without color the residuals refute nothing.
+    """
+    joint, runs = fit.joint, fit.task.runs
+    automatic = structure.initial == "auto" and structure.offset == "none" and structure.is_linear
+    if joint is None or not automatic or joint.initial != "rest" or not has_colored_residuals(joint):
+        return None
+    evidence = [rest_evidence(run, structure) for run in runs]
+    if any(known is not None and known.rows == 0 for known in evidence):
+        # A constant input never tells.
+        return None
+    least, chosen = fit_score(joint, joint) - START_SETTINGS.history_margin, None
+    for offset in MOTION_OFFSETS:
+        asked = replace(structure, initial="caputo", offset=offset)
+        try:
+            other = hypotheses.refit(asked, fit)
+        except FtlmError:
+            continue
+        levels = len(runs) * len(fit.model.outputs) * (offset == "level")
+        if other.joint is None or other.joint.unstable_optimum is not None:
+            continue
+        score = fit_score(other.joint, joint, levels)
+        if score < least:
+            least, chosen = score, (asked, other)
+    if chosen is None:
+        return None
+    whole = hypotheses.take(*chosen)
+    said = make_finding("looked_like_rest", run=", ".join(r.name for r in runs))
+    return replace(whole, findings=[*whole.findings, said])
+
+
+def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, shown: bool) -> Fit | None:
     """Return the best fit with a level of the outputs, from rest or in motion, if the runs prefer it; else None.
 
-    Two fits are compared by the color of the one that leaves more.
+    Two fits are compared by the color of the one that leaves more. A level that is shown moves the optimum far; another
+    one is fitted from the optimum without it.
     """
     best, chosen, numbers = fit.joint, None, 0
     margin = START_SETTINGS.history_margin if best is not None and isinstance(best.initial, History) else 0.0
     for initial in LEVEL_STARTS:
+        asked = replace(structure, initial=initial, offset="level")
         try:
-            level = estimate(replace(structure, initial=initial, offset="level"))
+            level = hypotheses.fit(asked) if shown else hypotheses.refit(asked, fit)
         except FtlmError:
             continue
         if best is None or level.joint is None:
@@ -142,14 +225,15 @@ def _fit_with_level(fit: Fit, structure: Structure, estimate: Callable[[Structur
         more = len(fit.task.runs) * len(fit.model.outputs)
         worse = max((best, level.joint), key=lambda joint: math.prod(joint.noise.values()))
         if fit_score(level.joint, worse, more) < fit_score(best, worse, numbers) + margin:
-            best, chosen, numbers, margin = level.joint, level, more, 0.0
-    if chosen is None or chosen.joint is None:
+            best, chosen, numbers, margin = level.joint, (asked, level), more, 0.0
+    if chosen is None or best is None:
         return None
-    was = "rested" if chosen.joint.initial == "rest" else "moved"
+    whole = hypotheses.take(*chosen)
+    was = "rested" if best.initial == "rest" else "moved"
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
     # Another run may start otherwise.
-    model = replace(chosen.model, structure=replace(chosen.model.structure, initial=structure.initial))
-    return replace(chosen, model=model, findings=[*chosen.findings, make_finding("level_estimated", **about)])
+    model = replace(whole.model, structure=replace(whole.model.structure, initial=structure.initial))
+    return replace(whole, model=model, findings=[*whole.findings, make_finding("level_estimated", **about)])
 
 
 def _shows_level(fit: Fit) -> bool:
@@ -283,14 +367,17 @@ def identify(
     if structure.offset == "auto":
         _check_offset_test(structure, chosen)
 
-    def estimate(asked: Structure) -> Fit:
-        fit = chosen.fit(several, asked, m=m, threads=threads, progress=progress)
+    def estimate(asked: Structure, method: EstimationMethod = chosen, **more: JointFit | None) -> Fit:
+        fit = method.fit(several, asked, m=m, threads=threads, progress=progress, **more)
         if not isinstance(fit, Fit):
             raise ModelError(f"the method {chosen.name!r} fitted a {type(fit).__name__}, not a Fit")
         return fit
 
+    light, hypotheses = getattr(chosen, "hypothesis", None), Hypotheses(estimate)
+    if light is not None:
+        hypotheses = Hypotheses(partial(estimate, method=light), lambda asked, joint: estimate(asked, fitted=joint))
     PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
-    result = assess_fit(fit_with_offset_decision(several, structure, estimate))
+    result = assess_fit(fit_with_offset_decision(several, structure, estimate, hypotheses))
     PACKAGE_LOGGER.info("identified: %s", result.verdict)
     for item in result.findings:
         PACKAGE_LOGGER.warning("%s", item)
@@ -356,6 +443,9 @@ def assess_fit(fit: Fit) -> Identification:
         findings += arm_findings(fit.task.structure, findings)
         if any(f.code in (*LEFT_OUT_CODES, "noise_coloured") for f in findings):
             findings += intersample_findings(fit)
+            drift = drift_findings(fit)
+            # A constant is a part of the line.
+            findings = [*(f for f in findings if not drift or f.code != "offset_missing"), *drift]
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
     result = Identification(

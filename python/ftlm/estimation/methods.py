@@ -17,7 +17,7 @@ from ftlm.estimation.estimators import estimate_order_search, estimate_output_er
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.estimation.noise_model import check_noise_model, fit_noise_model
-from ftlm.estimation.output_error import Loss, Noise
+from ftlm.estimation.output_error import JointFit, Loss, Noise
 from ftlm.estimation.result import Identification, Task
 from ftlm.findings import Finding
 from ftlm.model.model import Model
@@ -128,8 +128,9 @@ class OutputError:
         m: int | None = None,
         threads: int | None = None,
         progress: ProgressCallback = None,
+        fitted: JointFit | None = None,
     ) -> Fit:
-        """Fit a structure to checked runs; see :func:`ftlm.identify`."""
+        """Fit a structure to checked runs; see :func:`ftlm.identify`. `fitted` is a fit of :meth:`hypothesis`."""
         if self.reference is not None and structure.has_friction:
             raise ModelError(
                 f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the "
@@ -164,13 +165,19 @@ class OutputError:
                 )
             else:
                 fit = estimate_output_error(
-                    task, m, workers, progress, answers, self.loss, self.intervals, first, more, alone=alone
+                    task, m, workers, progress, answers, self.loss, self.intervals, first, more, alone, fitted
                 )
             return fit, {} if fit.joint is None else fit.joint.values_by_name
 
         fit, found = fit_within_bounds(structure, bounds, estimate)
         fit = replace(fit, findings=[*fit.findings, *found])
         return fit if self.reference is None else mark_reference_fit(fit, self.reference, weak)
+
+    @property
+    def hypothesis(self) -> OutputError | None:
+        """Method without profiles for fits of several hypotheses; None if its fits cannot be completed by `fitted`."""
+        resumable = self.bounds is None and self.noise == "white" and self.reference is None
+        return replace(self, intervals="quadratic") if resumable else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -250,7 +250,8 @@ def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
     """Return findings on runs that are assumed to rest before their first row, with the evidence."""
     resolved = resolve_start(runs, structure)
     findings = []
-    for run in runs if resolved.initial == "rest" or resolved.offset == "level" else ():
+    some_rested = resolved.initial == "auto" and resolved.offset == "level"
+    for run in runs if resolved.initial == "rest" or some_rested else ():
         evidence = rest_evidence(run, structure)
         if evidence is None:
             continue

@@ -11,13 +11,14 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import MAX_SAMPLE_VALUE
+from ftlm.data.sampling import MAX_SAMPLE_VALUE, drop_missing
 from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance
 from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, run_multistart
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.initial_conditions import (
+    START_SETTINGS,
     common_initial_conditions,
     has_memory,
     history,
@@ -36,6 +37,7 @@ from ftlm.utils.statistics import (
     SIGNIFICANCE_LEVEL,
     autoregression,
     chi_squared,
+    variance_inflation,
 )
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
@@ -302,13 +304,11 @@ def fit_with_initial_conditions(
         raced = None if alone else run_multistart(runs, asked, threads, progress)
         many = fit_initial_terms(start, refine=False, raced=raced)
         kept = _simplify_initial_terms(many, runs, structure, loss, refine=False)
-        if kept.unstable_optimum is None and many.unstable_optimum is None:
-            asked = replace(structure, initial=kept.initial)
-            fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
-            fine = replace(fine, starts=many.starts, origin=many.origin)
-            return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
-        # Where a simulation may grow, the starts of the race are asked on every grid.
-        return _simplify_initial_terms(fit_initial_terms(start, raced=raced), runs, structure, loss, refine=True)
+        asked = replace(structure, initial=kept.initial)
+        fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
+        unstable = fine.unstable_optimum or kept.unstable_optimum or many.unstable_optimum
+        fine = replace(fine, starts=many.starts, origin=many.origin, unstable_optimum=unstable)
+        return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
     joint = fit_initial_terms(start)
     if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
         return joint
@@ -322,6 +322,12 @@ def fit_score(joint: JointFit, reference: JointFit, levels: int = 0) -> float:
     """Return the criterion of a fit's start (:func:`start_score`); `levels` are numbers beside its initial terms."""
     own, others = _pooled_residuals(joint), _pooled_residuals(reference)
     return start_score(own, joint.initial_terms + levels, others)
+
+
+def has_colored_residuals(joint: JointFit) -> bool:
+    """Whether residuals have the color of a structure or of a start that leaves something out."""
+    inflation = (variance_inflation(drop_missing(series)) for series in _pooled_residuals(joint))
+    return max(inflation) > START_SETTINGS.white_inflation
 
 
 def _pooled_residuals(joint: JointFit) -> list[Floats]:

@@ -40,6 +40,7 @@ WHOLE_RUN_CODES = (
     "instruments_unstable",
     "unstable_optimum_kept",
     "offset_missing",
+    "drift_fits",
     "simulated_from_rest",
 )
 

@@ -215,7 +215,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     if unseen and "run_forgets" not in codes:
         yield make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen))
     yield from (f for f in result.findings if f.code == "equation_says_identity")
-    yield from (f for f in result.findings if f.code == "offset_missing")
+    yield from (f for f in result.findings if f.code in ("drift_fits", "offset_missing"))
     yield from _residuals(result)
     if joint is not None and not joint.converged and "not_converged" not in codes:
         yield make_finding("not_converged")
