@@ -72,7 +72,7 @@ def measure(case: str, initial: str) -> dict[str, object]:
         " at a level" if found.settings.get("offset") == "level" else ""
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"seconds": seconds, "peak": peak, "before": before, "taken": taken, "fit": min(found.fit_percent.values())}
+    return {"seconds": seconds, "peak": peak, "before": before, "taken": taken, "fit": min(found.fit.values())}
 
 
 def apart(case: str, initial: str, repeats: int) -> dict[str, object]:

@@ -390,7 +390,7 @@ def test_quiet_rows_of_a_slow_motion_are_refuted():
     assert "rests_at_level" not in codes(found)
     # The model says so to comparisons.
     assert found.model.structure.initial == "caputo"
-    assert found.model.compare(record).fit_percent == pytest.approx(found.fit_percent)
+    assert found.model.compare(record).fit == pytest.approx(found.fit)
     # A lag that the structure lacks refutes no rest.
     wrong = ftlm.identify(panel_record("two lags", "pulse", "level", 411), ftlm.equation(FRACTIONAL))
     assert "looked_like_rest" not in codes(wrong)
