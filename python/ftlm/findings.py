@@ -21,7 +21,13 @@ MAX_SUMMARY_FINDINGS = 3
 #: Codes of residuals that are not white.
 NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "noise_coloured", "response_not_white")
 #: Codes of residuals that show what a model leaves out.
-LEFT_OUT_CODES = ("residuals_follow_input", "coupling_missing", "residuals_not_white", "output_not_white")
+LEFT_OUT_CODES = (
+    "residuals_follow_input",
+    "coupling_missing",
+    "residuals_follow_direction",
+    "residuals_not_white",
+    "output_not_white",
+)
 #: Fields of the subject of a finding.
 SUBJECT_FIELDS = ("run", "output", "input", "parameter", "method")
 #: Role of findings on runs that a model was not identified from.
@@ -526,6 +532,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{output}: residuals are correlated with {input}| (correlation {value:.2g} at lag {lag}, 99 % limit "
         "{limit:.2g}): part of the effect of {input} is not modeled",
         "residuals are correlated with inputs ({shown}): the model is incomplete",
+    ),
+    "residuals_follow_direction": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output}: residuals depend on the direction of motion| (correlation {value:.2g}, 99 % limit {limit:.2g}): dry "
+        "friction, backlash or another non-linearity is not modeled",
+        "residuals of {output} depend on the direction of motion: friction is missing",
+        "add the term {term}",
     ),
     "coupling_missing": FindingKind(
         "residuals",

@@ -237,7 +237,7 @@ def test_words_are_read_and_written() -> None:
     [
         ("D^2 y = u + fc*sign(D y)", "it is subtracted"),
         ("D^2 y = u - fc*sign(D u)", "own output"),
-        ("D^2 y = u - fc*sign(y)", "D and the name of a signal"),
+        ("D^2 y = u - fc*sign(y)", "of a measured speed .*fc.tanh"),
         ("D^2 y = u - fc*sign(D y) - fs*sign(D y)", "twice"),
         ("D^0.8 y = u - fc*sign(D y)", r"outside \(1, 2\]"),
         ("D^2.2 y = u - fc*sign(D y)", r"outside \(1, 2\]"),

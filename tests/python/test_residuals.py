@@ -480,3 +480,44 @@ def test_an_input_of_noise_and_a_missing_lag_keep_their_behavior_between_samples
         run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y + 0.05 * np.std(y) * noise})
         found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
         assert "other_intersample_fits" not in {f.code for f in found.findings}
+
+
+def rubbing_motor(seed: int, friction: float) -> ftlm.Run:
+    """Return the speed of a motor under steps of voltage, by Euler's method with sticking."""
+    g = np.random.default_rng(seed)
+    voltage = np.repeat(g.uniform(-6, 6, 40), 40)
+    speed, speeds, step = 0.0, [], 0.01
+    for u in voltage:
+        speeds.append(speed)
+        for _ in range(20):
+            force = 12 * u - 3 * speed
+            stuck = speed == 0.0 and abs(force) <= friction
+            rub = friction * np.sign(speed if speed != 0.0 else force)
+            after = speed + step / 20 * (force - rub)
+            speed = 0.0 if stuck or after * speed < 0 else after
+    y = np.array(speeds) + 0.05 * g.standard_normal(voltage.size)
+    return ftlm.Run.from_arrays(step=step, inputs={"u": voltage}, outputs={"w": y})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_friction_that_a_linear_model_lacks_is_named_with_the_term(seed):
+    run, other = rubbing_motor(seed, 9.0), rubbing_motor(seed + 50, 9.0)
+    found = ftlm.identify(run, ftlm.equation("D w = a w + b u"), threads=1)
+    (said,) = [f for f in found.findings if f.code == "residuals_follow_direction"]
+    assert not [f for f in found.findings if f.code == "noise_coloured"]
+    assert found.validate(other).verdict.level == "with care"
+    term = said.numbers["term"]
+    assert term.startswith("- fc*tanh(")
+    whole = ftlm.identify(run, ftlm.equation(f"D w = a w + b u {term}"), threads=1)
+    assert not [f for f in whole.findings if f.code == "residuals_follow_direction"]
+    for name, true in (("a", -3.0), ("b", 12.0), ("fc", 9.0)):
+        assert whole.parameters[name].value == pytest.approx(true, rel=0.02)
+
+
+def test_a_linear_motor_has_no_friction():
+    said = [
+        f
+        for seed in range(20)
+        for f in ftlm.identify(rubbing_motor(seed, 0.0), ftlm.equation("D w = a w + b u"), threads=1).findings
+    ]
+    assert not [f for f in said if f.code == "residuals_follow_direction"]

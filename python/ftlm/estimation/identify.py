@@ -438,6 +438,8 @@ def assess_fit(fit: Fit) -> Identification:
         tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is not None:
+        directed = [o for o, r in tests.outputs.items() if r.follows_direction]
+        findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in directed]
         findings = [_noise_finding(f, tests) for f in findings] + _residual_findings(fit, tests)
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)

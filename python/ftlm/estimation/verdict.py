@@ -144,9 +144,17 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     if against is not None:
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
-    return Verdict(
-        TRUST_LEVEL, f"it predicts validation runs ({fits}), residuals are noise, all parameters are well determined"
-    )
+    left = _describe_residuals(result)
+    return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), {left}, all parameters are well determined")
+
+
+def _describe_residuals(result: Identification) -> str:
+    """Say what the residuals of a model to trust are: noise, noise with a color, or too small to matter."""
+    outputs = () if result.residuals is None else result.residuals.outputs.values()
+    if any(not r.is_noise for r in outputs):
+        return f"residuals are below {100 * NEGLIGIBLE_RESIDUAL_RATIO:g} % of the output where they are not noise"
+    colored = any(not r.whiteness.passed for r in outputs)
+    return "residuals are noise with a color" if colored else "residuals are noise"
 
 
 def _combined_verdict(
@@ -386,6 +394,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
         yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
     yield from coupled
+    yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in judged)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]

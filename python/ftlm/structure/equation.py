@@ -362,8 +362,8 @@ class Equation:
         alpha = self.order.constant
         if not 1 < alpha <= 2:
             raise ModelError(
-                f"{words} acts on its velocity, but alpha = {alpha:g} is outside (1, 2]; leave it out, or choose "
-                "another order"
+                f"{words} acts on its velocity, but alpha = {alpha:g} is outside (1, 2]; of a measured speed write "
+                f"'- fc*tanh(100 {self.output})', or choose another order"
             )
 
     @check_arguments

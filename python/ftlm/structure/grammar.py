@@ -680,6 +680,12 @@ class EquationParser:
                 raise self._syntax_error(f"sign(D {near[0]})")
         self._take()
         self._expect("(")
+        kind, value, _ = self._peek()
+        if kind == "name" and value != "D" and self._peek(1)[1] == ")":
+            raise self._error(
+                f"sign({value}) is no term; friction of a position is '- fc*sign(D {value})', that of a measured speed "
+                f"'- fc*tanh(100 {value})', with a slope that rises within its noise"
+            )
         signal = self._velocity("D and the name of a signal, as in sign(D y)")
         self._expect(")")
         if near is not None and near[0] != signal:

@@ -42,6 +42,10 @@ from ftlm.validation.feedback import FeedbackTest, feedback_test
 ORDER_TOLERANCE = 1e-9
 #: Ratio of residual RMS to the output's standard deviation below which discretization or quantization explains it.
 NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
+#: Velocity of a simulation, relative to the largest, below which an output stands still.
+REST_SHARE = 0.01
+#: Slope of the smooth step that stands for the sign of a measured speed, relative to the largest speed.
+SIGN_SLOPE = 100.0
 #: Singular values of sensitivities, relative to the largest, below which they are rounding.
 DIRECTION_RANK = 1e-10
 
@@ -131,6 +135,10 @@ class OutputResiduals:
         Cross-correlations with each input, both signals through the whitening filter of the residuals.
     feedback_tests
         Feedback test of each input of its equation.
+    direction
+        Cross-correlation with the direction of the simulated motion; None for equations with friction.
+    friction
+        Term of dry friction of the output.
     """
 
     residuals: list[Floats]
@@ -139,6 +147,13 @@ class OutputResiduals:
     whiteness: CorrelationTest
     inputs: dict[str, CorrelationTest]
     feedback_tests: dict[str, FeedbackTest] = field(default_factory=dict)
+    direction: CorrelationTest | None = None
+    friction: str = ""
+
+    @property
+    def follows_direction(self) -> bool:
+        """Whether residuals depend on the direction of motion, and nothing else explains it."""
+        return self.direction is not None and self.direction.failed and self.is_noise and not self.feedback
 
     @property
     def feedback(self) -> tuple[str, ...]:
@@ -378,6 +393,10 @@ def run_residual_tests(
         direct = {s for t in item.terms for s in t.signals if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
         outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
+        if item.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
+            row = model.outputs.index(name)
+            moves = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
+            outputs[name] = _test_direction(outputs[name], name, moves, lags, item.order.constant)
         if sensitivities is not None and outputs[name].fails_colored:
             outputs[name] = _test_beyond_parameters(outputs[name], sensitivities().get(name, []), signals, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
@@ -421,6 +440,19 @@ def _test_output(
             later = _independence(series, values, noise, lags, first=1)
             inputs[name] = later if later.passed else inputs[name]
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
+
+
+def _test_direction(
+    output: OutputResiduals, name: str, velocities: Sequence[Floats], lags: int, order: float
+) -> OutputResiduals:
+    """Test whether residuals depend on the sign of a simulated velocity, as those of a model without friction do."""
+    largest = max(float(np.max(np.abs(v))) for v in velocities)
+    if not 0.0 < largest < math.inf:
+        return output
+    signs = [np.where(np.abs(v) > REST_SHARE * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
+    test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
+    term = f"- fc*sign(D {name})" if order > 1.0 else f"- fc*tanh({SIGN_SLOPE / largest:.2g} {name})"
+    return replace(output, direction=test, friction=term)
 
 
 def _test_beyond_parameters(
@@ -548,7 +580,7 @@ def failed_tests(tests: Residuals) -> list[Finding]:
             found.append(make_finding("out_of_range", output=name))
             continue
         white = output.whiteness
-        if not white.passed:
+        if not white.passed and not output.follows_direction:
             numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
             noise = make_finding("noise_coloured", output=name)
             found.append(noise if output.is_noise else make_finding("output_not_white", output=name, **numbers))
@@ -563,6 +595,9 @@ def failed_tests(tests: Residuals) -> list[Finding]:
             elif test.first:
                 at_once = test.values[test.lags == 0]
                 found.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
+        if output.follows_direction and output.direction is not None:
+            numbers = {"value": output.direction.largest[1], "limit": output.direction.limit}
+            found.append(make_finding("residuals_follow_direction", output=name, term=output.friction, **numbers))
         found += [feedback_finding(name, signal, output) for signal in output.feedback]
     return found
 
