@@ -921,10 +921,12 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "residuals are {ratio:.3g} times the standard deviations of the data (99 %): the model is "
         "incomplete, or the standard deviations are too small",
     ),
-    "response_not_white": _rule(
+    "response_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
+        "residuals at neighboring frequencies are correlated: the model is incomplete; {remedy}",
         "residuals at neighboring frequencies are correlated: the model is incomplete",
+        "add an element or a term, and compare the errors",
     ),
     "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit has not converged"),
     "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "a parameter is on its bound: {bound}"),

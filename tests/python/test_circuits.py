@@ -225,3 +225,18 @@ def test_a_circuit_on_the_command_line(tmp_path, monkeypatch):
     assert result.exit_code == 0
     assert "W1_sigma" in result.output
     assert (tmp_path / "a.html").exists()
+
+
+def test_intervals_of_positive_parameters_are_positive_and_symmetric_in_logarithms():
+    # A finite diffusion whose end the spectrum does not reach: only its short-time slope is known.
+    g = np.random.default_rng(3)
+    f = np.geomspace(0.01, 1e4, 50)
+    s = 2j * np.pi * f
+    z = 0.02 + 0.1 / np.tanh(np.sqrt(400 * s)) / np.sqrt(400 * s)
+    noisy = z * (1 + 0.003 * (g.standard_normal(50) + 1j * g.standard_normal(50)))
+    found = ftlm.identify_frequency(ftlm.FrequencyData.from_arrays(2 * np.pi * f, noisy), "R0-Wo1")
+    for name, (low, high) in found.intervals.items():
+        value = found.values[name]
+        assert 0 < low < value < high
+        assert low * high == pytest.approx(value**2, rel=1e-9)
+    assert found.intervals["Wo1_tau"][1] - found.values["Wo1_tau"] > 1.02 * 1.96 * found.standard_errors["Wo1_tau"]

@@ -19,6 +19,8 @@ START_POINTS, RATIO_DECADES = 400, 2.0
 MIN_EXPONENT, START_EXPONENTS = 0.05, (0.6, 1.0)
 #: Smallest and largest parameter in SI units.
 PARAMETER_RANGE = (1e-18, 1e18)
+#: Largest half-width of an interval of a logarithm: beyond it a parameter is not identifiable.
+MAX_LOG_WIDTH = 700.0
 
 
 class CircuitProblem(ResponseProblem):
@@ -54,6 +56,15 @@ class CircuitProblem(ResponseProblem):
         """Return logarithms of parameters; NaN for those that are not above 0."""
         safe = np.where(values > 0, values, np.nan)
         return np.where(self.is_log, np.log(np.where(self.is_log, safe, 1.0)), values)
+
+    def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Return intervals of given half-widths; of positive parameters by their logarithms, and so above 0."""
+        found = super().intervals(values, widths)
+        for name, value, is_log in zip(self.names, values.tolist(), self.is_log.tolist(), strict=True):
+            if is_log:
+                ratio = float(np.exp(np.minimum(widths[name] / value, MAX_LOG_WIDTH)))
+                found[name] = (value / ratio, value * ratio)
+        return found
 
     def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
         """Convert a Jacobian by logarithms to one by the parameters."""

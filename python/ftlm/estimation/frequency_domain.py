@@ -504,7 +504,7 @@ def _result(
         model = problem.circuit.with_values(named)
     else:
         model = _model(problem, records, named, values, covariance, standard, findings)
-    intervals = {n: (named[n] - factor * e, named[n] + factor * e) for n, e in standard.items()}
+    intervals = problem.intervals(values, {n: factor * e for n, e in standard.items()})
     return FrequencyIdentification(
         model,
         tuple(records),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,6 +114,10 @@ class ResponseProblem:
     def in_seconds(self, values: Floats) -> Floats:
         """Convert parameters from the time unit of this problem to seconds."""
         return self._convert_time_unit(values, 1.0)
+
+    def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Return intervals of parameters [in seconds] of given half-widths by name."""
+        return {n: (v - widths[n], v + widths[n]) for n, v in zip(self.names, values.tolist(), strict=True)}
 
     def _convert_time_unit(self, values: Floats, way: float) -> Floats:
         out = values.astype(np.float64).copy()
