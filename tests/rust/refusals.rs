@@ -94,10 +94,22 @@ fn regressions_that_cannot_be_made() {
     refused(least_squares::fit(&run, &there, &[None], &Initial::Powers(vec![f64::NAN])));
     refused(least_squares::fit(&[], &there, &[None], &Initial::Rest));
     refused(least_squares::solve(&[vec![1.0; 3]], &[1.0; 4], 1));
-    refused(instrumental_variables::fit(&run, &[], &[], &Initial::Rest, instrumental_variables::Settings::default()));
+    refused(instrumental_variables::fit(
+        &run,
+        &[],
+        &[],
+        &Initial::Rest,
+        instrumental_variables::InstrumentalSettings::default(),
+    ));
     for wrong in [
-        instrumental_variables::Settings { iterations: 1 << 62, ..instrumental_variables::Settings::default() },
-        instrumental_variables::Settings { tolerance: f64::NAN, ..instrumental_variables::Settings::default() },
+        instrumental_variables::InstrumentalSettings {
+            iterations: 1 << 62,
+            ..instrumental_variables::InstrumentalSettings::default()
+        },
+        instrumental_variables::InstrumentalSettings {
+            tolerance: f64::NAN,
+            ..instrumental_variables::InstrumentalSettings::default()
+        },
     ] {
         refused(instrumental_variables::fit(
             &run,
@@ -112,7 +124,7 @@ fn regressions_that_cannot_be_made() {
         &[structure(0, 1.0, &[(7, 0.0)])],
         &[vec![None]],
         &Initial::Rest,
-        instrumental_variables::Settings::default(),
+        instrumental_variables::InstrumentalSettings::default(),
     ));
 }
 
@@ -174,11 +186,12 @@ fn free_orders_out_of_all_bounds() {
 fn a_joint_structure_of_signals_that_are_not_there() {
     let made = |output, signal| {
         let order = joint::Order::number(0.0);
-        let term = joint::Term { signal, order, coefficient: joint::Coefficient::Free("a".into()), factor: 1.0 };
+        let term =
+            joint::ParametricTerm { signal, order, coefficient: joint::Coefficient::Free("a".into()), factor: 1.0 };
         let order = joint::Order::free("alpha");
-        let equation = joint::Equation { output, order, terms: vec![term], friction: None };
+        let equation = joint::ParametricEquation { output, order, terms: vec![term], friction: None };
         let signals = vec!["y".into(), "u".into()];
-        ParameterSet::from_structure(joint::Structure::new(signals, vec![equation], Initial::Rest))
+        ParameterSet::from_structure(joint::ParametricStructure::new(signals, vec![equation], Initial::Rest))
     };
     made(0, 1).unwrap();
     refused(made(2, 1));

@@ -470,7 +470,7 @@ struct Products<'a> {
     out: &'a mut [f64],
 }
 
-impl simd::Kernel for Products<'_> {
+impl simd::SimdKernel for Products<'_> {
     type Output = ();
 
     #[inline(always)]
