@@ -14,7 +14,7 @@ use ftlm::fractional::exponential_sum::{integral_by_memory, Rates};
 use ftlm::fractional::integral::{fractional_derivative, fractional_integral, Derivative, IntegralRule};
 use ftlm::fractional::kernels::digamma;
 use ftlm::fractional::operational_matrices;
-use ftlm::linalg::small::{self, Recursion};
+use ftlm::linalg::small::{self, Recursion, SlidingGram};
 use ftlm::rig::arm_model::{Arm, Parameters};
 use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
 use ftlm::series;
@@ -260,7 +260,8 @@ fn numbers_that_are_none() {
     refused(Recursion::new(&[f64::NAN]));
     refused(small::inverse(&[1.0, 2.0], 2));
     refused(small::scaled_inverse(&[1.0, 2.0], 2));
-    refused(Recursion::new(&[1.0]).unwrap().step([(&[1.0, 2.0][..], 1.0)].into_iter()));
+    refused(Recursion::new(&[1.0]).unwrap().step(&SlidingGram::new(2, 1)));
+    refused(SlidingGram::new(2, 1).push(&[1.0], 1.0));
     refused(series::divide_naive(&[1.0, 2.0], &[1.0]));
     refused(Rates::new(1e-300, 1e300, 1e-6));
     refused(integral_by_memory(&[0.0, f64::NAN], 0.5, 0.1, 1e-6));
