@@ -29,7 +29,7 @@
 //! let y = Channel::new("y", y, Role::Output);
 //! let u = Channel::new("u", u, Role::Input(Intersample::Hold));
 //! let run = Recording::from_channels(step, vec![y, u])?;
-//! let equation = Equation::new(0, Order::free("alpha"))
+//! let equation = ParametricEquation::new(0, Order::free("alpha"))
 //!     .with_term("a", Order::number(0.0), 0)
 //!     .with_term("b", Order::number(0.0), 1);
 //! let found = fit_equations(vec![run], vec![equation])?;
@@ -84,7 +84,7 @@ pub mod rig;
 /// Types for a fit of measured columns.
 pub mod prelude {
     pub use crate::error::{Error, Result};
-    pub use crate::estimation::joint_fit::structure::{Equation, Order};
+    pub use crate::estimation::joint_fit::structure::{Order, ParametricEquation};
     pub use crate::estimation::joint_fit::{fit_equations, EquationFit};
     pub use crate::recording::{Channel, Recording, Role};
     pub use crate::signal::block_pulse::{Intersample, PulseMeans};

@@ -14,11 +14,11 @@ pub const LANE_COUNT: usize = 8;
 /// One value of each of several computations that run side by side.
 pub type Lanes<const L: usize> = [f64; L];
 
-/// Kernel for [`dispatch_simd`].
+/// SimdKernel for [`dispatch_simd`].
 ///
 /// `run` and the functions in its inner loops must be `#[inline(always)]`: code that is not inlined is compiled for the
 /// oldest machine.
-pub trait Kernel {
+pub trait SimdKernel {
     /// Result type.
     type Output;
 
@@ -28,7 +28,7 @@ pub trait Kernel {
 
 struct PulpKernel<K>(K);
 
-impl<K: Kernel> WithSimd for PulpKernel<K> {
+impl<K: SimdKernel> WithSimd for PulpKernel<K> {
     type Output = K::Output;
 
     #[inline(always)]
@@ -47,11 +47,11 @@ pub fn force_portable(on: bool) {
 /// Run a kernel with the widest vector instructions of this machine.
 ///
 /// ```
-/// use ftlm::simd::{dispatch_simd, dot, Kernel};
+/// use ftlm::simd::{dispatch_simd, dot, SimdKernel};
 ///
 /// struct Squares<'a>(&'a [f64]);
 ///
-/// impl Kernel for Squares<'_> {
+/// impl SimdKernel for Squares<'_> {
 ///     type Output = f64;
 ///
 ///     #[inline(always)]
@@ -62,7 +62,7 @@ pub fn force_portable(on: bool) {
 ///
 /// assert_eq!(dispatch_simd(Squares(&[3.0, 4.0])), 25.0);
 /// ```
-pub fn dispatch_simd<K: Kernel>(kernel: K) -> K::Output {
+pub fn dispatch_simd<K: SimdKernel>(kernel: K) -> K::Output {
     if USE_PORTABLE.load(Ordering::Relaxed) {
         kernel.run()
     } else {

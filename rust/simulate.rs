@@ -10,6 +10,7 @@ use crate::series_system::System;
 
 /// Response with initial terms fitted to the measured outputs.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Response {
     /// Pulse means of each equation's output.
     pub outputs: Vec<Vec<f64>>,

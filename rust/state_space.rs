@@ -23,7 +23,7 @@ use crate::signal::block_pulse::{delay_samples, delayed_row, Intersample};
 
 /// Input of the equations.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Input {
+pub struct InputSignal {
     /// Index of the signal in the equations.
     pub signal: usize,
     /// Samples, one a row of the record.
@@ -63,12 +63,12 @@ const TAYLOR_TERMS: i32 = 15;
 /// ```
 /// use ftlm::equation::{Equation, Structure, Term};
 /// use ftlm::signal::block_pulse::Intersample;
-/// use ftlm::state_space::{respond, Input};
+/// use ftlm::state_space::{respond, InputSignal};
 /// # fn main() -> ftlm::error::Result<()> {
 /// // y′ = −y + u.
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
-/// let step = Input { signal: 1, samples: vec![1.0; 3], between: Intersample::Hold, delay: 0.0, before: 0.0 };
+/// let step = InputSignal { signal: 1, samples: vec![1.0; 3], between: Intersample::Hold, delay: 0.0, before: 0.0 };
 /// let y = respond(&[model], &[step], &[], 0.5, 3, &ftlm::parallel::Stop::default())?.unwrap_or_default();
 /// assert!((y[2] - (1.0 - (-1.0_f64).exp())).abs() < 1e-15);
 /// # Ok(())
@@ -76,7 +76,7 @@ const TAYLOR_TERMS: i32 = 15;
 /// ```
 pub fn respond(
     equations: &[Equation],
-    inputs: &[Input],
+    inputs: &[InputSignal],
     initial: &[Vec<(f64, f64)>],
     step: f64,
     rows: usize,
@@ -129,7 +129,12 @@ struct Realization {
 
 impl Realization {
     /// Model of equations, balanced. None if the direct terms are singular, or for too many states.
-    fn new(equations: &[Equation], inputs: &[Input], initial: &[Vec<(f64, f64)>], step: f64) -> Result<Option<Self>> {
+    fn new(
+        equations: &[Equation],
+        inputs: &[InputSignal],
+        initial: &[Vec<(f64, f64)>],
+        step: f64,
+    ) -> Result<Option<Self>> {
         let count = equations.len();
         let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
         let mut lengths = vec![0; count];
@@ -237,7 +242,7 @@ impl Realization {
     }
 
     /// Recursion over one sampling interval; None if it overflows.
-    fn discretize<'a>(&self, inputs: &'a [Input]) -> Result<Option<Recursion<'a>>> {
+    fn discretize<'a>(&self, inputs: &'a [InputSignal]) -> Result<Option<Recursion<'a>>> {
         let n = self.states;
         let Some(interval) = Transition::new(&self.system, n, 1.0) else { return Ok(None) };
         let mut channels = Vec::with_capacity(inputs.len());
@@ -458,7 +463,7 @@ fn advance(n: usize, growth: &[f64], state: &mut [f64], forcing: &[f64], history
 
 #[cfg(test)]
 mod tests {
-    use super::{respond, Input, Transition};
+    use super::{respond, InputSignal, Transition};
     use crate::equation::{Equation, Structure, Term};
     use crate::error::Error;
     use crate::parallel::Stop;
@@ -506,7 +511,7 @@ mod tests {
     fn a_stop_ends_the_recursion() {
         let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 1, order: 0.0 }] };
         let samples = vec![1.0; 5];
-        let ramp = [Input { signal: 1, samples, between: Intersample::Hold, delay: 0.0, before: 0.0 }];
+        let ramp = [InputSignal { signal: 1, samples, between: Intersample::Hold, delay: 0.0, before: 0.0 }];
         let equations = [Equation { structure, coefficients: vec![1.0] }];
         let stop = Stop::default();
         let of = || respond(&equations, &ramp, &[], 1.0, 5, &stop);

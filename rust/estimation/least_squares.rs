@@ -11,6 +11,7 @@ const RANK_TOLERANCE: f64 = 1e-12;
 
 /// Least-squares estimate of one equation.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Estimate {
     /// One per term; fixed coefficients as given.
     pub coefficients: Vec<f64>,

@@ -9,7 +9,7 @@ use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::least_squares::{self, Estimate, Regression};
 use crate::fractional::operational_matrices;
-use crate::linalg::small::Recursion;
+use crate::linalg::small::{Recursion, SlidingGram};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
@@ -226,14 +226,17 @@ fn run_recursion(
     stop: &Stop,
 ) -> Result<Vec<Vec<f64>>> {
     let mut state = Recursion::new(prior)?;
-    let rows: Vec<Vec<f64>> = (0..target.len()).map(|i| columns.iter().map(|c| c[i]).collect()).collect();
+    let mut window = SlidingGram::new(columns.len(), length);
+    let mut row = vec![0.0; columns.len()];
     let mut trace = Vec::with_capacity(target.len());
     for pair in starts.windows(2) {
+        window.clear();
         for newest in pair[0]..pair[1] {
             stop.check()?;
-            let oldest = (newest + 1).saturating_sub(length).max(pair[0]);
+            row.iter_mut().zip(columns).for_each(|(value, column)| *value = column[newest]);
+            window.push(&row, target[newest])?;
             state
-                .step((oldest..=newest).rev().map(|i| (rows[i].as_slice(), target[i])))
+                .step(&window)
                 .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;
             trace.push(state.coefficients().to_vec());
         }

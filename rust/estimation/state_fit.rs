@@ -4,8 +4,8 @@
 
 use super::output_error::{Coordinate, Experiment, FreeInput};
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::estimation::optimization::damped_step::Problem;
-use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
+use crate::estimation::optimization::damped_step::LeastSquaresProblem;
+use crate::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings, Status};
 use crate::linalg::orthogonal::extend_orthonormal;
 use crate::parallel::Stop;
 
@@ -127,7 +127,8 @@ pub struct Start {
 
 /// Optimum of a fit and its diagnostics.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Fit {
+#[non_exhaustive]
+pub struct StateFit {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
@@ -156,7 +157,7 @@ struct OutputError<'a, M> {
     stop: &'a Stop,
 }
 
-impl<M: StateModel> Problem for OutputError<'_, M> {
+impl<M: StateModel> LeastSquaresProblem for OutputError<'_, M> {
     type Point = Point;
     type Evaluation = Evaluation<M::Part>;
 
@@ -263,7 +264,7 @@ impl<M> InitialStateProblem<'_, M> {
     }
 }
 
-impl<M: StateModel> Problem for InitialStateProblem<'_, M> {
+impl<M: StateModel> LeastSquaresProblem for InitialStateProblem<'_, M> {
     type Point = Vec<f64>;
     type Evaluation = Evaluation<M::Part>;
 
@@ -295,7 +296,7 @@ impl<M: StateModel> Problem for InitialStateProblem<'_, M> {
 }
 
 /// Evaluations and tolerance of the estimate of an initial state.
-const INITIAL_STATE_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
+const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 30, tolerance: 1e-6 };
 
 /// Initial state of a run at fixed parameters: best result of local optimizations from its first samples.
 fn estimate_initial_state<M: StateModel>(
@@ -330,9 +331,9 @@ pub(crate) fn fit<M: StateModel>(
     model: &M,
     experiments: &[Experiment],
     start: &Start,
-    settings: Settings,
+    settings: MinimizationSettings,
     stop: &Stop,
-) -> Result<Fit> {
+) -> Result<StateFit> {
     model.check(experiments)?;
     check_length("orders", model.order_bounds().len(), start.orders.len())?;
     check_length("coefficients", model.coordinates().len(), start.coefficients.len())?;
@@ -376,7 +377,7 @@ pub(crate) fn fit<M: StateModel>(
         }
     }
     let Point { orders, coefficients, inputs, states } = found.point;
-    Ok(Fit {
+    Ok(StateFit {
         initial: states.iter().map(|values| model.powers(&orders, &coefficients, values)).collect(),
         orders,
         coefficients,

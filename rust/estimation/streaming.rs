@@ -3,7 +3,7 @@
 //! A new row needs the fractional integrals of every signal at the newest pulse, which depend on the whole past. The
 //! newest two pulses enter by the exact kernel (32). Older pulses enter through a sum of exponentials,
 //! exact to rounding. An order above 1 is a running integral of the order minus one. A row costs
-//! O((signals + terms)·rates + p k² + k³), independent of the length of the run. Earlier rows may be forgotten
+//! O((signals + terms)·rates + k³), independent of the innovation length and of the length of the run. Earlier rows may be forgotten
 //! exponentially, and a stream that begins in motion has powers of t as more terms.
 
 use crate::equation::{Initial, Structure};
@@ -11,8 +11,8 @@ use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::estimation::multi_innovation::{Innovation, Prior, RowBasis};
 use crate::fractional::exponential_sum::{decay, Rates};
 use crate::fractional::kernels::{block_pulse_kernel, PowerMeans};
-use crate::linalg::small::Recursion;
-use crate::simd::dot;
+use crate::linalg::small::{Recursion, SlidingGram};
+use crate::simd::{self, dot};
 
 /// Relative accuracy of the sum of exponentials, at the rounding level of the batch form.
 const MEMORY_TOLERANCE: f64 = 2e-15;
@@ -24,15 +24,28 @@ struct SignalHistory {
     last: f64,
 }
 
+/// Weights of the pulses in an integral of order at most 1 at the newest pulse, or in the last step of a higher one.
+#[derive(Debug, Clone)]
+struct PulseWeights {
+    /// Of the newest pulse and of the previous one.
+    recent: [f64; 2],
+    history: Vec<f64>,
+}
+
+impl PulseWeights {
+    #[inline(always)]
+    fn apply(&self, newest: f64, past: &SignalHistory) -> f64 {
+        self.recent[0] * newest + self.recent[1] * past.last + dot(&self.history, &past.states[..self.history.len()])
+    }
+}
+
 /// Running integral I^η of one signal at the newest pulse.
 #[derive(Debug, Clone)]
 struct RunningIntegral {
     signal: usize,
-    /// Weights of the newest pulse and of the previous one.
-    recent_weights: [f64; 2],
-    history_weights: Vec<f64>,
+    local: PulseWeights,
     /// For orders above 1: the integral of the order minus one, and its running sum.
-    inner: Option<Box<(RunningIntegral, f64)>>,
+    inner: Option<(PulseWeights, f64)>,
     step: f64,
 }
 
@@ -41,7 +54,8 @@ impl RunningIntegral {
         // The sum of orders may exceed 2 by rounding alone.
         let eta = if (eta - 2.0).abs() < 1e-9 { 2.0 } else { eta };
         if eta == 0.0 {
-            return Ok(Self { signal, recent_weights: [1.0, 0.0], history_weights: Vec::new(), inner: None, step });
+            let local = PulseWeights { recent: [1.0, 0.0], history: Vec::new() };
+            return Ok(Self { signal, local, inner: None, step });
         }
         if !(eta > 0.0 && eta <= 2.0) {
             return Err(Error::OutOfRange {
@@ -51,36 +65,35 @@ impl RunningIntegral {
                 remedy: "identify such an equation from the recorded run".into(),
             });
         }
-        let kernel = block_pulse_kernel(eta, 2, step);
-        let q = if eta > 1.0 { eta - 1.0 } else { eta };
-        let inner = if eta > 1.0 { Some(Box::new((Self::new(signal, q, step, rates)?, 0.0))) } else { None };
-        let mut near = [kernel[0], kernel[1]];
-        if eta > 1.0 {
-            // The running sum already contains the contribution of the last pulse at its end.
-            near[1] -= libm::pow(step, eta) / libm::tgamma(eta + 1.0);
+        let history = |q: f64, weight: fn((f64, f64, f64), f64) -> f64| -> Vec<f64> {
+            let decays = rates.rates().iter().map(|rate| decay(rate * step));
+            rates.weights(q).iter().zip(decays).map(|(w, parts)| w * parts.0 * weight(parts, step)).collect()
+        };
+        let kernel = |eta: f64| {
+            let kernel = block_pulse_kernel(eta, 2, step);
+            [kernel[0], kernel[1]]
+        };
+        let means =
+            |q: f64| PulseWeights { recent: kernel(q), history: history(q, |(_, first, last), _| first + last) };
+        if eta <= 1.0 {
+            return Ok(Self { signal, local: means(eta), inner: None, step });
         }
-        let far = rates
-            .weights(q)
-            .iter()
-            .zip(rates.rates())
-            .map(|(w, s)| {
-                let (keep, first, last) = decay(s * step);
-                w * keep * if eta > 1.0 { step * last } else { first + last }
-            })
-            .collect();
-        Ok(Self { signal, recent_weights: near, history_weights: far, inner, step })
+        let mut recent = kernel(eta);
+        // The running sum already contains the contribution of the last pulse at its end.
+        recent[1] -= libm::pow(step, eta) / libm::tgamma(eta + 1.0);
+        let local = PulseWeights { recent, history: history(eta - 1.0, |(_, _, last), step| step * last) };
+        Ok(Self { signal, local, inner: Some((means(eta - 1.0), 0.0)), step })
     }
 
     /// Mean over the newest pulse.
+    #[inline(always)]
     fn next(&mut self, newest: f64, past: &SignalHistory) -> f64 {
-        let older = dot(&self.history_weights, &past.states);
-        let local = self.recent_weights[0] * newest + self.recent_weights[1] * past.last + older;
+        let local = self.local.apply(newest, past);
         match &mut self.inner {
             None => local,
-            Some(pair) => {
-                let (inner, sum) = pair.as_mut();
+            Some((inner, sum)) => {
                 let value = *sum + local;
-                *sum += self.step * inner.next(newest, past);
+                *sum += self.step * inner.apply(newest, past);
                 value
             }
         }
@@ -104,9 +117,12 @@ struct EquationRecursion {
     initial: Vec<InitialColumn>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
-    /// Ring buffer of the p newest rows, each with its target.
-    rows: Vec<(Vec<f64>, f64)>,
-    at: usize,
+    /// The p newest rows.
+    window: SlidingGram,
+    /// Integrals of the output and of the signals of the terms at the newest pulse.
+    values: Vec<f64>,
+    /// Newest row.
+    row: Vec<f64>,
 }
 
 /// Options of a stream.
@@ -152,7 +168,8 @@ pub struct Streaming {
     share: Vec<f64>,
     pasts: Vec<SignalHistory>,
     fits: Vec<EquationRecursion>,
-    sample: Option<Vec<f64>>,
+    /// Last sample, empty before the first one.
+    sample: Vec<f64>,
     means: Vec<f64>,
     options: StreamingOptions,
     pulses: usize,
@@ -219,8 +236,9 @@ impl Streaming {
                 initial,
                 fixed: fixed.clone(),
                 recursion: Recursion::new(&vec![options.prior.precision(0.0); free])?,
-                rows: Vec::new(),
-                at: 0,
+                window: SlidingGram::new(free, options.length),
+                values: vec![0.0; 1 + orders.len()],
+                row: Vec::with_capacity(free),
             });
         }
         let decays: Vec<_> = rates.rates().iter().map(|s| decay(s * step)).collect();
@@ -231,7 +249,7 @@ impl Streaming {
             share: decays.iter().map(|d| step * (d.1 + d.2)).collect(),
             pasts: vec![SignalHistory { states: vec![0.0; count], last: 0.0 }; inputs.len()],
             fits,
-            sample: None,
+            sample: Vec::new(),
             means: vec![0.0; inputs.len()],
             options,
             pulses: 0,
@@ -247,7 +265,10 @@ impl Streaming {
     pub fn push(&mut self, sample: &[f64]) -> Result<()> {
         check_length("sample", self.inputs.len(), sample.len())?;
         check_finite("sample", sample)?;
-        let Some(before) = self.sample.replace(sample.to_vec()) else { return Ok(()) };
+        if self.sample.is_empty() {
+            self.sample.extend_from_slice(sample);
+            return Ok(());
+        }
         if self.pulses == self.longest {
             #[allow(clippy::cast_precision_loss)]
             return Err(Error::OutOfRange {
@@ -258,16 +279,13 @@ impl Streaming {
             });
         }
         for (s, mean) in self.means.iter_mut().enumerate() {
-            *mean = if self.inputs[s] { before[s] } else { 0.5 * (before[s] + sample[s]) };
+            *mean = if self.inputs[s] { self.sample[s] } else { 0.5 * (self.sample[s] + sample[s]) };
         }
+        self.sample.copy_from_slice(sample);
+        let Self { fits, pasts, means, keep, share, .. } = self;
+        simd::dispatch_simd(Integration { fits, pasts, means, keep, share });
         for fit in &mut self.fits {
-            fit.step(&self.means, &self.pasts, &self.options, self.pulses)?;
-        }
-        for (past, mean) in self.pasts.iter_mut().zip(&self.means) {
-            for ((z, keep), share) in past.states.iter_mut().zip(&self.keep).zip(&self.share) {
-                *z = *z * keep + share * past.last;
-            }
-            past.last = *mean;
+            fit.step(&self.options, self.pulses)?;
         }
         self.pulses += 1;
         Ok(())
@@ -314,21 +332,43 @@ impl InitialColumn {
     }
 }
 
-impl EquationRecursion {
-    fn step(&mut self, means: &[f64], pasts: &[SignalHistory], options: &StreamingOptions, pulse: usize) -> Result<()> {
-        let mut target = self.target.next(means[self.output], &pasts[self.output]);
-        if self.rows.len() < options.length {
-            self.at = self.rows.len();
-            self.rows.push((Vec::with_capacity(self.integrals.len() + self.initial.len()), 0.0));
-        } else {
-            self.at = (self.at + 1) % options.length;
+/// Kernel that integrates the newest pulse for every equation and then adds it to the histories.
+struct Integration<'a> {
+    fits: &'a mut [EquationRecursion],
+    pasts: &'a mut [SignalHistory],
+    means: &'a [f64],
+    keep: &'a [f64],
+    share: &'a [f64],
+}
+
+impl simd::SimdKernel for Integration<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let Self { fits, pasts, means, keep, share } = self;
+        for fit in fits {
+            fit.values[0] = fit.target.next(means[fit.output], &pasts[fit.output]);
+            for (value, integral) in fit.values[1..].iter_mut().zip(&mut fit.integrals) {
+                *value = integral.next(means[integral.signal], &pasts[integral.signal]);
+            }
         }
-        let row = &mut self.rows[self.at].0;
+        for (past, mean) in pasts.iter_mut().zip(means) {
+            for ((z, keep), share) in past.states.iter_mut().zip(keep).zip(share) {
+                *z = *z * keep + share * past.last;
+            }
+            past.last = *mean;
+        }
+    }
+}
+
+impl EquationRecursion {
+    fn step(&mut self, options: &StreamingOptions, pulse: usize) -> Result<()> {
+        let (mut target, row) = (self.values[0], &mut self.row);
         row.clear();
-        for (integral, fixed) in self.integrals.iter_mut().zip(&self.fixed) {
-            let value = integral.next(means[integral.signal], &pasts[integral.signal]);
+        for (value, fixed) in self.values[1..].iter().zip(&self.fixed) {
             match fixed {
-                None => row.push(value),
+                None => row.push(*value),
                 Some(coefficient) => target -= coefficient * value,
             }
         }
@@ -337,9 +377,9 @@ impl EquationRecursion {
         if let Prior::Relative(_) = options.prior {
             self.recursion.add_prior(row.iter().map(|value| options.prior.precision(value * value)));
         }
-        self.rows[self.at].1 = target;
+        self.window.push(row, target)?;
         self.recursion
-            .step(self.rows.iter().map(|(row, target)| (row.as_slice(), *target)))
+            .step(&self.window)
             .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: pulse })
     }
 

@@ -19,6 +19,6 @@ pub mod law;
 pub(crate) mod model;
 
 pub use dynamics::{Body, Motion};
-pub use fit::{fit, fit_until, Fit, Start};
+pub use fit::{fit, fit_until, Start, StateFit};
 pub use law::FrictionLaw;
 pub use model::{filtered_outputs, FreeFrictionLaw, FrictionModel};

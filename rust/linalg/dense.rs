@@ -108,6 +108,7 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
 }
 
 /// Singular value decomposition of columns. Values are in descending order.
+#[non_exhaustive]
 pub struct SingularValues {
     /// Singular vectors on the left, each as long as the columns.
     pub left: Vec<Vec<f64>>,

@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::parallel::{self, Stop};
-use crate::simd::{dispatch_simd, dot, Kernel};
+use crate::simd::{dispatch_simd, dot, SimdKernel};
 
 /// Rows of one block of a triangular factorization. They fit in the cache.
 const QR_BLOCK_ROWS: usize = 1 << 10;
@@ -19,7 +19,7 @@ struct Reflections<'a> {
     columns: &'a mut [Vec<f64>],
 }
 
-impl Kernel for Reflections<'_> {
+impl SimdKernel for Reflections<'_> {
     type Output = bool;
 
     #[inline(always)]
@@ -90,7 +90,7 @@ struct Projection<'a> {
     times: usize,
 }
 
-impl Kernel for Projection<'_> {
+impl SimdKernel for Projection<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -171,7 +171,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
 /// √Σ v².
 struct Norm<'a>(&'a [f64]);
 
-impl Kernel for Norm<'_> {
+impl SimdKernel for Norm<'_> {
     type Output = f64;
 
     #[inline(always)]

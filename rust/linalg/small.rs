@@ -362,6 +362,75 @@ fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
     Some(())
 }
 
+/// Σ q qᵀ and Σ q m over the newest rows, in amortized O(k²) per row for any length of the window.
+///
+/// Rows form blocks of the window's length. A window is the end of one block and the beginning of the next, so its sum
+/// is that of a suffix and of a prefix (van Herk, doi:10.1016/0167-8655(92)90069-C). Nothing is subtracted.
+#[derive(Debug, Clone)]
+pub struct SlidingGram {
+    width: usize,
+    length: usize,
+    /// Products of the rows of the current block: packed rows of q qᵀ, then q m.
+    block: Vec<f64>,
+    /// Sums of the previous block from each of its rows on.
+    suffixes: Vec<f64>,
+    /// Sums of the current block, and of the rows of the previous one that are still in the window.
+    prefix: Vec<f64>,
+    suffix: Vec<f64>,
+}
+
+impl SlidingGram {
+    /// Empty window of this many rows, each of `width` values.
+    #[must_use]
+    pub fn new(width: usize, length: usize) -> Self {
+        let zeros = vec![0.0; packed_index(width, 0) + width];
+        Self { width, length, block: Vec::new(), suffixes: Vec::new(), prefix: zeros.clone(), suffix: zeros }
+    }
+
+    /// Remove all rows.
+    pub fn clear(&mut self) {
+        self.block.clear();
+        self.suffixes.clear();
+        self.prefix.fill(0.0);
+        self.suffix.fill(0.0);
+    }
+
+    /// Add a row and its output. The oldest row leaves a full window.
+    ///
+    /// # Errors
+    /// [`Error::Length`] for a row of another length.
+    pub fn push(&mut self, row: &[f64], output: f64) -> Result<()> {
+        check_length("row", self.width, row.len())?;
+        let all = self.prefix.len();
+        if self.block.len() == self.length.saturating_mul(all) {
+            for at in (0..self.block.len() - all).rev() {
+                self.block[at] += self.block[at + all];
+            }
+            std::mem::swap(&mut self.block, &mut self.suffixes);
+            self.block.clear();
+            self.prefix.fill(0.0);
+        }
+        let start = self.block.len();
+        for (i, q) in row.iter().enumerate() {
+            self.block.extend(row[..=i].iter().map(|other| q * other));
+        }
+        self.block.extend(row.iter().map(|q| q * output));
+        self.prefix.iter_mut().zip(&self.block[start..]).for_each(|(sum, product)| *sum += product);
+        let after = self.block.len();
+        match self.suffixes.get(after..after + all) {
+            Some(suffix) => self.suffix.copy_from_slice(suffix),
+            None => self.suffix.fill(0.0),
+        }
+        Ok(())
+    }
+
+    /// Sum of the products at this place: packed rows of q qᵀ, then q m.
+    #[inline]
+    fn sum(&self, at: usize) -> f64 {
+        self.suffix[at] + self.prefix[at]
+    }
+}
+
 /// State of recursion (44): coefficients and inverse covariance.
 #[derive(Debug, Clone)]
 pub struct Recursion {
@@ -407,22 +476,30 @@ impl Recursion {
         }
     }
 
-    /// One update of (44) with the innovation of these rows, in any order.
+    /// One update of (44) with the rows of a window.
     ///
     /// A coefficient without any information stays as it is.
     ///
     /// # Errors
-    /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for a row of another length.
-    pub fn step<'a>(&mut self, rows: impl Iterator<Item = (&'a [f64], f64)>) -> Result<()> {
+    /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for rows of another length.
+    pub fn step(&mut self, window: &SlidingGram) -> Result<()> {
         let k = self.coefficients.len();
-        for (row, output) in rows {
-            check_length("row", k, row.len())?;
-            let innovation = output - row.iter().zip(&self.coefficients).map(|(q, x)| q * x).sum::<f64>();
-            for (i, q) in row.iter().enumerate() {
-                self.gain[i] += q * innovation;
-                let triangle = &mut self.information[packed_index(i, 0)..=packed_index(i, i)];
-                triangle.iter_mut().zip(row).for_each(|(v, other)| *v += q * other);
+        check_length("row", k, window.width)?;
+        let mut at = 0;
+        for i in 0..k {
+            for j in 0..i {
+                let sum = window.sum(at + j);
+                self.information[at + j] += sum;
+                self.gain[i] -= sum * self.coefficients[j];
+                self.gain[j] -= sum * self.coefficients[i];
             }
+            let sum = window.sum(at + i);
+            self.information[at + i] += sum;
+            self.gain[i] -= sum * self.coefficients[i];
+            at += i + 1;
+        }
+        for (i, gain) in self.gain.iter_mut().enumerate() {
+            *gain += window.sum(at + i);
         }
         self.factor.copy_from_slice(&self.information);
         cholesky(&mut self.factor, k)
@@ -445,5 +522,53 @@ impl Recursion {
     #[must_use]
     pub fn coefficients(&self) -> &[f64] {
         &self.coefficients
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One update of (44) with each row of the window by itself, by a dense solve.
+    fn naive_step(information: &mut DMatrix<f64>, x: &mut DVector<f64>, rows: &[(Vec<f64>, f64)]) {
+        let mut gain = DVector::zeros(x.len());
+        for (row, output) in rows {
+            let row = DVector::from_column_slice(row);
+            gain += &row * (output - row.dot(x));
+            *information += &row * row.transpose();
+        }
+        *x += information.clone().lu().solve(&gain).unwrap_or_else(|| gain.clone() * f64::NAN);
+    }
+
+    #[test]
+    fn window_sums_give_the_steps_of_its_rows() -> Result<()> {
+        let noise = |i: usize, j: usize| libm::sin((i * i + 7 * i * j + 3) as f64 * 0.7310 + j as f64);
+        for (k, length, forgetting) in
+            [(1, 1, 1.0), (3, 1, 0.95), (3, 2, 1.0), (4, 7, 0.9), (2, 20, 1.0), (5, 200, 0.99)]
+        {
+            let mut state = Recursion::new(&vec![0.5; k])?;
+            let mut window = SlidingGram::new(k, length);
+            let (mut information, mut x) = (DMatrix::identity(k, k) * 0.5, DVector::zeros(k));
+            // The second part begins with an empty window.
+            for _ in 0..2 {
+                let mut rows: Vec<(Vec<f64>, f64)> = Vec::new();
+                window.clear();
+                for i in 0..100 {
+                    // A relation that changes, so that the oldest rows of a window differ from its newest.
+                    let row: Vec<f64> = (0..k).map(|j| noise(i, j)).collect();
+                    let output = row.iter().sum::<f64>() * (1.0 + 0.1 * i as f64) + noise(i, k);
+                    rows.push((row.clone(), output));
+                    state.forget(forgetting);
+                    information *= forgetting;
+                    window.push(&row, output)?;
+                    state.step(&window)?;
+                    naive_step(&mut information, &mut x, &rows[rows.len().saturating_sub(length)..]);
+                    let worst = x.iter().zip(state.coefficients()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                    assert!(worst <= 1e-12 * x.amax(), "k = {k}, p = {length}, row {i}: {worst:e}");
+                }
+            }
+        }
+        assert!(SlidingGram::new(2, 3).push(&[1.0], 0.0).is_err());
+        Ok(())
     }
 }

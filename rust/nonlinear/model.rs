@@ -3,9 +3,9 @@
 use super::march::{refuse_beside, FreeRun, FrozenProducts, Moves, NonlinearSystem, Operators};
 use crate::equation::{Equation, Structure, Term};
 use crate::error::{check_length, Error, Result};
-use crate::estimation::optimization::levenberg_marquardt::Settings;
+use crate::estimation::optimization::levenberg_marquardt::MinimizationSettings;
 use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, FreeModel};
-use crate::estimation::state_fit::{self, Evaluation, Fit, Parameter, Point, Start, StateModel};
+use crate::estimation::state_fit::{self, Evaluation, Parameter, Point, Start, StateFit, StateModel};
 use crate::expression::DerivedSignal;
 use crate::friction::initial_state::{merge_powers, State};
 use crate::friction::model::first_of;
@@ -35,9 +35,9 @@ pub fn fit(
     model: &NonlinearModel,
     experiments: &[Experiment],
     start: &Start,
-    settings: Settings,
+    settings: MinimizationSettings,
     stop: &Stop,
-) -> Result<Fit> {
+) -> Result<StateFit> {
     state_fit::fit(model, experiments, start, settings, stop)
 }
 

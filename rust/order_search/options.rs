@@ -7,7 +7,7 @@
 
 use crate::equation::Initial;
 use crate::error::{check_finite, Error, Result};
-use crate::estimation::instrumental_variables::Settings;
+use crate::estimation::instrumental_variables::InstrumentalSettings;
 use crate::estimation::multi_innovation::Innovation;
 use crate::fft::{fast_length, Bin};
 use crate::regressors::{Bank, Index, Record, BANK_LIMIT};
@@ -65,7 +65,7 @@ pub enum Estimator {
     /// Multi-innovation least squares in closed form.
     MultiInnovation(Innovation),
     /// Instrumental variables, refined from the records' noise-free signals.
-    InstrumentalVariables(Settings),
+    InstrumentalVariables(InstrumentalSettings),
 }
 
 /// Options of an order search.

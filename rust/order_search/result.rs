@@ -64,6 +64,7 @@ pub struct Counts {
 
 /// The result of a search.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Outcome {
     /// Best rows in ascending order of the score, ties by index.
     pub rows: Vec<Row>,

@@ -38,7 +38,7 @@ struct Screening<'a> {
     limit: f64,
 }
 
-impl simd::Kernel for Screening<'_> {
+impl simd::SimdKernel for Screening<'_> {
     type Output = (Vec<OpenCandidate>, Vec<u64>);
 
     #[inline(always)]

@@ -7,7 +7,7 @@ use crate::equation::Equation;
 use crate::error::{check_length, Result};
 use crate::parallel::Stop;
 use crate::recording::{Role, MIN_SIGNAL_PEAK};
-use crate::state_space::{self, Input};
+use crate::state_space::{self, InputSignal};
 
 impl OutputSimulation {
     /// Exact samples of a model with integer orders; None if it has to be discretized by block pulses.
@@ -94,7 +94,7 @@ impl OutputSimulation {
             let own = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
             let read = |signal: usize| equations.iter().flat_map(|e| &e.structure.terms).any(|t| t.signal == signal);
             let signals = (0..self.recording.channels().len()).filter(|&s| is_driven && read(s) && !own(s));
-            let inputs: Vec<Input> = signals.map(|signal| self.input(signal)).collect();
+            let inputs: Vec<InputSignal> = signals.map(|signal| self.input(signal)).collect();
             let mut terms = terms.to_vec();
             terms.iter_mut().for_each(|own| own.sort_by(|a, b| a.0.total_cmp(&b.0)));
             let found = state_space::respond(equations, &inputs, &terms, step, rows, stop)?;
@@ -112,9 +112,9 @@ impl OutputSimulation {
         Ok(alone.collect::<Result<Option<Vec<Rows>>>>()?.map(|rows| rows.concat()))
     }
 
-    fn input(&self, signal: usize) -> Input {
+    fn input(&self, signal: usize) -> InputSignal {
         let (channel, samples) = (&self.recording.channels()[signal], self.recording.acting_samples(signal));
-        Input {
+        InputSignal {
             signal,
             between: channel.intersample(),
             delay: channel.lag() / self.recording.step(),

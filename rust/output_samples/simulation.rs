@@ -6,7 +6,7 @@ use super::initial_terms::{self, fit_initial_terms, OutputSamples};
 use super::richardson::{add_multiple, combine, Rows};
 use crate::equation::{AffineOrder, Equation, Filter, Initial, Term};
 use crate::error::{check_length, Error, Result};
-use crate::estimation::output_error::{FreeEquation, FreeModel, Monomial, Settings};
+use crate::estimation::output_error::{FreeEquation, FreeModel, MinimizationSettings, Monomial};
 use crate::expression::DerivedSignal;
 use crate::fractional::kernels::first_coefficient;
 use crate::friction::{self, Body, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
@@ -28,7 +28,7 @@ pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
 /// Maximum number of evaluations for the initial states of a run that is not linear in them, and relative change of the cost
 /// that terminates.
-const INITIAL_STATE_SETTINGS: Settings = Settings { evaluations: 60, tolerance: 1e-12 };
+const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 60, tolerance: 1e-12 };
 
 /// Initial terms of a simulation. Exponents −1, −2, … are an impulse and its derivatives before the sensor filter, the
 /// exponent ∞ is the level of an output.

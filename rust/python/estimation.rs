@@ -139,7 +139,7 @@ pub fn instrumental_variables(
     let structures =
         equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
     let (initial, fixed) = (initial(terms)?, to_vectors(fixed));
-    let settings = instruments::Settings { iterations, tolerance };
+    let settings = instruments::InstrumentalSettings { iterations, tolerance };
     let points = pulses(&measured).saturating_mul(iterations.max(1));
     let fit = run_interruptible(py, points, None, move |stop| {
         let at_rest = initial == Initial::Rest;

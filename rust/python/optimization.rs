@@ -9,8 +9,8 @@ use super::convert::{copy_vector, rows, vector};
 use super::errors::run_attached;
 use super::estimation::status;
 use crate::error::{check_length, Error, Result};
-use crate::estimation::optimization::damped_step::{LinearizedProblem, Problem};
-use crate::estimation::optimization::levenberg_marquardt::{minimize as find_minimum, Settings};
+use crate::estimation::optimization::damped_step::{LeastSquaresProblem, LinearizedProblem};
+use crate::estimation::optimization::levenberg_marquardt::{minimize as find_minimum, MinimizationSettings};
 use crate::signal::statistics::inner;
 
 /// Excess over a constraint that rounding of a step causes: relative to the step, and for values of about 1.
@@ -47,7 +47,7 @@ impl<'py> CallbackProblem<'py> {
     }
 }
 
-impl Problem for CallbackProblem<'_> {
+impl LeastSquaresProblem for CallbackProblem<'_> {
     type Point = Vec<f64>;
     type Evaluation = Vec<f64>;
 
@@ -118,7 +118,8 @@ pub fn minimize<'py>(
     rows.iter().try_for_each(|row| check_length("a row of the constraints", start.len(), row.len()))?;
     let problem = CallbackProblem { residuals, jacobian, rows, limits, signal_norm, raised: RefCell::new(None) };
     let found = run_attached(|| {
-        let found = find_minimum(&problem, start, Settings { evaluations, tolerance: COST_REDUCTION_TOLERANCE })?;
+        let found =
+            find_minimum(&problem, start, MinimizationSettings { evaluations, tolerance: COST_REDUCTION_TOLERANCE })?;
         let linear = LinearizedProblem::at(&problem, &found.point, &found.jacobian, &found.evaluation, false);
         let active = linear.active_constraints().into_iter().map(|(k, _)| k).collect::<Vec<_>>();
         Ok((found, active))

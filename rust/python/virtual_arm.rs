@@ -36,7 +36,7 @@ struct GuardSettings {
     filter: Option<(f64, f64)>,
 }
 
-impl From<GuardSettings> for safety_guard::Settings {
+impl From<GuardSettings> for safety_guard::GuardSettings {
     fn from(s: GuardSettings) -> Self {
         Self {
             step: s.step,

@@ -7,7 +7,7 @@ use crate::rig::virtual_arm::Reading;
 
 /// Limits and scales of the guard. Pairs are joint 1 and joint 2.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct GuardSettings {
     /// Sampling interval \[s\].
     pub step: f64,
     /// Deflection per volt of strain gauge \[rad/V\]. The deflection is minus the volts above bias times this.
@@ -44,7 +44,7 @@ pub struct Settings {
     pub filter: Option<(f64, f64)>,
 }
 
-impl Settings {
+impl GuardSettings {
     fn check(&self) -> Result<()> {
         let pairs = [
             ("strain_scale", self.strain_scale),
@@ -190,7 +190,7 @@ pub enum Fault {
 /// Limits, conversions and faults of one run.
 #[derive(Debug, Clone)]
 pub struct Guard {
-    settings: Settings,
+    settings: GuardSettings,
     fault: Option<Fault>,
     rest: usize,
     sums: [f64; 2],
@@ -214,8 +214,8 @@ impl Guard {
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
-    /// use ftlm::rig::safety_guard::{Guard, Settings};
-    /// let mut guard = Guard::new(Settings {
+    /// use ftlm::rig::safety_guard::{Guard, GuardSettings};
+    /// let mut guard = Guard::new(GuardSettings {
     ///     step: 0.002,
     ///     strain_scale: [0.0136, 0.0187],
     ///     sense_scale: 2.0,
@@ -239,7 +239,7 @@ impl Guard {
     /// # Ok(())
     /// # }
     /// ```
-    pub fn new(settings: Settings) -> Result<Self> {
+    pub fn new(settings: GuardSettings) -> Result<Self> {
         settings.check()?;
         let filters = settings.filter.map(|(w, damping)| [Filter::new(w, damping, settings.step); 2]);
         Ok(Self {

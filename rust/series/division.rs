@@ -52,7 +52,7 @@ struct Substitution<'a> {
     block: &'a mut [f64],
 }
 
-impl simd::Kernel for Substitution<'_> {
+impl simd::SimdKernel for Substitution<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -93,7 +93,7 @@ struct Join<'a> {
     open: &'a mut [f64],
 }
 
-impl simd::Kernel for Join<'_> {
+impl simd::SimdKernel for Join<'_> {
     type Output = ();
 
     #[inline(always)]

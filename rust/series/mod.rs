@@ -26,4 +26,4 @@ pub use division::{divide, reciprocal, solve, Division, Solver, BLOCK_TERMS};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
 pub use product::{multiply, multiply_signals, Buffers, Kernel, SumOfProducts};
-pub use running_sums::{running_sums, Recursion, Source, MAX_SUMS, RIGHT_SIDE_LANES};
+pub use running_sums::{running_sums, RunningSumSystem, Source, MAX_SUMS, RIGHT_SIDE_LANES};

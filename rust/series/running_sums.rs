@@ -7,7 +7,7 @@
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::small;
-use crate::simd::{dispatch_simd, Kernel};
+use crate::simd::{dispatch_simd, SimdKernel};
 
 /// Highest order of an integral. Transforms are as fast for higher orders.
 pub const MAX_SUMS: usize = 6;
@@ -65,7 +65,7 @@ pub struct Source<'a> {
 
 /// System y_i = Σ c·I^η y_j + inputs, for any number of right-hand sides.
 #[derive(Debug, Clone)]
-pub struct Recursion {
+pub struct RunningSumSystem {
     n: usize,
     /// Number of running sums of each equation.
     sums: usize,
@@ -76,7 +76,7 @@ pub struct Recursion {
     inverse: Vec<f64>,
 }
 
-impl Recursion {
+impl RunningSumSystem {
     /// System of n equations with terms (i, j, η, c): c·I^η y_j in equation i. `sums` is the highest η of terms and
     /// sources.
     ///
@@ -210,7 +210,7 @@ struct Block<'a, const L: usize> {
     answer: &'a mut [[f64; RIGHT_SIDE_LANES]],
 }
 
-impl<const L: usize> Kernel for Block<'_, L> {
+impl<const L: usize> SimdKernel for Block<'_, L> {
     type Output = ();
 
     #[inline(always)]

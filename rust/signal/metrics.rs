@@ -5,6 +5,7 @@ use crate::fft;
 
 /// Figures of merit of one output over the M pulses of a record.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct Metrics {
     /// Σ|y − ŷ| (paper (45)), in the unit of the output.
     pub error: f64,
@@ -50,6 +51,7 @@ pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
 
 /// Correlation of two signals, pooled over runs.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Correlation {
     /// r(k) = corr(x(t + k), y(t)) for k = −lags … lags. Zero for a constant signal.
     pub values: Vec<f64>,

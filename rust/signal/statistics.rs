@@ -1,7 +1,7 @@
 //! Statistics of series: robust noise scale, autocovariance, whiteness test, autoregressive noise models.
 
 use crate::fft::{plan, Bin, Workspace};
-use crate::simd::{dispatch_simd, dot, Kernel};
+use crate::simd::{dispatch_simd, dot, SimdKernel};
 
 /// Median absolute deviation of a normal variable, in units of its standard deviation.
 pub const NORMAL_MAD_PER_SIGMA: f64 = 0.674_489_750_196_081_7;
@@ -17,7 +17,7 @@ const MAX_SERIAL_SUM_VALUES: usize = 128;
 /// Inner product of two rows of one length.
 struct Inner<'a>(&'a [f64], &'a [f64]);
 
-impl Kernel for Inner<'_> {
+impl SimdKernel for Inner<'_> {
     type Output = f64;
 
     #[inline(always)]
@@ -263,6 +263,7 @@ const COLUMN_TOLERANCE: f64 = 1e-8;
 
 /// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t), k ≥ 1, of series that may follow inputs.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct ArxModel {
     /// Whitening filter 1, a₁, …, aₙ of the noise, without what follows the inputs.
     pub filter: Vec<f64>,

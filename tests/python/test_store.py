@@ -734,10 +734,10 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     half.write_bytes(whole)
     keep(half, 2)
     begun = half.read_bytes()
-    monkeypatch.setattr("ftlm.order_search.checkpoint.ALGORITHM_VERSION", 7)
+    monkeypatch.setattr("ftlm.order_search.checkpoint.ALGORITHM_VERSION", 8)
     assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
     assert finished.read_bytes() == whole
-    with pytest.raises(ftlm.DataError, match=r"follow algorithm 6; this version's is 7: finish the search with that"):
+    with pytest.raises(ftlm.DataError, match=r"follow algorithm 7; this version's is 8: finish the search with that"):
         ftlm.resume_search(half)
     assert half.read_bytes() == begun
 
@@ -754,7 +754,7 @@ def test_only_what_another_algorithm_does_otherwise_is_refused_half_done(run, tm
             Store(half, held.requests).close()
         if name == "free":
             begun = half.read_bytes()
-            with pytest.raises(ftlm.DataError, match=r"rounds follow algorithm 4; this version's is 6: finish the"):
+            with pytest.raises(ftlm.DataError, match=r"rounds follow algorithm 4; this version's is 7: finish the"):
                 search(run, half, **options)
             assert half.read_bytes() == begun
         else:

@@ -502,7 +502,7 @@ fn dependent_columns_of_a_gram_matrix() {
 
 struct Wide<'a>(&'a mut [[f64; LANE_COUNT]], &'a mut [[f64; LANE_COUNT]], usize);
 
-impl simd::Kernel for Wide<'_> {
+impl simd::SimdKernel for Wide<'_> {
     type Output = [bool; LANE_COUNT];
 
     #[inline(always)]
@@ -513,7 +513,7 @@ impl simd::Kernel for Wide<'_> {
 
 struct Dot<'a>(&'a [f64], &'a [f64]);
 
-impl simd::Kernel for Dot<'_> {
+impl simd::SimdKernel for Dot<'_> {
     type Output = f64;
 
     #[inline(always)]

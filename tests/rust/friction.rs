@@ -2,7 +2,7 @@
 
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
-use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
+use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, MinimizationSettings, Monomial};
 use ftlm::friction::contact::{is_p_matrix, ContactLaw, ContactSolution, Trace};
 use ftlm::friction::convolution::{Heads, OnlineConvolution};
 use ftlm::friction::law::{Phase, PulseDerivatives};
@@ -182,8 +182,12 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
         filtered: vec![],
     };
     let start = Start { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], inputs: vec![], states: vec![] };
-    let found =
-        fit(&model, std::slice::from_ref(&experiment), &start, Settings { evaluations: 200, tolerance: 1e-14 })?;
+    let found = fit(
+        &model,
+        std::slice::from_ref(&experiment),
+        &start,
+        MinimizationSettings { evaluations: 200, tolerance: 1e-14 },
+    )?;
     assert!((found.orders[0] - 1.9).abs() < 1e-5, "{:?}", found.orders);
     for (value, truth) in found.coefficients.iter().zip([1.0, 1.0, 0.8]) {
         assert!((value - truth).abs() < 1e-4, "{:?}", found.coefficients);
@@ -198,7 +202,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
     endless.equations[0].terms[1].1.constant = 1e308;
     let falling = FrictionModel { order_bounds: vec![(1.2, -1.0)], ..model.clone() };
     for wrong in [&endless, &falling] {
-        let found = fit(wrong, std::slice::from_ref(&experiment), &start, Settings::default());
+        let found = fit(wrong, std::slice::from_ref(&experiment), &start, MinimizationSettings::default());
         assert!(matches!(found, Err(Error::OutOfRange { .. } | Error::Structure { .. })), "{found:?}");
     }
     // Behind a filter that the model does not know.

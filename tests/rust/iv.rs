@@ -3,7 +3,8 @@
 use ftlm::equation::{Equation, Filter, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::instrumental_variables::{
-    damped_inverse, fit, low_pass, power_frequency, project, refine, step, with_projections, Scratch, Settings, Source,
+    damped_inverse, fit, low_pass, power_frequency, project, refine, step, with_projections, InstrumentSource,
+    InstrumentalSettings, Scratch,
 };
 use ftlm::estimation::least_squares;
 use ftlm::fractional::kernels::block_pulse_kernel;
@@ -46,7 +47,7 @@ fn with_clean(record: &Record, output: usize, inputs: &[usize]) -> Record {
 
 fn run(records: &[Record], model: &Equation, fixed: &[Option<f64>], initial: &Initial) -> Vec<f64> {
     let structures = std::slice::from_ref(&model.structure);
-    let found = fit(records, structures, &[fixed.to_vec()], initial, Settings::default()).unwrap();
+    let found = fit(records, structures, &[fixed.to_vec()], initial, InstrumentalSettings::default()).unwrap();
     assert!(found.converged);
     found.estimates.into_iter().next().unwrap().coefficients
 }
@@ -83,7 +84,7 @@ fn one_step_is_that_of_dense_algebra() {
         (0..4).map(|k| Kernel::new(&noisy.integral(signals[k], model.structure.integration(k)))).collect();
     let goal = Kernel::new(noisy.signal(0));
     let spectra: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
-    let source = Source {
+    let source = InstrumentSource {
         own: (0..4).map(|k| (signals[k] == 0).then(|| (kernels[k].as_slice(), &spectra[k]))).collect(),
         measured: columns.iter().collect(),
         clean: columns.iter().collect(),
@@ -118,7 +119,7 @@ fn exact_data_is_a_fixed_point_from_any_number_of_records_and_initial_terms() {
         .collect();
     let initial = Initial::Powers(vec![0.0, 0.9, 1.0]);
     let structures = std::slice::from_ref(&model.structure);
-    let found = fit(&records, structures, &[FREE.to_vec()], &initial, Settings::default()).unwrap();
+    let found = fit(&records, structures, &[FREE.to_vec()], &initial, InstrumentalSettings::default()).unwrap();
     assert!(found.converged && !found.damped);
     let estimate = &found.estimates[0];
     check("coefficients of exact data", relative_distance(&estimate.coefficients, &model.coefficients), 1e-9);
@@ -147,7 +148,8 @@ fn noise_that_ruins_least_squares_leaves_the_truth_within_its_standard_errors() 
         let squares = least_squares::fit(&records, &model.structure, &FREE, &Initial::Rest).unwrap();
         by_squares.iter_mut().zip(&squares.coefficients).for_each(|(s, c)| *s += c / 30.0);
         let structures = std::slice::from_ref(&model.structure);
-        let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, Settings::default()).unwrap();
+        let found =
+            fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, InstrumentalSettings::default()).unwrap();
         assert!(found.converged, "seed {seed}");
         let e = &found.estimates[0];
         for (k, list) in scores.iter_mut().enumerate() {
@@ -183,7 +185,8 @@ fn coupled_equations_are_simulated_from_the_input_alone() {
     let noisy = noisy.clone().with_clean(clean.map(PulseMeans::new).collect()).unwrap();
     let structures = [first.structure.clone(), second.structure.clone()];
     let found =
-        fit(&[noisy], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, Settings::default()).unwrap();
+        fit(&[noisy], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, InstrumentalSettings::default())
+            .unwrap();
     assert!(found.converged && !found.damped);
     for (estimate, model) in found.estimates.iter().zip(&both) {
         for (k, (c, truth)) in estimate.coefficients.iter().zip(&model.coefficients).enumerate() {
@@ -223,7 +226,7 @@ fn refining_one_equation_alone_ends_where_the_whole_does() {
         .collect();
     let goal = Kernel::new(noisy.signal(0));
     let spectra: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
-    let source = Source {
+    let source = InstrumentSource {
         own: vec![Some((&kernels[0][..], &spectra[0])), Some((&kernels[1][..], &spectra[1])), None, None],
         measured: columns.iter().collect(),
         clean: columns.iter().collect(),
@@ -231,7 +234,7 @@ fn refining_one_equation_alone_ends_where_the_whole_does() {
         target: &goal,
         output: noisy.signal(0),
     };
-    let settings = Settings { iterations: 40, tolerance: 1e-9 };
+    let settings = InstrumentalSettings { iterations: 40, tolerance: 1e-9 };
     let start = [-2.0, -30.0, 3.0, 0.5];
     let (found, made, still) =
         refine(std::slice::from_ref(&source), &FREE, &[], &start, settings, &mut Scratch::default()).unwrap();
@@ -384,7 +387,7 @@ fn nearly_equal_regressors_cost_their_condition_once() {
         // One record, and two: a column over all of them for each term.
         for seeds in [&[61][..], &[61, 62]] {
             let records: Vec<Record> = seeds.iter().map(|&seed| measured(&model, 400, &[], 0.0, seed).1).collect();
-            let settings = Settings { iterations: 1, tolerance: 0.0 };
+            let settings = InstrumentalSettings { iterations: 1, tolerance: 0.0 };
             let structures = std::slice::from_ref(&model.structure);
             let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, settings).unwrap();
             let by_factor = least_squares::fit(&records, &model.structure, &FREE, &Initial::Rest).unwrap();
@@ -415,9 +418,9 @@ fn instruments_that_say_nothing_are_refused() {
     let silent = with_signal(&with_signal(&noisy, 1, vec![0.0; 200]), 2, vec![0.0; 200]);
     let structures = std::slice::from_ref(&model.structure);
     let records = [silent];
-    let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, Settings::default());
+    let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, InstrumentalSettings::default());
     assert!(matches!(found, Err(Error::Singular { .. })), "{found:?}");
-    let short = fit(&records, structures, &[], &Initial::Rest, Settings::default());
+    let short = fit(&records, structures, &[], &Initial::Rest, InstrumentalSettings::default());
     assert!(matches!(short, Err(Error::Length { .. })));
 }
 
@@ -463,7 +466,7 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
     let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
     let terms = [axis(0, &[0.7, 0.9, 1.1]), axis(0, &[0.0, 0.2]), axis(1, &[0.0, 0.1])];
     let lattice = OrderGrid::new(0, &[1.6, 1.8, 2.0], &terms, |s| s == 1).unwrap();
-    let settings = Settings { iterations: 6, tolerance: 1e-9 };
+    let settings = InstrumentalSettings { iterations: 6, tolerance: 1e-9 };
     let options = |threads, early_stopping| Options {
         criterion: Criterion::OutputError,
         norm: Norm::L1,
@@ -499,7 +502,7 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
             (0..2).map(|k| block_pulse_kernel(structure.integration(k), m, noisy.step())).collect();
         let (measured, clean, goal) = (spectra(&noisy), spectra(&tidy), Kernel::new(noisy.signal(0)));
         let own: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
-        let source = Source {
+        let source = InstrumentSource {
             own: vec![Some((&kernels[0][..], &own[0])), Some((&kernels[1][..], &own[1])), None],
             measured: measured.iter().collect(),
             clean: clean.iter().collect(),
@@ -554,7 +557,7 @@ fn what_no_coefficients_can_bring_below_the_kept_ones_is_left_out_and_nothing_el
             })
             .collect();
         let run = |threads, early_stopping| {
-            let settings = Settings { iterations: 3, tolerance: 1e-4 };
+            let settings = InstrumentalSettings { iterations: 3, tolerance: 1e-4 };
             let estimator = Estimator::InstrumentalVariables(settings);
             let (criterion, initial) = (Criterion::OutputError, initial.clone());
             let memory = 2 << 30;

@@ -1,8 +1,8 @@
 //! Instrumental variables of coupled equations: one step against dense algebra, where they stand still, their spread.
 
 use ftlm::equation::{Equation, Initial};
-use ftlm::estimation::instrumental_variables::coupled::Problem;
-use ftlm::estimation::instrumental_variables::{fit, project, Settings};
+use ftlm::estimation::instrumental_variables::coupled::CoupledProblem;
+use ftlm::estimation::instrumental_variables::{fit, project, InstrumentalSettings};
 use ftlm::fractional::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::signal::block_pulse::PulseMeans;
@@ -105,7 +105,7 @@ fn one_step_of_both_equations_is_that_of_full_matrices() {
     let structures = [start[0].structure.clone(), start[1].structure.clone()];
     let none = [vec![], vec![]];
     let (one, exponents, dropped) = (std::slice::from_ref(&noisy), [vec![], vec![]], none);
-    let problem = Problem {
+    let problem = CoupledProblem {
         records: one,
         clean: one,
         structures: &structures,
@@ -114,7 +114,7 @@ fn one_step_of_both_equations_is_that_of_full_matrices() {
         dropped: &dropped,
     };
     let begin: Vec<Vec<f64>> = start.iter().map(|e| e.coefficients.clone()).collect();
-    let found = problem.refine(&begin, Settings { iterations: 1, tolerance: 0.0 }).unwrap().unwrap();
+    let found = problem.refine(&begin, InstrumentalSettings { iterations: 1, tolerance: 0.0 }).unwrap().unwrap();
     assert_eq!(found.solutions[1][0].to_bits(), begin[1][0].to_bits());
     let free: Vec<f64> = found.solutions[0].iter().chain(&found.solutions[1][1..]).copied().collect();
     check("a step of coupled instrumental variables", relative_distance(&free, &oracle), 1e-9);
@@ -135,7 +135,8 @@ fn exact_data_of_several_records_with_initial_terms_is_a_fixed_point() {
     let truth = pair();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
     let initial = Initial::Powers(vec![0.0, 1.0]);
-    let found = fit(&records, &structures, &[vec![None; 3], vec![None; 3]], &initial, Settings::default()).unwrap();
+    let found =
+        fit(&records, &structures, &[vec![None; 3], vec![None; 3]], &initial, InstrumentalSettings::default()).unwrap();
     assert!(!found.damped);
     for (i, (estimate, model)) in found.estimates.iter().zip(&truth).enumerate() {
         let what = format!("coefficients of equation {i}");
@@ -154,7 +155,7 @@ fn where_the_steps_stand_still_the_likelihood_does_too() {
     let noisy = projected(&noisy, true);
     let truth = pair();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
-    let settings = Settings { iterations: 40, tolerance: 1e-10 };
+    let settings = InstrumentalSettings { iterations: 40, tolerance: 1e-10 };
     let found =
         fit(std::slice::from_ref(&noisy), &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, settings)
             .unwrap();
@@ -198,7 +199,13 @@ fn scores_have_the_spread_that_the_covariance_says() {
     for seed in 0..30 {
         let (_, noisy) = measured(900, 0.05, &[vec![], vec![]], 100 + seed);
         let noisy = projected(&noisy, true);
-        let found = fit(&[noisy], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, Settings::default());
+        let found = fit(
+            &[noisy],
+            &structures,
+            &[vec![None; 3], vec![None; 3]],
+            &Initial::Rest,
+            InstrumentalSettings::default(),
+        );
         let found = found.unwrap();
         assert!(found.converged && !found.damped, "seed {seed}");
         for (i, (estimate, model)) in found.estimates.iter().zip(&truth).enumerate() {
@@ -225,7 +232,7 @@ fn a_start_that_grows_is_left_alone() {
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
     let (one, exponents, dropped) = (std::slice::from_ref(&noisy), [vec![], vec![]], [vec![], vec![]]);
     let fixed = [vec![None; 3], vec![None; 3]];
-    let problem = Problem {
+    let problem = CoupledProblem {
         records: one,
         clean: one,
         structures: &structures,
@@ -234,5 +241,5 @@ fn a_start_that_grows_is_left_alone() {
         dropped: &dropped,
     };
     let begin = vec![vec![-20.0, 3.0, 10.0], vec![40.0, -90.0, 6.0]];
-    assert_eq!(problem.refine(&begin, Settings::default()).unwrap(), None);
+    assert_eq!(problem.refine(&begin, InstrumentalSettings::default()).unwrap(), None);
 }

@@ -6,7 +6,7 @@ use ftlm::estimation::joint_fit::covariance::long_run_covariance;
 use ftlm::estimation::joint_fit::{
     best_alternative, correct_step, fit_reweighted, refine_step, Iterate, Loss, Objective, Optimum, Problem, Weights,
 };
-use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
+use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, ParameterPoint};
 use ftlm::parallel::Stop;
 use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
 use ftlm::signal::block_pulse::Intersample;
@@ -53,7 +53,7 @@ fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> Recordings {
 }
 
 fn place(orders: &[f64], coefficients: &[f64]) -> Iterate {
-    let point = Point { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() };
+    let point = ParameterPoint { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() };
     Iterate { point, states: Vec::new() }
 }
 

@@ -1,8 +1,8 @@
 //! Levenberg–Marquardt by itself: problems whose minimum is known in closed form, and one that no step can lower.
 
 use ftlm::error::{Error, Result};
-use ftlm::estimation::optimization::damped_step::Problem;
-use ftlm::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
+use ftlm::estimation::optimization::damped_step::LeastSquaresProblem;
+use ftlm::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings, Status};
 
 use crate::common::{check, dense_solve, distance, Random};
 
@@ -12,7 +12,7 @@ struct Closed<R, J> {
     jacobian: J,
 }
 
-impl<R, J> Problem for Closed<R, J>
+impl<R, J> LeastSquaresProblem for Closed<R, J>
 where
     R: Fn(&[f64]) -> Result<Vec<f64>>,
     J: Fn(&[f64]) -> Vec<Vec<f64>>,
@@ -38,8 +38,8 @@ where
     }
 }
 
-fn settings(evaluations: usize) -> Settings {
-    Settings { evaluations, tolerance: 1e-14 }
+fn settings(evaluations: usize) -> MinimizationSettings {
+    MinimizationSettings { evaluations, tolerance: 1e-14 }
 }
 
 #[test]
@@ -80,7 +80,7 @@ fn a_problem_whose_slopes_lie_stalls() {
     // The derivative has the wrong sign: every step, however short, raises the cost.
     let problem =
         Closed { residuals: |x: &[f64]| Ok(vec![1.0 + x[0] * x[0] + x[0]]), jacobian: |_: &[f64]| vec![vec![-1.0]] };
-    let found = minimize(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 0.0 }).unwrap();
+    let found = minimize(&problem, vec![0.0], MinimizationSettings { evaluations: 1000, tolerance: 0.0 }).unwrap();
     assert_eq!(found.status, Status::Stalled);
     assert_eq!(found.point, [0.0]);
 }
@@ -125,7 +125,7 @@ struct Boxed {
     corner: bool,
 }
 
-impl Problem for Boxed {
+impl LeastSquaresProblem for Boxed {
     type Point = [f64; 2];
     type Evaluation = Vec<f64>;
 
@@ -171,7 +171,9 @@ const OPEN: Boxed = Boxed { bounds: (-10.0, 10.0), wall: 20.0, corner: false };
 fn what_pushes_out_of_a_bound_does_not_keep_the_rest_from_its_minimum() {
     for (bounds, x) in [((-10.0, 10.0), 3.0), ((-10.0, 1.0), 1.0), ((4.0, 10.0), 4.0), ((0.5, 0.5), 0.5)] {
         let start = [0.0_f64.clamp(bounds.0, bounds.1), -7.0];
-        let found = minimize(&Boxed { bounds, ..OPEN }, start, Settings { evaluations: 60, tolerance: 1e-12 }).unwrap();
+        let found =
+            minimize(&Boxed { bounds, ..OPEN }, start, MinimizationSettings { evaluations: 60, tolerance: 1e-12 })
+                .unwrap();
         assert_eq!((found.status, found.point[0]), (Status::Converged, if x == 3.0 { found.point[0] } else { x }));
         check("minimum within bounds", (found.point[0] - x).abs().max((found.point[1] - 0.5 * (4.0 - x)).abs()), 1e-5);
         assert!(found.evaluations < 20, "{}", found.evaluations);
@@ -180,14 +182,15 @@ fn what_pushes_out_of_a_bound_does_not_keep_the_rest_from_its_minimum() {
 
 #[test]
 fn a_start_on_a_bound_leaves_it_where_the_slope_leads_inside() {
-    let found = minimize(&Boxed { bounds: (-10.0, 5.0), ..OPEN }, [5.0, 0.0], Settings::default()).unwrap();
+    let found = minimize(&Boxed { bounds: (-10.0, 5.0), ..OPEN }, [5.0, 0.0], MinimizationSettings::default()).unwrap();
     assert_eq!(found.status, Status::Converged);
     check("minimum inside", (found.point[0] - 3.0).abs(), 1e-4);
 }
 
 #[test]
 fn a_minimum_behind_a_wall_is_no_minimum() {
-    let found = minimize(&Boxed { wall: 1.0, ..OPEN }, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 });
+    let found =
+        minimize(&Boxed { wall: 1.0, ..OPEN }, [0.0, 0.0], MinimizationSettings { evaluations: 500, tolerance: 1e-9 });
     let found = found.unwrap();
     assert_eq!(found.status, Status::DomainLimit);
     assert!(found.point[0] <= 1.0 && found.point[0] > 0.99, "{:?}", found.point);
@@ -196,7 +199,7 @@ fn a_minimum_behind_a_wall_is_no_minimum() {
 #[test]
 fn a_corner_of_the_cost_is_a_minimum_where_the_rest_lies_flat() {
     let corner = Boxed { corner: true, ..OPEN };
-    let found = minimize(&corner, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 }).unwrap();
+    let found = minimize(&corner, [0.0, 0.0], MinimizationSettings { evaluations: 500, tolerance: 1e-9 }).unwrap();
     assert_eq!(found.status, Status::Converged);
     check("corner", (found.point[0] - 2.0).abs().max((found.point[1] - 1.0).abs()), 1e-4);
 }
@@ -206,7 +209,7 @@ fn a_short_step_is_no_minimum() {
     // Slopes that lie, and a tolerance that every damped step falls below before the damping ends.
     let problem =
         Closed { residuals: |x: &[f64]| Ok(vec![1.0 + x[0] * x[0] + x[0]]), jacobian: |_: &[f64]| vec![vec![-1.0]] };
-    let found = minimize(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 1e-6 }).unwrap();
+    let found = minimize(&problem, vec![0.0], MinimizationSettings { evaluations: 1000, tolerance: 1e-6 }).unwrap();
     assert_eq!(found.status, Status::Stalled);
 }
 
@@ -238,7 +241,7 @@ fn large_residuals_bend_the_steps() {
             ]
         },
     };
-    let settings = Settings { evaluations: 40, tolerance: 1e-12 };
+    let settings = MinimizationSettings { evaluations: 40, tolerance: 1e-12 };
     let found = minimize(&problem, vec![25.0, 5.0, -5.0, -1.0], settings).unwrap();
     assert_eq!(found.status, Status::Converged, "{} evaluations, {}", found.evaluations, found.cost);
     check("Brown & Dennis", (2.0 * found.cost / 85_822.201_626_356_3 - 1.0).abs(), 1e-8);
@@ -252,7 +255,7 @@ fn leaps_shorten_the_way_along_a_curved_valley() {
         residuals: |x: &[f64]| Ok(vec![50.0 * (x[1] - x[0] * x[0]), 0.1 * (x[0] - 12.0), 3.0]),
         jacobian: |x: &[f64]| vec![vec![-100.0 * x[0], 0.1, 0.0], vec![50.0, 0.0, 0.0]],
     };
-    let settings = Settings { evaluations: 400, tolerance: 1e-12 };
+    let settings = MinimizationSettings { evaluations: 400, tolerance: 1e-12 };
     let found = minimize(&problem, vec![0.0, 0.0], settings).unwrap();
     assert_eq!(found.status, Status::Converged, "{} evaluations, {}", found.evaluations, found.cost);
     check("end of the valley", (found.point[0] - 12.0).abs(), 1e-2);
@@ -274,7 +277,8 @@ fn a_leap_that_leads_nowhere_is_taken_back() {
             vec![vec![-100.0 * x[0], slope, 0.0], vec![50.0, 0.0, 0.0]]
         },
     };
-    let found = minimize(&problem, vec![0.0, 0.0], Settings { evaluations: 600, tolerance: 1e-12 }).unwrap();
+    let found =
+        minimize(&problem, vec![0.0, 0.0], MinimizationSettings { evaluations: 600, tolerance: 1e-12 }).unwrap();
     assert!(tried.borrow().iter().any(|x| *x > 3.0), "no leap went too far: the test says nothing");
     check("end of the valley", (found.point[0] - 3.0).abs(), 1e-2);
     check("cost", (found.cost / 4.5 - 1.0).abs(), 1e-6);

@@ -3,7 +3,8 @@
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::{
-    self, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point, PointValues, Settings,
+    self, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, MinimizationSettings, Monomial,
+    ParameterPoint, PointValues,
 };
 use ftlm::friction::{self, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
 use ftlm::regressors::Record;
@@ -95,7 +96,7 @@ const LAWS: [(InputLaw, f64); 2] = [(InputLaw::Saturation, 1.3), (InputLaw::Dead
 
 #[test]
 fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
-    let settings = Settings { evaluations: 1, ..Settings::default() };
+    let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
     for (law, limit) in LAWS {
         let mut experiment = run(law, limit, 0.0, 3)?;
         // Held inputs act at once at their samples; friction is followed on pulse means alone.
@@ -103,7 +104,7 @@ fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
             experiment.point_values =
                 vec![PointValues::default(), PointValues { values: None, is_zero_order_hold: held }];
             let here = |value: f64| {
-                let start = Point { orders: vec![1.7], coefficients: vec![0.8, 1.4], inputs: vec![value] };
+                let start = ParameterPoint { orders: vec![1.7], coefficients: vec![0.8, 1.4], inputs: vec![value] };
                 output_error::fit(&linear(law), std::slice::from_ref(&experiment), &start, settings)
             };
             let (at, up, down) = (here(1.0)?, here(1.0001)?, here(0.9999)?);
@@ -127,12 +128,13 @@ fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
 #[test]
 fn a_limit_is_found_with_the_rest() -> Result<(), Error> {
     for (law, limit) in LAWS {
-        let start = Point { orders: vec![1.9], coefficients: vec![0.7, 1.2], inputs: vec![0.9] };
-        let found = output_error::fit(&linear(law), &[run(law, limit, 0.0, 5)?], &start, Settings::default())?;
+        let start = ParameterPoint { orders: vec![1.9], coefficients: vec![0.7, 1.2], inputs: vec![0.9] };
+        let found =
+            output_error::fit(&linear(law), &[run(law, limit, 0.0, 5)?], &start, MinimizationSettings::default())?;
         assert!((found.point.inputs[0] - limit).abs() < 1e-6, "{law:?} {:?}", found.point);
         assert!((found.point.orders[0] - 1.8).abs() < 1e-6, "{law:?} {:?}", found.point);
         let start = Start { orders: vec![1.9], coefficients: vec![0.7, 1.2, 0.3], inputs: vec![0.9], states: vec![] };
-        let settings = Settings { evaluations: 300, tolerance: 1e-14 };
+        let settings = MinimizationSettings { evaluations: 300, tolerance: 1e-14 };
         let found = friction::fit(&rubbing(law), &[run(law, limit, 0.5, 7)?], &start, settings)?;
         assert!((found.inputs[0] - limit).abs() < 1e-4, "{law:?} {:?} {:?}", found.inputs, found.coefficients);
         assert!((found.coefficients[2] - 0.5).abs() < 1e-4, "{law:?} {:?}", found.coefficients);

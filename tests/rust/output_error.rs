@@ -3,8 +3,8 @@
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::{
-    fit, Coordinate, Experiment, Fit, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point, PointValues,
-    Settings, Status,
+    fit, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, MinimizationSettings, Monomial,
+    OutputErrorFit, ParameterPoint, PointValues, Status,
 };
 use ftlm::regressors::Record;
 use ftlm::series;
@@ -89,13 +89,13 @@ fn run(intervals: usize, every: usize, initial: &[Vec<(f64, f64)>], noise: f64, 
     Experiment::new(record, every, samples, weights).unwrap()
 }
 
-fn point(orders: &[f64], coefficients: &[f64]) -> Point {
-    Point { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() }
+fn point(orders: &[f64], coefficients: &[f64]) -> ParameterPoint {
+    ParameterPoint { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() }
 }
 
 /// Residuals, cost and Jacobian at given parameters, no step taken.
-fn at(model: &FreeModel, experiments: &[Experiment], orders: &[f64], coefficients: &[f64]) -> Fit {
-    let settings = Settings { evaluations: 1, ..Settings::default() };
+fn at(model: &FreeModel, experiments: &[Experiment], orders: &[f64], coefficients: &[f64]) -> OutputErrorFit {
+    let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
     let found = fit(model, experiments, &point(orders, coefficients), settings).unwrap();
     assert_eq!((found.evaluations, found.status), (1, Status::Exhausted));
     found
@@ -182,7 +182,7 @@ fn known_models_are_recovered() {
             vec![run(300, 1, &[vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]], 0.0, 414), run(200, 1, &[], 0.0, 415)],
         ),
     ] {
-        let found = fit(&model, &experiments, &point(&START.0, &START.1), Settings::default()).unwrap();
+        let found = fit(&model, &experiments, &point(&START.0, &START.1), MinimizationSettings::default()).unwrap();
         assert_eq!(found.status, Status::Converged, "{name}");
         check(&format!("orders, {name}"), relative_distance(&found.point.orders, &ORDERS), 1e-9);
         check(&format!("coefficients, {name}"), relative_distance(&found.point.coefficients, &COEFFICIENTS), 1e-9);
@@ -202,7 +202,7 @@ fn estimates_from_noise_are_as_near_as_their_deviations_say() {
     let (mut sum, mut count) = (0.0, 0);
     for seed in 420..428 {
         let experiments = [run(400, 1, &[], 0.02, seed)];
-        let found = fit(&model, &experiments, &point(&START.0, &START.1), Settings::default()).unwrap();
+        let found = fit(&model, &experiments, &point(&START.0, &START.1), MinimizationSettings::default()).unwrap();
         assert_eq!(found.status, Status::Converged);
         let rows = found.residuals.len() as f64;
         check_between("chi-squared per sample", 2.0 * found.cost / rows, 0.8, 1.2);
@@ -242,12 +242,13 @@ fn bounds_hold_and_the_best_inside_them_is_found() {
     // The true 0.1 of β₂ is out of reach.
     model.order_bounds[1] = (0.2, 0.5);
     let experiments = [run(300, 1, &[], 0.01, 430)];
-    let found = fit(&model, &experiments, &point(&[2.0, -1.0, 0.8], &START.1), Settings::default()).unwrap();
+    let found =
+        fit(&model, &experiments, &point(&[2.0, -1.0, 0.8], &START.1), MinimizationSettings::default()).unwrap();
     assert_eq!(found.point.orders[1], 0.2);
     assert!(found.point.orders.iter().zip(&model.order_bounds).all(|(o, b)| (b.0..=b.1).contains(o)));
     // An order without room is fixed.
     model.order_bounds = ORDERS.iter().map(|&o| (o, o)).collect();
-    let found = fit(&model, &experiments, &point(&ORDERS, &START.1), Settings::default()).unwrap();
+    let found = fit(&model, &experiments, &point(&ORDERS, &START.1), MinimizationSettings::default()).unwrap();
     assert_eq!(found.point.orders, ORDERS);
     assert!(relative_distance(&found.point.coefficients, &COEFFICIENTS) < 0.05);
 }
@@ -257,7 +258,7 @@ fn what_cannot_be_started_is_refused() {
     let model = two_link(true, Initial::Rest);
     let experiments = [run(100, 2, &[], 0.01, 431)];
     let start = |orders: &[f64], coefficients: &[f64]| {
-        fit(&model, &experiments, &point(orders, coefficients), Settings::default()).map(|_| ())
+        fit(&model, &experiments, &point(orders, coefficients), MinimizationSettings::default()).map(|_| ())
     };
     assert!(matches!(start(&ORDERS[..2], &COEFFICIENTS), Err(Error::Length { .. })));
     assert!(matches!(start(&ORDERS, &COEFFICIENTS[..4]), Err(Error::Length { .. })));
@@ -272,19 +273,22 @@ fn what_cannot_be_started_is_refused() {
     let mut short = experiments[0].clone();
     short.samples[1].pop();
     assert!(matches!(
-        fit(&model, &[short], &point(&ORDERS, &COEFFICIENTS), Settings::default()),
+        fit(&model, &[short], &point(&ORDERS, &COEFFICIENTS), MinimizationSettings::default()),
         Err(Error::Length { .. })
     ));
     let mut few = experiments[0].clone();
     few.weights.pop();
     assert!(matches!(
-        fit(&model, &[few], &point(&ORDERS, &COEFFICIENTS), Settings::default()),
+        fit(&model, &[few], &point(&ORDERS, &COEFFICIENTS), MinimizationSettings::default()),
         Err(Error::Length { .. })
     ));
     // A start that explodes.
     let long = [run(3000, 1, &[], 0.01, 432)];
     let wild = [-4e4, -6.0, 1.5, 14.0, 1.4];
-    assert!(matches!(fit(&model, &long, &point(&ORDERS, &wild), Settings::default()), Err(Error::Diverged { .. })));
+    assert!(matches!(
+        fit(&model, &long, &point(&ORDERS, &wild), MinimizationSettings::default()),
+        Err(Error::Diverged { .. })
+    ));
 }
 
 #[test]
@@ -293,7 +297,7 @@ fn few_evaluations_are_said_to_be_too_few() {
     let experiments = [run(200, 1, &[], 0.01, 433)];
     let mut last = f64::INFINITY;
     for evaluations in [1, 3, 6] {
-        let settings = Settings { evaluations, ..Settings::default() };
+        let settings = MinimizationSettings { evaluations, ..MinimizationSettings::default() };
         let found = fit(&model, &experiments, &point(&START.0, &START.1), settings).unwrap();
         assert_eq!((found.status, found.evaluations), (Status::Exhausted, evaluations));
         assert!(found.cost <= last);
@@ -314,9 +318,10 @@ fn a_filter_on_the_outputs_is_part_of_the_model() {
     experiment.record = logged.into();
     let model = two_link(true, Initial::Rest);
     let without =
-        fit(&model, std::slice::from_ref(&experiment), &point(&START.0, &START.1), Settings::default()).unwrap();
+        fit(&model, std::slice::from_ref(&experiment), &point(&START.0, &START.1), MinimizationSettings::default())
+            .unwrap();
     experiment.filter = Some((low_pass(m), vec![false, true]));
-    let with = fit(&model, &[experiment], &point(&START.0, &START.1), Settings::default()).unwrap();
+    let with = fit(&model, &[experiment], &point(&START.0, &START.1), MinimizationSettings::default()).unwrap();
     check("coefficients through the filter", relative_distance(&with.point.coefficients, &COEFFICIENTS), 1e-9);
     assert!(without.cost > 1e6 * with.cost);
 }
@@ -349,9 +354,9 @@ fn with_delay(coupled: bool) -> FreeModel {
 fn the_slope_towards_a_delay_is_that_of_the_residuals() {
     for coupled in [true, false] {
         let (model, experiments) = (with_delay(coupled), [late(0.057, 2, 0.02, 500)]);
-        let settings = Settings { evaluations: 1, ..Settings::default() };
+        let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
         let here = |delay: f64| {
-            let start = Point { inputs: vec![delay], ..point(&START.0, &START.1) };
+            let start = ParameterPoint { inputs: vec![delay], ..point(&START.0, &START.1) };
             fit(&model, &experiments, &start, settings).unwrap()
         };
         // Inside a step residuals are linear in the delay, so the difference is exact; 0.057 s is 5.7 steps.
@@ -368,8 +373,8 @@ fn a_delay_is_found_with_the_rest() {
     for (coupled, every, delay) in [(true, 1, 0.05), (true, 2, 0.033), (false, 1, 0.11), (true, 1, 0.0), (true, 1, 0.2)]
     {
         let model = with_delay(coupled);
-        let start = Point { inputs: vec![0.08], ..point(&START.0, &START.1) };
-        let found = fit(&model, &[late(delay, every, 0.0, 510)], &start, Settings::default()).unwrap();
+        let start = ParameterPoint { inputs: vec![0.08], ..point(&START.0, &START.1) };
+        let found = fit(&model, &[late(delay, every, 0.0, 510)], &start, MinimizationSettings::default()).unwrap();
         let miss = (found.point.inputs[0] - delay).abs();
         assert!(miss < 1e-6, "delay {delay}: {} s", found.point.inputs[0]);
         check("orders beside a delay", relative_distance(&found.point.orders, &ORDERS), 1e-5);
@@ -380,10 +385,11 @@ fn a_delay_is_found_with_the_rest() {
 #[test]
 fn a_delay_is_estimated_as_well_as_its_slope_says() {
     let (model, delay) = (with_delay(true), 0.047);
-    let start = Point { inputs: vec![0.08], ..point(&START.0, &START.1) };
+    let start = ParameterPoint { inputs: vec![0.08], ..point(&START.0, &START.1) };
     let mut scores = Vec::new();
     for seed in 0..40 {
-        let found = fit(&model, &[late(delay, 1, 0.02, 600 + 2 * seed)], &start, Settings::default()).unwrap();
+        let found =
+            fit(&model, &[late(delay, 1, 0.02, 600 + 2 * seed)], &start, MinimizationSettings::default()).unwrap();
         let normal: Vec<f64> = (0..9)
             .flat_map(|i| (0..9).map(move |j| (i, j)))
             .map(|(i, j)| found.jacobian[i].iter().zip(&found.jacobian[j]).map(|(a, b)| a * b).sum())
@@ -440,8 +446,8 @@ fn what_feeds_through_has_the_slope_of_its_residuals() {
             instants.chain([PointValues { values: Some(held), is_zero_order_hold: true }]).collect();
         let at = |c: &[f64], delay: f64| {
             let inputs = model.inputs.iter().map(|_| delay).collect();
-            let start = Point { orders: Vec::new(), coefficients: c.to_vec(), inputs };
-            let settings = Settings { evaluations: 1, ..Settings::default() };
+            let start = ParameterPoint { orders: Vec::new(), coefficients: c.to_vec(), inputs };
+            let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
             fit(&model, std::slice::from_ref(&experiment), &start, settings).unwrap()
         };
         let here = at(&coefficients, 0.057);
@@ -512,7 +518,7 @@ fn a_fit_that_its_grid_stops_says_so() {
         coupled: false,
         initial: Initial::Rest,
     };
-    let settings = Settings { evaluations: 500, tolerance: 1e-7 };
+    let settings = MinimizationSettings { evaluations: 500, tolerance: 1e-7 };
     let found = fit(&model, &[experiment], &point(&[], &[2.0]), settings).unwrap();
     assert_eq!(found.status, Status::DomainLimit, "{:?}", found.point);
 }
@@ -522,7 +528,7 @@ fn no_evaluation_is_residuals_without_slopes() {
     let experiments = [run(100, 1, &[], 0.05, 431)];
     let model = two_link(true, Initial::Caputo);
     let there = at(&model, &experiments, &START.0, &START.1);
-    let settings = Settings { evaluations: 0, ..Settings::default() };
+    let settings = MinimizationSettings { evaluations: 0, ..MinimizationSettings::default() };
     let found = fit(&model, &experiments, &point(&START.0, &START.1), settings).unwrap();
     assert_eq!((&found.residuals, found.cost, found.status), (&there.residuals, there.cost, there.status));
     assert!(found.jacobian.is_empty() && !there.jacobian.is_empty());
@@ -532,8 +538,8 @@ fn no_evaluation_is_residuals_without_slopes() {
 fn a_number_that_is_held_stays_and_the_others_are_the_optimum_beside_it() {
     let experiments = [run(200, 1, &[], 0.05, 430)];
     let free = two_link(true, Initial::Rest);
-    let whole = fit(&free, &experiments, &point(&START.0, &START.1), Settings::default()).unwrap();
-    let settings = Settings { evaluations: 200, tolerance: 1e-12 };
+    let whole = fit(&free, &experiments, &point(&START.0, &START.1), MinimizationSettings::default()).unwrap();
+    let settings = MinimizationSettings { evaluations: 200, tolerance: 1e-12 };
     // A coefficient by its coordinate, an order by its bounds.
     let (mut coefficient, mut order) = (free.clone(), free.clone());
     coefficient.coordinates[3] = Coordinate::Fixed;
@@ -585,9 +591,10 @@ fn whole_orders_that_are_known_give_what_the_same_orders_give_where_they_may_mov
     for (name, model, experiments) in cases {
         let known = with_known_orders(&model, &whole);
         let inputs = vec![0.03; model.inputs.len()];
-        let settings = Settings { evaluations: 1, ..Settings::default() };
+        let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
         let at = |model: &FreeModel, orders: &[f64]| {
-            let start = Point { orders: orders.to_vec(), coefficients: START.1.to_vec(), inputs: inputs.clone() };
+            let start =
+                ParameterPoint { orders: orders.to_vec(), coefficients: START.1.to_vec(), inputs: inputs.clone() };
             fit(model, &experiments, &start, settings).unwrap()
         };
         let (moving, still) = (at(&model, &whole), at(&known, &[]));
@@ -601,7 +608,7 @@ fn whole_orders_that_are_known_give_what_the_same_orders_give_where_they_may_mov
         }
         check(&format!("running sums against transforms, {name}"), worst, 1e-9);
         let (there, here) =
-            (fit(&known, &experiments, &at(&known, &[]).point, Settings::default()).unwrap(), still.cost);
+            (fit(&known, &experiments, &at(&known, &[]).point, MinimizationSettings::default()).unwrap(), still.cost);
         assert!(there.cost < here);
     }
 }
@@ -642,7 +649,7 @@ fn driven() -> (FreeModel, Vec<Experiment>) {
 #[test]
 fn what_drives_is_solved_for_as_dense_least_squares_does() {
     let (mut model, experiments) = driven();
-    let once = Settings { evaluations: 1, ..Settings::default() };
+    let once = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
     let residuals = |b: f64, c: f64| fit(&model, &experiments, &point(&[], &[-3.0, b, c]), once).unwrap().residuals;
     // The residuals are linear in both: columns by differences, and the normal equations.
     let none = residuals(1e-300, 1e-300);
@@ -656,7 +663,7 @@ fn what_drives_is_solved_for_as_dense_least_squares_does() {
     let best = dense_solve(&gram, &rhs);
     model.coordinates[0] = Coordinate::Fixed;
     for start in [[1.0, 1.0], [-700.0, 2e5]] {
-        let settings = Settings { evaluations: 5, ..Settings::default() };
+        let settings = MinimizationSettings { evaluations: 5, ..MinimizationSettings::default() };
         let found = fit(&model, &experiments, &point(&[], &[-3.0, start[0], start[1]]), settings).unwrap();
         assert_eq!(found.status, Status::Converged);
         check("linear coefficients", relative_distance(&found.point.coefficients[1..], &best), 1e-8);
@@ -666,8 +673,8 @@ fn what_drives_is_solved_for_as_dense_least_squares_does() {
 #[test]
 fn where_what_drives_starts_does_not_matter() {
     let (model, experiments) = driven();
-    let settings = Settings { evaluations: 15, tolerance: 1e-12 };
-    let ends: Vec<Fit> = [[3.0, 0.5], [-3.0, -0.5], [1e4, -1e-4]]
+    let settings = MinimizationSettings { evaluations: 15, tolerance: 1e-12 };
+    let ends: Vec<OutputErrorFit> = [[3.0, 0.5], [-3.0, -0.5], [1e4, -1e-4]]
         .iter()
         .map(|start| fit(&model, &experiments, &point(&[], &[-1.5, start[0], start[1]]), settings).unwrap())
         .collect();
@@ -686,12 +693,12 @@ fn what_nothing_excites_stays_where_it_was() {
         Experiment::new(signals, 1, e.samples.clone(), vec![1.0]).unwrap()
     };
     let experiments: Vec<Experiment> = experiments.iter().map(still).collect();
-    let found = fit(&model, &experiments, &point(&[], &[-4.0, 3.0, 7.5]), Settings::default()).unwrap();
+    let found = fit(&model, &experiments, &point(&[], &[-4.0, 3.0, 7.5]), MinimizationSettings::default()).unwrap();
     assert_eq!(found.point.coefficients[2], 7.5);
 }
 
 /// Residuals and their slopes of a fit and of the same point evaluated by itself are the same.
-fn agree(name: &str, found: &Fit, alone: &Fit) {
+fn agree(name: &str, found: &OutputErrorFit, alone: &OutputErrorFit) {
     check(&format!("{name}: residuals"), relative_distance(&found.residuals, &alone.residuals), 1e-8);
     for (parameter, (one, other)) in found.jacobian.iter().zip(&alone.jacobian).enumerate() {
         check(&format!("{name}: slope {parameter}"), relative_distance(one, other), 1e-5);
@@ -712,9 +719,9 @@ fn runs_on_one_grid_share_what_does_not_depend_on_the_run() {
         let model = two_link(coupled, initial);
         let (orders, coefficients) = ([0.8, 0.2, 0.85], START.1);
         let together = at(&model, &runs, &orders, &coefficients);
-        let alone: Vec<Fit> =
+        let alone: Vec<OutputErrorFit> =
             runs.iter().map(|one| at(&model, std::slice::from_ref(one), &orders, &coefficients)).collect();
-        let joined = |rows: &dyn Fn(&Fit) -> Vec<f64>| alone.iter().flat_map(rows).collect::<Vec<f64>>();
+        let joined = |rows: &dyn Fn(&OutputErrorFit) -> Vec<f64>| alone.iter().flat_map(rows).collect::<Vec<f64>>();
         check("residuals", relative_distance(&together.residuals, &joined(&|fit| fit.residuals.clone())), 1e-10);
         for parameter in 0..8 {
             let rows = joined(&|fit| fit.jacobian[parameter].clone());
@@ -747,7 +754,9 @@ fn a_filter_that_all_outputs_pass_may_come_first() {
         let model = two_link(coupled, initial);
         let start = point(&[0.8, 0.2, 0.85], &START.1);
         // More than one evaluation lets it pass first, one by itself does not.
-        let found = fit(&model, &runs, &start, Settings { evaluations: 4, ..Settings::default() }).unwrap();
+        let found =
+            fit(&model, &runs, &start, MinimizationSettings { evaluations: 4, ..MinimizationSettings::default() })
+                .unwrap();
         assert!(found.evaluations > 1);
         agree(name, &found, &at(&model, &runs, &found.point.orders, &found.point.coefficients));
     }

@@ -14,7 +14,7 @@ use ftlm::fractional::exponential_sum::{integral_by_memory, Rates};
 use ftlm::fractional::integral::{fractional_derivative, fractional_integral, Derivative, IntegralRule};
 use ftlm::fractional::kernels::digamma;
 use ftlm::fractional::operational_matrices;
-use ftlm::linalg::small::{self, Recursion};
+use ftlm::linalg::small::{self, Recursion, SlidingGram};
 use ftlm::rig::arm_model::{Arm, Parameters};
 use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
 use ftlm::series;
@@ -94,10 +94,22 @@ fn regressions_that_cannot_be_made() {
     refused(least_squares::fit(&run, &there, &[None], &Initial::Powers(vec![f64::NAN])));
     refused(least_squares::fit(&[], &there, &[None], &Initial::Rest));
     refused(least_squares::solve(&[vec![1.0; 3]], &[1.0; 4], 1));
-    refused(instrumental_variables::fit(&run, &[], &[], &Initial::Rest, instrumental_variables::Settings::default()));
+    refused(instrumental_variables::fit(
+        &run,
+        &[],
+        &[],
+        &Initial::Rest,
+        instrumental_variables::InstrumentalSettings::default(),
+    ));
     for wrong in [
-        instrumental_variables::Settings { iterations: 1 << 62, ..instrumental_variables::Settings::default() },
-        instrumental_variables::Settings { tolerance: f64::NAN, ..instrumental_variables::Settings::default() },
+        instrumental_variables::InstrumentalSettings {
+            iterations: 1 << 62,
+            ..instrumental_variables::InstrumentalSettings::default()
+        },
+        instrumental_variables::InstrumentalSettings {
+            tolerance: f64::NAN,
+            ..instrumental_variables::InstrumentalSettings::default()
+        },
     ] {
         refused(instrumental_variables::fit(
             &run,
@@ -112,7 +124,7 @@ fn regressions_that_cannot_be_made() {
         &[structure(0, 1.0, &[(7, 0.0)])],
         &[vec![None]],
         &Initial::Rest,
-        instrumental_variables::Settings::default(),
+        instrumental_variables::InstrumentalSettings::default(),
     ));
 }
 
@@ -174,11 +186,12 @@ fn free_orders_out_of_all_bounds() {
 fn a_joint_structure_of_signals_that_are_not_there() {
     let made = |output, signal| {
         let order = joint::Order::number(0.0);
-        let term = joint::Term { signal, order, coefficient: joint::Coefficient::Free("a".into()), factor: 1.0 };
+        let term =
+            joint::ParametricTerm { signal, order, coefficient: joint::Coefficient::Free("a".into()), factor: 1.0 };
         let order = joint::Order::free("alpha");
-        let equation = joint::Equation { output, order, terms: vec![term], friction: None };
+        let equation = joint::ParametricEquation { output, order, terms: vec![term], friction: None };
         let signals = vec!["y".into(), "u".into()];
-        ParameterSet::from_structure(joint::Structure::new(signals, vec![equation], Initial::Rest))
+        ParameterSet::from_structure(joint::ParametricStructure::new(signals, vec![equation], Initial::Rest))
     };
     made(0, 1).unwrap();
     refused(made(2, 1));
@@ -247,7 +260,8 @@ fn numbers_that_are_none() {
     refused(Recursion::new(&[f64::NAN]));
     refused(small::inverse(&[1.0, 2.0], 2));
     refused(small::scaled_inverse(&[1.0, 2.0], 2));
-    refused(Recursion::new(&[1.0]).unwrap().step([(&[1.0, 2.0][..], 1.0)].into_iter()));
+    refused(Recursion::new(&[1.0]).unwrap().step(&SlidingGram::new(2, 1)));
+    refused(SlidingGram::new(2, 1).push(&[1.0], 1.0));
     refused(series::divide_naive(&[1.0, 2.0], &[1.0]));
     refused(Rates::new(1e-300, 1e300, 1e-6));
     refused(integral_by_memory(&[0.0, f64::NAN], 0.5, 0.1, 1e-6));

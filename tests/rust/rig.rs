@@ -1,13 +1,13 @@
 //! The rig's guard under a million random commands, and the arm's bounded memory.
 
 use ftlm::fractional::exponential_sum::{decay, Rates};
-use ftlm::rig::safety_guard::{Fault, Guard, Settings};
+use ftlm::rig::safety_guard::{Fault, Guard, GuardSettings};
 use ftlm::rig::virtual_arm::Reading;
 
 use crate::common::Random;
 
-fn settings() -> Settings {
-    Settings {
+fn settings() -> GuardSettings {
+    GuardSettings {
         step: 0.002,
         strain_scale: [0.013636, 0.018694],
         sense_scale: 2.0,
@@ -84,9 +84,9 @@ fn the_first_fault_stays() {
 #[test]
 fn settings_that_mean_nothing_are_refused() {
     for change in [
-        |s: &mut Settings| s.step = 0.0,
-        |s: &mut Settings| s.slew[1] = f64::NAN,
-        |s: &mut Settings| {
+        |s: &mut GuardSettings| s.step = 0.0,
+        |s: &mut GuardSettings| s.slew[1] = f64::NAN,
+        |s: &mut GuardSettings| {
             s.current_limit[0] = -1.0;
         },
     ] {

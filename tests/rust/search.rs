@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 
 use ftlm::equation::{Equation, Initial, Structure};
 use ftlm::error::{Error, Kind};
-use ftlm::estimation::instrumental_variables::Settings;
+use ftlm::estimation::instrumental_variables::InstrumentalSettings;
 use ftlm::estimation::least_squares::{self, Estimate};
 use ftlm::estimation::multi_innovation::{closed_form, Innovation, Prior, RowBasis};
 use ftlm::order_search::batches::search;
@@ -557,7 +557,7 @@ fn kernels_that_overflow_are_a_reason_on_every_row() {
     let record = record(1e200, vec![random.signal(64), random.signal(64)]);
     let terms = [axis(0, &[0.0, 0.5], false), axis(1, &[0.0], false)];
     let lattice = OrderGrid::new(0, &[1.8, 2.0], &terms, |s| s == 1).unwrap();
-    let settings = Settings { iterations: 3, tolerance: 1e-4 };
+    let settings = InstrumentalSettings { iterations: 3, tolerance: 1e-4 };
     for estimator in [Estimator::LeastSquares, Estimator::InstrumentalVariables(settings)] {
         for early_stopping in [false, true] {
             let options = Options { estimator, pruning: early_stopping, ..options() };

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::{Error, Result};
-use ftlm::estimation::instrumental_variables::Settings;
+use ftlm::estimation::instrumental_variables::InstrumentalSettings;
 use ftlm::order_search::batches::{batch_count, generation_ends, search, BatchEvaluator};
 use ftlm::order_search::control::{BatchPosition, Checkpoint, Control};
 use ftlm::order_search::grid::{LawEquation, OrderGrid, OrderLawGrid, TermAxis};
@@ -103,7 +103,7 @@ fn searches_refuse_settings_out_of_range() {
         assert!(matches!(pool(threads), Err(Error::OutOfRange { .. })));
     }
     for (iterations, tolerance) in [(0, 1e-4), (3, f64::NAN), (3, -1.0), (3, f64::INFINITY)] {
-        let estimator = Estimator::InstrumentalVariables(Settings { iterations, tolerance });
+        let estimator = Estimator::InstrumentalVariables(InstrumentalSettings { iterations, tolerance });
         assert!(matches!(with(Options { estimator, ..Options::default() }), Err(Error::OutOfRange { .. })));
     }
     let powers = |powers: &[f64]| Options { initial: Initial::Powers(powers.to_vec()), ..Options::default() };

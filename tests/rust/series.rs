@@ -4,7 +4,9 @@
 use ftlm::error::Error;
 use ftlm::fft;
 use ftlm::fractional::kernels::{block_pulse_kernel, power_means};
-use ftlm::series::{self, Buffers, Division, Kernel, Recursion, Solver, Source, SumOfProducts, BLOCK_TERMS, MAX_SUMS};
+use ftlm::series::{
+    self, Buffers, Division, Kernel, RunningSumSystem, Solver, Source, SumOfProducts, BLOCK_TERMS, MAX_SUMS,
+};
 use proptest::prelude::*;
 
 use crate::common::{
@@ -538,7 +540,7 @@ fn integrals_of_whole_order_by_running_sums() {
     let mut worst = 0.0_f64;
     for order in 0..=MAX_SUMS {
         let source = Source { equation: 0, order, weight: 1.0, series: &pulse };
-        let found = Recursion::new(1, order, step, &[]).unwrap().solve(m, &[vec![source]]).unwrap();
+        let found = RunningSumSystem::new(1, order, step, &[]).unwrap().solve(m, &[vec![source]]).unwrap();
         worst = worst.max(relative_error(&found[0][0], &block_pulse_kernel(order as f64, m, step)));
     }
     check("kernels by running sums", worst, 1e-11);
@@ -577,7 +579,7 @@ fn systems_of_whole_order_by_running_sums_are_those_by_division() {
         // More lists than go side by side, one of them empty.
         let twice = sources.iter().map(|s| Source { weight: 2.0 * s.weight, ..*s }).collect();
         let lists = [sources.clone(), Vec::new(), twice, sources.clone(), sources.clone(), sources.clone()];
-        let found = Recursion::new(n, sums, step, &terms).unwrap().solve(m, &lists).unwrap();
+        let found = RunningSumSystem::new(n, sums, step, &terms).unwrap().solve(m, &lists).unwrap();
         assert_eq!(found.len(), lists.len());
         assert!(found[1].iter().flatten().all(|v| *v == 0.0) && found[5] == found[0]);
         assert!(found[2].iter().flatten().zip(found[0].iter().flatten()).all(|(a, b)| *a == 2.0 * b));
@@ -590,10 +592,13 @@ fn systems_of_whole_order_by_running_sums_are_those_by_division() {
 
 #[test]
 fn running_sums_that_cannot_be() {
-    assert!(matches!(Recursion::new(1, 1, 0.1, &[(0, 0, 2, 1.0)]), Err(Error::Structure { .. })));
-    assert!(matches!(Recursion::new(1, MAX_SUMS + 1, 0.1, &[]), Err(Error::Structure { .. })));
+    assert!(matches!(RunningSumSystem::new(1, 1, 0.1, &[(0, 0, 2, 1.0)]), Err(Error::Structure { .. })));
+    assert!(matches!(RunningSumSystem::new(1, MAX_SUMS + 1, 0.1, &[]), Err(Error::Structure { .. })));
     // 1 − c·h/2 = 0.
-    assert!(matches!(Recursion::new(1, 1, 0.5, &[(0, 0, 1, 4.0)]), Err(Error::LeadingZero { .. })));
+    assert!(matches!(RunningSumSystem::new(1, 1, 0.5, &[(0, 0, 1, 4.0)]), Err(Error::LeadingZero { .. })));
     let short = Source { equation: 0, order: 0, weight: 1.0, series: &[1.0] };
-    assert!(matches!(Recursion::new(1, 0, 0.5, &[]).unwrap().solve(2, &[vec![short]]), Err(Error::Length { .. })));
+    assert!(matches!(
+        RunningSumSystem::new(1, 0, 0.5, &[]).unwrap().solve(2, &[vec![short]]),
+        Err(Error::Length { .. })
+    ));
 }

@@ -7,7 +7,9 @@ use ftlm::error::{Error, Result};
 use ftlm::estimation::joint_fit::initial_guesses::{power_frequency, OrderGrids};
 use ftlm::estimation::joint_fit::multistart::coarse_sampling;
 use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
-use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Input, Order, Structure, Term};
+use ftlm::estimation::joint_fit::structure::{
+    Coefficient, Hints, Input, Order, ParametricEquation, ParametricStructure, ParametricTerm,
+};
 use ftlm::estimation::joint_fit::Candidate;
 use ftlm::estimation::output_error::{FreeInput, InputLaw};
 use ftlm::parallel::Stop;
@@ -50,18 +52,18 @@ fn runs() -> Recordings {
     Recordings::new(vec![plant()]).unwrap()
 }
 
-fn term(signal: usize, order: Order, name: &str) -> Term {
-    Term { signal, order, coefficient: Coefficient::Free(name.into()), factor: 1.0 }
+fn term(signal: usize, order: Order, name: &str) -> ParametricTerm {
+    ParametricTerm { signal, order, coefficient: Coefficient::Free(name.into()), factor: 1.0 }
 }
 
 /// D^alpha y = a D^nu y + b y + c D^beta u.
-fn structure(alpha: Order, beta: f64) -> Structure {
+fn structure(alpha: Order, beta: f64) -> ParametricStructure {
     let terms =
         vec![term(0, Order::free("nu"), "a"), term(0, Order::number(0.0), "b"), term(1, Order::number(beta), "c")];
-    Structure {
+    ParametricStructure {
         signals: vec!["y".into(), "u".into()],
         derived: Vec::new(),
-        equations: vec![Equation { output: 0, order: alpha, terms, friction: None }],
+        equations: vec![ParametricEquation { output: 0, order: alpha, terms, friction: None }],
         bounds: [].into(),
         coupled: true,
         delayed: false,
@@ -73,7 +75,7 @@ fn structure(alpha: Order, beta: f64) -> Structure {
     }
 }
 
-fn found(structure: Structure, source: &Recordings, threads: usize) -> Result<Vec<Candidate>> {
+fn found(structure: ParametricStructure, source: &Recordings, threads: usize) -> Result<Vec<Candidate>> {
     OrderGrids::new(source, threads, BANK_LIMIT, &Stop::default()).candidates(&ParameterSet::from_structure(structure)?)
 }
 
@@ -180,7 +182,7 @@ fn fast_swing() -> (Vec<f64>, Vec<f64>) {
     let plant = equation::Structure { output: 0, order: 2.0, terms: vec![term(0, 1.0), term(0, 0.0), term(1, 0.0)] };
     let plant = equation::Equation::new(plant, vec![-2.0, -400.0, 1.0]).unwrap();
     let input =
-        state_space::Input { signal: 1, samples: u.clone(), between: Intersample::Hold, delay: 0.0, before: 0.0 };
+        state_space::InputSignal { signal: 1, samples: u.clone(), between: Intersample::Hold, delay: 0.0, before: 0.0 };
     let y = state_space::respond(&[plant], &[input], &[], step, rows, &Stop::default()).unwrap().unwrap();
     (y, u)
 }

@@ -29,13 +29,14 @@ from ftlm.utils.checkpoint_file import RECORD_ENCODER, CheckpointFile, decode_ar
 from ftlm.utils.parameters import parameter
 
 #: Version of the search algorithm. Rounds of different versions must not be joined.
-ALGORITHM_VERSION = 6
+ALGORITHM_VERSION = 7
 #: Earlier versions whose partial searches can be resumed if the rounds of the search are the same in both versions.
 #: Version 2 excludes boxes on grids of 2²⁵ candidates or more, with longer rounds. Version 3 has sharper boxes, also
 #: for squared equation errors. Version 4 has tighter bounds of simulations from 2¹⁸ candidates on. Version 5 bounds
 #: simulations by coefficients that cancel, and constructs boxes by the coefficients of all of their candidates. Version
-#: 6 applies these bounds to multi-innovation.
-RESUMABLE_ALGORITHMS = (1, 2, 3, 4, 5)
+#: 6 applies these bounds to multi-innovation. Version 7 bounds unstable candidates by their first samples, from 2¹⁸
+#: candidates on.
+RESUMABLE_ALGORITHMS = (1, 2, 3, 4, 5, 6)
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
 #: Counts: candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.

@@ -10,7 +10,7 @@
 use super::prefilter::is_unstable;
 use super::solution::{
     add_long_run_covariance, dot, equations, has_converged, initial_terms, orthonormalize_instruments, Dropped,
-    RecordInstruments, Settings, Solution,
+    InstrumentalSettings, RecordInstruments, Solution,
 };
 use crate::equation::Structure;
 use crate::error::Result;
@@ -26,7 +26,7 @@ const MAX_STEP_HALVINGS: usize = 8;
 const COST_TOLERANCE: f64 = 1e-6;
 
 /// Equations to refine: structures, fixed coefficients, exponents and exclusions of their initial terms.
-pub struct Problem<'a> {
+pub struct CoupledProblem<'a> {
     /// Records as measured.
     pub records: &'a [Record],
     /// Records with noise-free substitutes for measured outputs without an equation.
@@ -75,7 +75,7 @@ struct Iterate {
     cost: f64,
 }
 
-impl Problem<'_> {
+impl CoupledProblem<'_> {
     /// Iterate from an initial guess until convergence; the cost never increases except by rounding.
     ///
     /// None if the simulation from the initial guess diverges, so that its inverse cannot be used as a filter.
@@ -83,7 +83,7 @@ impl Problem<'_> {
     ///
     /// # Errors
     /// [`crate::error::Error::Singular`] if the instruments do not identify the coefficients of all equations together.
-    pub fn refine(&self, start: &[Solution], settings: Settings) -> Result<Option<CoupledEstimate>> {
+    pub fn refine(&self, start: &[Solution], settings: InstrumentalSettings) -> Result<Option<CoupledEstimate>> {
         let unknowns = self.free_coefficients();
         let mut solutions = start.to_vec();
         let Some(mut point) = self.evaluate(&solutions)? else { return Ok(None) };

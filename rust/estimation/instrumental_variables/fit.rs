@@ -5,8 +5,8 @@
 
 use super::coupled;
 use super::prefilter::{damped_inverse, power_frequency, state_variable_filter};
-use super::single::{divisor, step, EquationSpectra, Scratch, Source};
-use super::solution::{dot, equations, has_converged, initial_terms, Dropped, Settings, Solution};
+use super::single::{divisor, step, EquationSpectra, InstrumentSource, Scratch};
+use super::solution::{dot, equations, has_converged, initial_terms, Dropped, InstrumentalSettings, Solution};
 use crate::equation::{Initial, Structure};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::least_squares;
@@ -28,7 +28,8 @@ const SAME_SOLUTION_TOLERANCE: f64 = 1e-4;
 
 /// Coefficient estimates of one equation.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Estimate {
+#[non_exhaustive]
+pub struct InstrumentalEstimate {
     /// One per term; fixed coefficients as given.
     pub coefficients: Vec<f64>,
     /// Coefficients of the initial terms, per record; 0 for a term excluded as linearly dependent.
@@ -41,9 +42,10 @@ pub struct Estimate {
 
 /// Coefficient estimates of all equations.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Fit {
+#[non_exhaustive]
+pub struct InstrumentalFit {
     /// One per equation.
-    pub estimates: Vec<Estimate>,
+    pub estimates: Vec<InstrumentalEstimate>,
     /// Number of iterations.
     pub iterations: usize,
     /// True if the last step changed no coefficient by more than the tolerance; otherwise the estimates are the iterate
@@ -64,7 +66,7 @@ pub struct Fit {
 /// O(iterations · Σ (terms · m log m + n² m log² m)).
 ///
 /// # Errors
-/// As least squares and [`Settings::check`]; [`Error::Singular`] if the instruments do not identify the coefficients;
+/// As least squares and [`InstrumentalSettings::check`]; [`Error::Singular`] if the instruments do not identify the coefficients;
 /// [`Error::Length`].
 ///
 /// ```
@@ -83,7 +85,7 @@ pub struct Fit {
 /// let measured = Record::new(0.02, PulseMeans::from_rows(vec![output, input]), None)?;
 /// let run = iv::with_projections(measured, &[false, true], true, &Stop::default())?;
 /// let structures = [plant.structure.clone()];
-/// let found = iv::fit(&[run], &structures, &[vec![None, None]], &Initial::Rest, iv::Settings::default())?;
+/// let found = iv::fit(&[run], &structures, &[vec![None, None]], &Initial::Rest, iv::InstrumentalSettings::default())?;
 /// assert!(found.converged && (found.estimates[0].coefficients[1] - 2.0).abs() < 1e-6);
 /// # Ok(())
 /// # }
@@ -93,8 +95,8 @@ pub fn fit(
     structures: &[Structure],
     fixed: &[Vec<Option<f64>>],
     initial: &Initial,
-    settings: Settings,
-) -> Result<Fit> {
+    settings: InstrumentalSettings,
+) -> Result<InstrumentalFit> {
     settings.check()?;
     check_length("fixed coefficients", structures.len(), fixed.len())?;
     if structures.is_empty() {
@@ -102,7 +104,7 @@ pub fn fit(
     }
     let clean: Vec<Record> = records.iter().map(Record::clean_record).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
-    let problem = Problem::new(records, &clean, structures, (fixed, initial), &exponents)?;
+    let problem = CoupledProblem::new(records, &clean, structures, (fixed, initial), &exponents)?;
     let mut ends: Vec<(Vec<Solution>, RefinementResult)> = Vec::new();
     let mut failure = None;
     for ratio in FILTER_POLE_RATIOS {
@@ -154,13 +156,13 @@ pub fn fit(
             let (coefficients, rest) = solution.split_at(structure.terms.len());
             let width = exponents.len();
             let initial = (0..records.len()).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
-            Estimate { coefficients: coefficients.to_vec(), initial, exponents, covariance }
+            InstrumentalEstimate { coefficients: coefficients.to_vec(), initial, exponents, covariance }
         })
         .collect();
-    Ok(Fit { estimates, iterations: ended.iterations, converged: ended.converged, damped: ended.damped })
+    Ok(InstrumentalFit { estimates, iterations: ended.iterations, converged: ended.converged, damped: ended.damped })
 }
 
-struct Problem<'a> {
+struct CoupledProblem<'a> {
     records: &'a [Record],
     clean: &'a [Record],
     structures: &'a [Structure],
@@ -183,7 +185,7 @@ struct RefinementResult {
     damped: bool,
 }
 
-impl<'a> Problem<'a> {
+impl<'a> CoupledProblem<'a> {
     fn new(
         records: &'a [Record],
         clean: &'a [Record],
@@ -214,7 +216,8 @@ impl<'a> Problem<'a> {
         let mut solutions = Vec::with_capacity(self.structures.len());
         for (i, (structure, fixed)) in self.structures.iter().zip(self.fixed).enumerate() {
             let pairs = self.spectra[i].iter().zip(&self.substitutes[i]);
-            let sources: Vec<Source<'_>> = pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
+            let sources: Vec<InstrumentSource<'_>> =
+                pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
             let filter = |r: &Record| {
                 state_variable_filter(ratio * power_frequency(r.signal(structure.output), r.step()), structure.order, r)
             };
@@ -225,7 +228,7 @@ impl<'a> Problem<'a> {
         Ok(solutions)
     }
 
-    fn iterate(&self, mut solutions: Vec<Solution>, settings: Settings) -> Result<RefinementResult> {
+    fn iterate(&self, mut solutions: Vec<Solution>, settings: InstrumentalSettings) -> Result<RefinementResult> {
         let mut scratch = Scratch::default();
         let mut best = (f64::INFINITY, solutions.clone());
         let (mut iterations, mut converged, mut shortened) = (0, false, 0);
@@ -268,8 +271,12 @@ impl<'a> Problem<'a> {
     }
 
     /// Refine all equations together; None if they cannot be refined together.
-    fn refine_together(&self, start: &[Solution], settings: Settings) -> Result<Option<coupled::CoupledEstimate>> {
-        let problem = coupled::Problem {
+    fn refine_together(
+        &self,
+        start: &[Solution],
+        settings: InstrumentalSettings,
+    ) -> Result<Option<coupled::CoupledEstimate>> {
+        let problem = coupled::CoupledProblem {
             records: self.records,
             clean: self.clean,
             structures: self.structures,
@@ -310,7 +317,7 @@ impl<'a> Problem<'a> {
             let made: Vec<Vec<Option<Kernel>>> =
                 pairs.map(|(shelf, record)| shelf.substitute_spectra(record, driven)).collect();
             let terms = &self.structures[i].terms;
-            let sources: Vec<Source<'_>> = (0..made.len())
+            let sources: Vec<InstrumentSource<'_>> = (0..made.len())
                 .map(|r| {
                     let of = |k: usize| if driven(terms[k].signal) { &made[r][k] } else { &self.substitutes[i][r][k] };
                     self.spectra[i][r].source(|k| of(k).as_ref())

@@ -11,7 +11,7 @@ pub mod prefilter;
 pub mod single;
 pub mod solution;
 
-pub use fit::{fit, Estimate, Fit};
+pub use fit::{fit, InstrumentalEstimate, InstrumentalFit};
 pub use prefilter::{damped_inverse, low_pass, power_frequency, project, with_projections};
-pub use single::{refine, step, Scratch, Source};
-pub use solution::{Dropped, Settings, Solution};
+pub use single::{refine, step, InstrumentSource, Scratch};
+pub use solution::{Dropped, InstrumentalSettings, Solution};

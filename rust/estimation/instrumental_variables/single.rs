@@ -6,7 +6,8 @@
 
 use super::prefilter::damped_inverse;
 use super::solution::{
-    add_long_run_covariance, dot, has_converged, orthonormalize_instruments, RecordInstruments, Settings, Solution,
+    add_long_run_covariance, dot, has_converged, orthonormalize_instruments, InstrumentalSettings, RecordInstruments,
+    Solution,
 };
 use crate::equation::Structure;
 use crate::error::Result;
@@ -17,7 +18,7 @@ use crate::regressors::Record;
 use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
 
 /// Data of one record for one equation: spectra padded for products of two series of m terms.
-pub struct Source<'a> {
+pub struct InstrumentSource<'a> {
     /// Per term: kernel of I^η and its spectrum for terms of the output itself; None for other terms.
     pub own: Vec<Option<(&'a [f64], &'a Kernel)>>,
     /// Per term: I^η s as measured.
@@ -92,10 +93,10 @@ impl<'a> EquationSpectra<'a> {
     }
 
     /// Source of a step with the given substitute spectra; measured spectra for terms without one.
-    pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> Source<'b> {
+    pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> InstrumentSource<'b> {
         let own = |t: &TermSpectra| t.signal == self.output;
         let terms = || self.terms.iter();
-        Source {
+        InstrumentSource {
             own: terms().map(|t| own(t).then_some((&t.kernel[..], &t.spectrum))).collect(),
             measured: terms().map(|t| &t.measured).collect(),
             clean: terms().enumerate().map(|(k, t)| clean(k).unwrap_or(&t.measured)).collect(),
@@ -107,7 +108,7 @@ impl<'a> EquationSpectra<'a> {
 }
 
 /// Divisor D = 1 − Σ c F^η over the terms of the output itself.
-pub(super) fn divisor(source: &Source<'_>, coefficients: &[f64]) -> Vec<f64> {
+pub(super) fn divisor(source: &InstrumentSource<'_>, coefficients: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; source.output.len()];
     for (kernel, c) in source.own.iter().zip(coefficients) {
         if let Some((kernel, _)) = kernel {
@@ -143,7 +144,7 @@ impl Scratch {
 /// [`Interrupted`](crate::error::Error::Interrupted) after a stop request.
 #[allow(clippy::cast_precision_loss)]
 pub fn step(
-    sources: &[Source<'_>],
+    sources: &[InstrumentSource<'_>],
     filters: &[Kernel],
     responses: &[Vec<f64>],
     fixed: &[Option<f64>],
@@ -268,11 +269,11 @@ fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Ve
 /// # Errors
 /// As [`step`] and [`damped_inverse`].
 pub fn refine(
-    sources: &[Source<'_>],
+    sources: &[InstrumentSource<'_>],
     fixed: &[Option<f64>],
     dropped: &[(usize, usize)],
     start: &[f64],
-    settings: Settings,
+    settings: InstrumentalSettings,
     scratch: &mut Scratch,
 ) -> Result<(Solution, usize, bool)> {
     let mut solution = start.to_vec();

@@ -13,29 +13,29 @@ const MAX_ITERATIONS: usize = 1000;
 
 /// Termination criteria of the iteration.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Settings {
+pub struct InstrumentalSettings {
     /// Maximum number of iterations.
     pub iterations: usize,
     /// Relative change of every coefficient below which the iteration has converged.
     pub tolerance: f64,
 }
 
-impl Default for Settings {
+impl Default for InstrumentalSettings {
     fn default() -> Self {
         Self { iterations: 30, tolerance: 1e-7 }
     }
 }
 
-impl Settings {
+impl InstrumentalSettings {
     /// Check that the settings are in range.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for more than 1000 iterations, and for a tolerance that is negative or not finite.
     ///
     /// ```
-    /// # use ftlm::estimation::instrumental_variables::Settings;
-    /// assert!(Settings::default().check().is_ok());
-    /// assert!(Settings { iterations: 1 << 20, ..Settings::default() }.check().is_err());
+    /// # use ftlm::estimation::instrumental_variables::InstrumentalSettings;
+    /// assert!(InstrumentalSettings::default().check().is_ok());
+    /// assert!(InstrumentalSettings { iterations: 1 << 20, ..InstrumentalSettings::default() }.check().is_err());
     /// ```
     pub fn check(&self) -> Result<()> {
         let refuse = |name: &str, value: f64, range: &str, remedy: &str| {

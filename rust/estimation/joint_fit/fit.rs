@@ -14,7 +14,7 @@ use super::progress::{FitProgress, ProgressListener};
 use super::reweighting::{fit_reweighted, Loss, EVALUATIONS_PER_REWEIGHTING};
 use super::stability_preference::{prefer_stable, StabilityComparison};
 use super::step_refinement::{correct_step, refine_step, Optimum, OptimumStatistics};
-use super::structure::{Equation, Structure};
+use super::structure::{ParametricEquation, ParametricStructure};
 use crate::equation::Initial;
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
@@ -119,6 +119,7 @@ pub struct Settings {
 
 /// An optimum of the joint output error.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct JointFit {
     /// The optimum and its statistics.
     pub finished: OptimumStatistics,
@@ -202,7 +203,7 @@ pub struct EquationFit {
 ///
 /// # Errors
 /// As [`fit`]; [`Error::Diverged`] if no initial guess has a finite simulation.
-pub fn fit_equations(runs: Vec<Recording>, equations: Vec<Equation>) -> Result<EquationFit> {
+pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -> Result<EquationFit> {
     let runs = Recordings::new(runs)?;
     let signals = runs.runs()[0].channels().iter().map(|channel| channel.name.clone()).collect();
     let sizes = equations
@@ -212,7 +213,7 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<Equation>) -> Result<E
             Ok(OutputScale::from_runs(&samples))
         })
         .collect::<Result<Vec<_>>>()?;
-    let free = ParameterSet::from_structure(Structure::new(signals, equations, Initial::Rest))?;
+    let free = ParameterSet::from_structure(ParametricStructure::new(signals, equations, Initial::Rest))?;
     let stop = Stop::default();
     let starts = OrderGrids::new(&runs, 1, BANK_LIMIT, &stop);
     let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
@@ -232,7 +233,7 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<Equation>) -> Result<E
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::equation::Initial;
-/// use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure, Term};
+/// use ftlm::estimation::joint_fit::structure::{Coefficient, ParametricEquation, Order, ParametricStructure, ParametricTerm};
 /// use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 /// use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
 /// use ftlm::estimation::joint_fit::{fit, FitProblem, Initialization, Loss, OutputScale, Settings};
@@ -250,12 +251,12 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<Equation>) -> Result<E
 /// let runs = Recordings::new(vec![Recording::new("run", step, None, vec![y, u], vec![0])?])?;
 /// let term = |signal, name: &str| {
 ///     let coefficient = Coefficient::Free(name.into());
-///     Term { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
+///     ParametricTerm { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
 /// };
 /// let terms = vec![term(0, "a"), term(1, "b")];
-/// let sought = Equation { output: 0, order: Order::free("alpha"), terms, friction: None };
+/// let sought = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
 /// let signals = vec!["y".into(), "u".into()];
-/// let free = ParameterSet::from_structure(Structure::new(signals, vec![sought], Initial::Rest))?;
+/// let free = ParameterSet::from_structure(ParametricStructure::new(signals, vec![sought], Initial::Rest))?;
 /// let stop = Stop::default();
 /// let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
 /// let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };

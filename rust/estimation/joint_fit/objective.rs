@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::problem::{Iterate, OptimizationResult, Problem};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::integer_orders::IntegerOrders;
-use crate::estimation::output_error::{Experiment, Settings};
+use crate::estimation::output_error::{Experiment, MinimizationSettings};
 use crate::parallel::Stop;
 use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
@@ -154,7 +154,7 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// As [`Problem::minimize`].
     pub fn minimize(&self, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
-        let settings = Settings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        let settings = MinimizationSettings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
         self.problem.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
@@ -163,7 +163,7 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// As [`Problem::minimize`].
     pub fn minimize_in(&self, turned: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
-        let settings = Settings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        let settings = MinimizationSettings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
         turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 

@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use super::problem::{Iterate, Problem};
-use super::structure::{unique, Coefficient, Equation, Input, Law, Structure};
+use super::structure::{unique, Coefficient, Input, Law, ParametricEquation, ParametricStructure};
 use crate::equation::Initial;
 use crate::error::Result;
 use crate::estimation::output_error::parameterization::TimeUnit as Unit;
@@ -30,7 +30,7 @@ const DEFAULT_RATIO_EXCESS: f64 = 0.5;
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterSet {
     /// The structure.
-    pub structure: Structure,
+    pub structure: ParametricStructure,
     /// Names of the free orders.
     pub orders: Vec<String>,
     /// Names of the free coefficients, including the factors of laws.
@@ -45,8 +45,8 @@ impl ParameterSet {
     /// Parameter set of a structure.
     ///
     /// # Errors
-    /// As [`Structure::check`] and [`Problem::new`].
-    pub fn from_structure(structure: Structure) -> Result<Self> {
+    /// As [`ParametricStructure::check`] and [`Problem::new`].
+    pub fn from_structure(structure: ParametricStructure) -> Result<Self> {
         structure.check()?;
         let named = structure.coefficient_names();
         let law = |name: &String| structure.laws.iter().rev().find(|law| law.name == *name).cloned();
@@ -76,7 +76,7 @@ impl ParameterSet {
                 Monomial { factor: factor * sign, powers }
             }
         };
-        let equation = |e: &Equation| FreeEquation {
+        let equation = |e: &ParametricEquation| FreeEquation {
             output: e.output,
             order: e.order.affine(&orders),
             terms: (e.terms.iter())
@@ -209,7 +209,7 @@ impl ParameterSet {
     /// # Errors
     /// As [`ParameterSet::from_structure`].
     pub fn with_initial_terms(&self, initial: Initial, history: bool) -> Result<Self> {
-        Self::from_structure(Structure { initial, history, ..self.structure.clone() })
+        Self::from_structure(ParametricStructure { initial, history, ..self.structure.clone() })
     }
 
     /// Lower bound of a ratio of the coefficient law.
@@ -219,7 +219,7 @@ impl ParameterSet {
 }
 
 /// Bounds of the free orders: given ones, else defaults.
-fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
+fn bounds(structure: &ParametricStructure, orders: &[String]) -> Vec<(f64, f64)> {
     let highest: Vec<&String> =
         structure.equations.iter().filter(|e| e.order.is_single()).flat_map(|e| e.order.names()).collect();
     let inertia: Vec<&String> = structure
@@ -242,9 +242,10 @@ fn bounds(structure: &Structure, orders: &[String]) -> Vec<(f64, f64)> {
 }
 
 /// Default upper bound of a free order: 3, or one above the highest fixed order of its equations if that is larger.
-fn upper_order_bound(structure: &Structure, name: &String, above: bool) -> f64 {
+fn upper_order_bound(structure: &ParametricStructure, name: &String, above: bool) -> f64 {
     let beside = structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
-    let numbers = beside.flat_map(Equation::orders).filter(|order| !order.is_free()).map(|order| order.constant);
+    let numbers =
+        beside.flat_map(ParametricEquation::orders).filter(|order| !order.is_free()).map(|order| order.constant);
     numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
 }
 
@@ -348,11 +349,11 @@ impl TimeScaling {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimation::joint_fit::structure::{Order, Term};
+    use crate::estimation::joint_fit::structure::{Order, ParametricTerm};
 
     #[test]
     fn time_scaling_converts_values_steps_and_errors() -> Result<()> {
-        let term = |signal, order, name: &str| Term {
+        let term = |signal, order, name: &str| ParametricTerm {
             signal,
             order,
             coefficient: Coefficient::Free(name.into()),
@@ -364,8 +365,8 @@ mod tests {
             term(1, Order::free("gamma"), "b0"),
             term(1, Order::number(0.0), "b1"),
         ];
-        let equation = Equation { output: 0, order: Order::free("alpha"), terms, friction: None };
-        let structure = Structure::new(vec!["y".into(), "u".into()], vec![equation], Initial::Rest);
+        let equation = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
+        let structure = ParametricStructure::new(vec!["y".into(), "u".into()], vec![equation], Initial::Rest);
         let problem = ParameterSet::from_structure(structure)?.problem;
         let (clock, minutes) =
             (TimeScaling::from_runs(&problem, &[(0.02, 4.8)]), TimeScaling::from_runs(&problem, &[(1.2, 288.0)]));

@@ -3,7 +3,7 @@
 use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{
-    fit_until, Coordinate, Experiment, FreeModel, Monomial, Point, Settings, Status,
+    fit_until, Coordinate, Experiment, FreeModel, MinimizationSettings, Monomial, ParameterPoint, Status,
 };
 use crate::expression::DerivedSignal;
 use crate::friction::{self, FreeFrictionLaw, FrictionModel, Start};
@@ -88,11 +88,11 @@ impl Problem {
     ///
     /// # Errors
     /// [`Error::Length`].
-    pub fn point(&self, values: &[f64]) -> Result<Point> {
+    pub fn point(&self, values: &[f64]) -> Result<ParameterPoint> {
         check_length("values of what is free", self.size(), values.len())?;
         let (orders, rest) = values.split_at(self.model.order_bounds.len());
         let (coefficients, inputs) = rest.split_at(self.model.coordinates.len());
-        Ok(Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() })
+        Ok(ParameterPoint { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() })
     }
 
     /// Bounds of all free parameters. Coefficients are unbounded, except that friction must dissipate energy.
@@ -113,7 +113,7 @@ impl Problem {
 
     /// True if an equation is unstable at a point and free initial terms may compensate the growth.
     #[must_use]
-    pub fn is_unstable(&self, point: &Point) -> bool {
+    pub fn is_unstable(&self, point: &ParameterPoint) -> bool {
         self.is_linear() && !self.model.initial.is_at_rest() && self.model.is_unstable(point)
     }
 
@@ -125,7 +125,7 @@ impl Problem {
         &self,
         experiments: &[Experiment],
         start: &Iterate,
-        settings: Settings,
+        settings: MinimizationSettings,
         steady: bool,
         stop: &Stop,
     ) -> Result<OptimizationResult> {
@@ -142,7 +142,7 @@ impl Problem {
             });
         }
         let filtered = friction::filtered_outputs(experiments);
-        let Iterate { point: Point { orders, coefficients, inputs }, states } = start.clone();
+        let Iterate { point: ParameterPoint { orders, coefficients, inputs }, states } = start.clone();
         let start = Start { orders, coefficients, inputs, states };
         let found = if self.derived.is_empty() {
             let model = FrictionModel {
@@ -159,7 +159,7 @@ impl Problem {
             let model = NonlinearModel { model: self.model.clone(), derived: self.derived.clone(), filtered };
             nonlinear::fit(&model, experiments, &start, settings, stop)?
         };
-        let point = Point { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };
+        let point = ParameterPoint { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };
         Ok(OptimizationResult {
             initial: found.states.iter().map(|states| vec![states.clone()]).collect(),
             iterate: Iterate { point, states: found.states },
@@ -176,13 +176,14 @@ impl Problem {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Iterate {
     /// Free orders, coefficients and input parameters.
-    pub point: Point,
+    pub point: ParameterPoint,
     /// Initial states of each run with friction or non-linear terms; empty if unknown.
     pub states: Vec<Vec<f64>>,
 }
 
 /// Result of an optimization.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct OptimizationResult {
     /// The final iterate.
     pub iterate: Iterate,
@@ -227,7 +228,7 @@ impl OptimizationResult {
     /// All parameters: orders, coefficients, input parameters.
     #[must_use]
     pub fn values(&self) -> Vec<f64> {
-        let Point { orders, coefficients, inputs } = &self.iterate.point;
+        let ParameterPoint { orders, coefficients, inputs } = &self.iterate.point;
         [orders.as_slice(), coefficients, inputs].concat()
     }
 
@@ -237,7 +238,7 @@ impl OptimizationResult {
         let point = &self.iterate.point;
         let (orders, rest) = values.split_at(point.orders.len());
         let (coefficients, inputs) = rest.split_at(point.coefficients.len());
-        let point = Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
+        let point = ParameterPoint { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
         Iterate { point, states: self.iterate.states.clone() }
     }
 }

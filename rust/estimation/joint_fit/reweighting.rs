@@ -26,6 +26,7 @@ pub enum Loss {
 
 /// Counts of downweighted residuals and outliers of a robust loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct RobustSummary {
     /// Residuals beyond 1.345 standard deviations, which are downweighted; 18 % of normal noise.
     pub reduced_weight_count: usize,

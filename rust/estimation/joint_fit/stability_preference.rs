@@ -27,6 +27,7 @@ const EVALUATIONS_PER_CANDIDATE: usize = 60;
 
 /// Comparison of an unstable optimum with the best stable one.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct StabilityComparison {
     /// True if the unstable optimum is the result, because it fits significantly better or no stable one exists.
     pub keeps_unstable: bool,

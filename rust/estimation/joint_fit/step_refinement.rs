@@ -35,6 +35,7 @@ pub struct Optimum<'a> {
 
 /// Optimum with its covariance, noise levels and residuals.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct OptimumStatistics {
     /// The optimum of the finest grid.
     pub attempt: OptimizationResult,

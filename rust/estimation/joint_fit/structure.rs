@@ -37,7 +37,7 @@ impl Coefficient {
 
 /// Term factor · coefficient · D^order signal.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Term {
+pub struct ParametricTerm {
     /// Index of the signal.
     pub signal: usize,
     /// ν.
@@ -48,7 +48,7 @@ pub struct Term {
     pub factor: f64,
 }
 
-impl Term {
+impl ParametricTerm {
     /// Value of factor · coefficient if fixed; None if free.
     #[must_use]
     pub fn fixed_coefficient(&self) -> Option<f64> {
@@ -78,18 +78,18 @@ impl FrictionParameters {
 
 /// Equation D^order output = Σ terms.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Equation {
+pub struct ParametricEquation {
     /// Index of the output.
     pub output: usize,
     /// α.
     pub order: Order,
     /// The right-hand side.
-    pub terms: Vec<Term>,
+    pub terms: Vec<ParametricTerm>,
     /// Friction on the velocity of the output, if any.
     pub friction: Option<FrictionParameters>,
 }
 
-impl Equation {
+impl ParametricEquation {
     /// Equation D^order output = 0, to which [`Self::with_term`] adds terms.
     #[must_use]
     pub fn new(output: usize, order: Order) -> Self {
@@ -99,7 +99,12 @@ impl Equation {
     /// Add a term coefficient · D^order signal with a free coefficient of this name.
     #[must_use]
     pub fn with_term(mut self, coefficient: &str, order: Order, signal: usize) -> Self {
-        self.terms.push(Term { signal, order, coefficient: Coefficient::Free(coefficient.into()), factor: 1.0 });
+        self.terms.push(ParametricTerm {
+            signal,
+            order,
+            coefficient: Coefficient::Free(coefficient.into()),
+            factor: 1.0,
+        });
         self
     }
 
@@ -115,12 +120,12 @@ impl Equation {
     }
 
     /// Terms of its own output.
-    pub fn autoregressive_terms(&self) -> impl Iterator<Item = &Term> {
+    pub fn autoregressive_terms(&self) -> impl Iterator<Item = &ParametricTerm> {
         self.terms.iter().filter(|term| term.signal == self.output)
     }
 
     /// Terms of other signals.
-    pub fn input_terms(&self) -> impl Iterator<Item = &Term> {
+    pub fn input_terms(&self) -> impl Iterator<Item = &ParametricTerm> {
         self.terms.iter().filter(|term| term.signal != self.output)
     }
 
@@ -189,13 +194,13 @@ pub struct Hints {
 
 /// Structure of a joint fit: equations, bounds, initial terms, input nonlinearities and laws.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Structure {
+pub struct ParametricStructure {
     /// Names of the signals, for messages: recorded ones, then derived ones.
     pub signals: Vec<String>,
     /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
     /// One equation per output.
-    pub equations: Vec<Equation>,
+    pub equations: Vec<ParametricEquation>,
     /// Lower and upper bound of free orders, if given.
     pub bounds: BTreeMap<String, (f64, f64)>,
     /// True if outputs enter other equations as simulated; false if as measured.
@@ -214,10 +219,10 @@ pub struct Structure {
     pub hints: Hints,
 }
 
-impl Structure {
+impl ParametricStructure {
     /// Structure with measured signals as inputs and no further assumptions.
     #[must_use]
-    pub fn new(signals: Vec<String>, equations: Vec<Equation>, initial: Initial) -> Self {
+    pub fn new(signals: Vec<String>, equations: Vec<ParametricEquation>, initial: Initial) -> Self {
         Self {
             signals,
             derived: Vec::new(),
@@ -242,7 +247,7 @@ impl Structure {
     /// Names of the free orders: single ones in order of appearance, then those that occur only in a law.
     #[must_use]
     pub fn order_names(&self) -> Vec<String> {
-        let orders = || self.equations.iter().flat_map(Equation::orders);
+        let orders = || self.equations.iter().flat_map(ParametricEquation::orders);
         let alone = orders().filter(|order| order.is_single()).flat_map(Order::names);
         unique(alone.chain(orders().flat_map(Order::names)))
     }
@@ -250,13 +255,14 @@ impl Structure {
     /// Names of the free coefficients.
     #[must_use]
     pub fn coefficient_names(&self) -> Vec<String> {
-        self.equations.iter().flat_map(Equation::coefficient_names).cloned().collect()
+        self.equations.iter().flat_map(ParametricEquation::coefficient_names).cloned().collect()
     }
 
     /// True if orders depend on one another: one is not a single free order, or two are the same.
     #[must_use]
     pub fn has_order_law(&self) -> bool {
-        let orders: Vec<_> = self.equations.iter().flat_map(Equation::orders).filter(|order| order.is_free()).collect();
+        let orders: Vec<_> =
+            self.equations.iter().flat_map(ParametricEquation::orders).filter(|order| order.is_free()).collect();
         let names = unique(orders.iter().filter_map(|order| order.names().next()));
         orders.iter().any(|order| !order.is_single()) || names.len() < orders.len()
     }
@@ -275,7 +281,7 @@ impl Structure {
         if self.equations.is_empty() {
             return Err(Error::Structure { what: "a model without an equation".into(), remedy: "add one".into() });
         }
-        let of_equation = |e: &Equation| e.terms.iter().map(|t| t.signal).chain([e.output]).max();
+        let of_equation = |e: &ParametricEquation| e.terms.iter().map(|t| t.signal).chain([e.output]).max();
         let inputs = self.inputs.iter().map(|input| input.free.signal);
         let highest = self.equations.iter().filter_map(of_equation).chain(inputs).max();
         if let Some(signal) = highest.filter(|&signal| signal >= self.signals.len()) {
@@ -286,13 +292,13 @@ impl Structure {
         if let Some(signal) = channels.chain(outputs).find(|&signal| signal >= self.recorded_count()) {
             return Err(missing_signal_error(signal, self.recorded_count()));
         }
-        self.equations.iter().try_for_each(Equation::check)
+        self.equations.iter().try_for_each(ParametricEquation::check)
     }
 
     /// Substitute values for some free orders.
     ///
     /// # Errors
-    /// As [`Structure::check`].
+    /// As [`ParametricStructure::check`].
     pub fn with_orders(&self, values: &BTreeMap<String, f64>) -> Result<Self> {
         let mut out = self.clone();
         for equation in &mut out.equations {
@@ -327,7 +333,7 @@ impl Structure {
 
     /// Replace equation number `place`, and remove bounds of orders that no longer occur.
     #[must_use]
-    pub fn with_equation(&self, place: usize, equation: Equation) -> Self {
+    pub fn with_equation(&self, place: usize, equation: ParametricEquation) -> Self {
         let mut out = self.clone();
         out.equations[place] = equation;
         let names: BTreeSet<String> = out.order_names().into_iter().collect();

@@ -43,7 +43,7 @@ pub(crate) struct LinearizedProblem {
 }
 
 impl LinearizedProblem {
-    pub(crate) fn at<P: Problem>(
+    pub(crate) fn at<P: LeastSquaresProblem>(
         problem: &P,
         point: &P::Point,
         jacobian: &[Vec<f64>],
@@ -322,7 +322,7 @@ fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(V
 }
 
 /// Nonlinear least-squares problem.
-pub trait Problem {
+pub trait LeastSquaresProblem {
     /// Argument of the residuals.
     type Point: Clone;
     /// Residuals at a point, and intermediates for their derivatives.
@@ -342,7 +342,7 @@ pub trait Problem {
     /// Derivatives of the residuals with respect to every parameter, one column each.
     ///
     /// # Errors
-    /// As [`Problem::evaluate`]; [`crate::error::Error::Diverged`] shortens the step.
+    /// As [`LeastSquaresProblem::evaluate`]; [`crate::error::Error::Diverged`] shortens the step.
     fn jacobian(&self, point: &Self::Point, evaluation: &Self::Evaluation) -> Result<Vec<Vec<f64>>>;
 
     /// Move a point by steps in the coordinates, within bounds; return it and the largest relative change.

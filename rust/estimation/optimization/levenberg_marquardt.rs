@@ -11,7 +11,7 @@
 //! Convergence means a vanishing gradient: the cosine between the residuals and every free column, as in Dennis &
 //! Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
-pub use super::damped_step::Problem;
+pub use super::damped_step::LeastSquaresProblem;
 
 use super::damped_step::{Curvature, LinearizedProblem, ValleyExtrapolation, MIN_DAMPING};
 use crate::error::{check_length, Error, Result};
@@ -44,14 +44,14 @@ pub enum Status {
 
 /// Termination criteria.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Settings {
+pub struct MinimizationSettings {
     /// Maximum number of residual evaluations; 0 for the residuals of the initial guess without derivatives.
     pub evaluations: usize,
     /// Relative decrease of the cost by a Gauss–Newton step at convergence: the square of the cosine of the gradient.
     pub tolerance: f64,
 }
 
-impl Default for Settings {
+impl Default for MinimizationSettings {
     fn default() -> Self {
         Self { evaluations: 100, tolerance: 1e-10 }
     }
@@ -59,6 +59,7 @@ impl Default for Settings {
 
 /// Result of a minimization.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Minimum<P, E> {
     /// The best point.
     pub point: P,
@@ -88,13 +89,13 @@ fn cost(residuals: &[f64]) -> f64 {
 ///
 /// ```
 /// use ftlm::error::Result;
-/// use ftlm::estimation::optimization::levenberg_marquardt::{minimize, Settings};
-/// use ftlm::estimation::optimization::damped_step::Problem;
+/// use ftlm::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings};
+/// use ftlm::estimation::optimization::damped_step::LeastSquaresProblem;
 ///
 /// /// x² − 2.
 /// struct Root;
 ///
-/// impl Problem for Root {
+/// impl LeastSquaresProblem for Root {
 ///     type Point = f64;
 ///     type Evaluation = [f64; 1];
 ///     fn evaluate(&self, x: &f64) -> Result<[f64; 1]> {
@@ -112,15 +113,15 @@ fn cost(residuals: &[f64]) -> f64 {
 /// }
 ///
 /// # fn main() -> Result<()> {
-/// let found = minimize(&Root, 1.0, Settings::default())?;
+/// let found = minimize(&Root, 1.0, MinimizationSettings::default())?;
 /// assert!((found.point - 2.0_f64.sqrt()).abs() < 1e-9);
 /// # Ok(())
 /// # }
 /// ```
-pub fn minimize<P: Problem>(
+pub fn minimize<P: LeastSquaresProblem>(
     problem: &P,
     start: P::Point,
-    settings: Settings,
+    settings: MinimizationSettings,
 ) -> Result<Minimum<P::Point, P::Evaluation>> {
     let mut search = Search { problem, settings, evaluations: 1, gain: f64::INFINITY, hit: false, corners: false };
     let mut at = search.start(start)?;
@@ -159,7 +160,7 @@ pub fn minimize<P: Problem>(
 }
 
 /// State of the iteration: point, evaluation, Jacobian, damping and curvature.
-struct SearchState<P: Problem> {
+struct SearchState<P: LeastSquaresProblem> {
     point: P::Point,
     evaluation: P::Evaluation,
     cost: f64,
@@ -171,7 +172,7 @@ struct SearchState<P: Problem> {
     before: Option<(Vec<f64>, Vec<f64>)>,
 }
 
-impl<P: Problem> SearchState<P> {
+impl<P: LeastSquaresProblem> SearchState<P> {
     fn into_minimum(self, evaluations: usize, status: Status) -> Minimum<P::Point, P::Evaluation> {
         let Self { point, evaluation, cost, jacobian, .. } = self;
         Minimum { point, evaluation, cost, jacobian, evaluations, status }
@@ -187,7 +188,7 @@ enum Advance {
 /// Settings and progress of a minimization.
 struct Search<'a, P> {
     problem: &'a P,
-    settings: Settings,
+    settings: MinimizationSettings,
     evaluations: usize,
     /// Relative decrease of the cost by the last step.
     gain: f64,
@@ -197,7 +198,7 @@ struct Search<'a, P> {
     corners: bool,
 }
 
-impl<P: Problem> Search<'_, P> {
+impl<P: LeastSquaresProblem> Search<'_, P> {
     fn checked_jacobian(&self, point: &P::Point, evaluation: &P::Evaluation) -> Result<Vec<Vec<f64>>> {
         let jacobian = self.problem.jacobian(point, evaluation)?;
         let rows = self.problem.residuals(evaluation).len();

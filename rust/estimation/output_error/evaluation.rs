@@ -1,6 +1,6 @@
 //! Residuals at a point, and the elimination of the linear coefficients.
 
-use super::parameterization::Point;
+use super::parameterization::ParameterPoint;
 use crate::error::{Error, Result};
 use crate::linalg::dense;
 use crate::linalg::orthogonal::{norm, project_out};
@@ -12,7 +12,7 @@ pub(crate) const RANK_TOLERANCE: f64 = 1e-12;
 /// Residuals at a point, and intermediates `P` of each experiment for their derivatives.
 pub(crate) struct Evaluation<P> {
     /// The point, with optimal values of the linear coefficients.
-    pub(crate) point: Point,
+    pub(crate) point: ParameterPoint,
     pub(crate) residuals: Vec<f64>,
     /// Norm of the weighted measured samples.
     pub(crate) size: f64,
@@ -23,7 +23,7 @@ pub(crate) struct Evaluation<P> {
 
 impl<P> Evaluation<P> {
     /// Evaluation before any experiment.
-    pub(crate) fn empty(point: Point) -> Self {
+    pub(crate) fn empty(point: ParameterPoint) -> Self {
         let (residuals, initial, exponents) = (Vec::new(), Vec::new(), Vec::new());
         Self { point, residuals, size: 0.0, initial, exponents, parts: Vec::new() }
     }

@@ -6,7 +6,7 @@
 //! linearly interpolated signal.
 
 use super::experiment::Experiment;
-use super::parameterization::{FreeModel, Point};
+use super::parameterization::{FreeModel, ParameterPoint};
 use crate::equation::Structure;
 use crate::error::Result;
 use crate::fractional::kernels::first_coefficient;
@@ -36,7 +36,7 @@ impl Feedthrough {
         model: &FreeModel,
         experiment: &Experiment,
         structures: &[Structure],
-        point: &Point,
+        point: &ParameterPoint,
         acted: &[(Vec<f64>, Vec<f64>)],
     ) -> Result<Option<Self>> {
         let terms: Vec<Vec<bool>> = structures
@@ -120,7 +120,7 @@ pub(crate) fn add_feedthrough_derivative(
     model: &FreeModel,
     experiment: &Experiment,
     direct: &Feedthrough,
-    point: &Point,
+    point: &ParameterPoint,
     parameter: usize,
     column: &mut [f64],
 ) {
@@ -187,7 +187,13 @@ impl JumpCorrection {
     }
 
     /// Response of the first pulse minus the direct gain: outputs by signals, row-major.
-    fn gains(model: &FreeModel, step: f64, signals: usize, at_once: &[Vec<bool>], point: &Point) -> Result<Vec<f64>> {
+    fn gains(
+        model: &FreeModel,
+        step: f64,
+        signals: usize,
+        at_once: &[Vec<bool>],
+        point: &ParameterPoint,
+    ) -> Result<Vec<f64>> {
         let structures = model.structures(&point.orders);
         let n = structures.len();
         let solved = |leading: &dyn Fn(usize, usize) -> f64| -> Result<Vec<f64>> {
@@ -211,7 +217,7 @@ impl JumpCorrection {
         Ok(answered.iter().zip(direct).map(|(first, direct)| first - direct).collect())
     }
 
-    fn feedthrough_terms(model: &FreeModel, point: &Point) -> Vec<Vec<bool>> {
+    fn feedthrough_terms(model: &FreeModel, point: &ParameterPoint) -> Vec<Vec<bool>> {
         let structures = model.structures(&point.orders);
         let near = |s: &Structure| {
             s.terms.iter().map(|term| (s.order - term.order).abs() < FEEDTHROUGH_ORDER_TOLERANCE).collect()
@@ -244,7 +250,7 @@ impl JumpCorrection {
         &self,
         model: &FreeModel,
         experiment: &Experiment,
-        point: &Point,
+        point: &ParameterPoint,
         samples: &mut [f64],
     ) -> Result<()> {
         if self.jumps.iter().all(Option::is_none) {
@@ -264,7 +270,7 @@ impl JumpCorrection {
         &self,
         model: &FreeModel,
         experiment: &Experiment,
-        point: &Point,
+        point: &ParameterPoint,
         parameter: usize,
         column: &mut [f64],
     ) -> Result<()> {
@@ -273,7 +279,8 @@ impl JumpCorrection {
         }
         let at_once = Self::feedthrough_terms(model, point);
         let (orders, numbers) = (point.orders.len(), point.orders.len() + point.coefficients.len());
-        let gains = |point: &Point| Self::gains(model, experiment.record.step(), self.jumps.len(), &at_once, point);
+        let gains =
+            |point: &ParameterPoint| Self::gains(model, experiment.record.step(), self.jumps.len(), &at_once, point);
         if parameter >= numbers {
             let acting = model.inputs[parameter - numbers].signal;
             let mut gains = gains(point)?;
@@ -282,7 +289,7 @@ impl JumpCorrection {
             return Ok(());
         }
         let (mut up, mut down) = (point.clone(), point.clone());
-        let shift = |point: &mut Point, sign: f64| {
+        let shift = |point: &mut ParameterPoint, sign: f64| {
             let value = match parameter.checked_sub(orders) {
                 None => &mut point.orders[parameter],
                 Some(c) => &mut point.coefficients[c],

@@ -6,18 +6,19 @@ use super::evaluation::Evaluation;
 use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
 use super::integer_orders::{ExactSimulation, IntegerOrders};
-use super::parameterization::{Coordinate, FreeInput, FreeModel, Point, TimeUnit};
+use super::parameterization::{Coordinate, FreeInput, FreeModel, ParameterPoint, TimeUnit};
 use super::residuals::Linearization;
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::estimation::optimization::damped_step::Problem;
-use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings, Status};
+use crate::estimation::optimization::damped_step::LeastSquaresProblem;
+use crate::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings, Status};
 use crate::parallel::Stop;
 
 /// Optimum of an output-error fit.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Fit {
+#[non_exhaustive]
+pub struct OutputErrorFit {
     /// Free orders, coefficients and input parameters.
-    pub point: Point,
+    pub point: ParameterPoint,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
     /// Residuals (y − ŷ)/σ, ordered by record, then by output.
@@ -42,7 +43,7 @@ enum Simulation<'a> {
 }
 
 impl Simulation<'_> {
-    fn point(&self) -> &Point {
+    fn point(&self) -> &ParameterPoint {
         match self {
             Self::Pulses(evaluation) => &evaluation.point,
             Self::Exact(evaluation) => &evaluation.point,
@@ -94,11 +95,11 @@ struct OutputErrorProblem<'a> {
     stop: &'a Stop,
 }
 
-impl<'a> Problem for OutputErrorProblem<'a> {
-    type Point = Point;
+impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
+    type Point = ParameterPoint;
     type Evaluation = Simulation<'a>;
 
-    fn evaluate(&self, point: &Point) -> Result<Simulation<'a>> {
+    fn evaluate(&self, point: &ParameterPoint) -> Result<Simulation<'a>> {
         self.stop.check()?;
         if let Some(exact) = &self.exact {
             return exact.evaluate(self.model, self.experiments, point, &self.linear).map(Simulation::Exact);
@@ -107,7 +108,7 @@ impl<'a> Problem for OutputErrorProblem<'a> {
         self.model.evaluate(self.experiments, caches, point, linear).map(Simulation::Pulses)
     }
 
-    fn point_of_evaluation(&self, evaluation: &Simulation<'a>, _point: Point) -> Point {
+    fn point_of_evaluation(&self, evaluation: &Simulation<'a>, _point: ParameterPoint) -> ParameterPoint {
         evaluation.point().clone()
     }
 
@@ -119,7 +120,7 @@ impl<'a> Problem for OutputErrorProblem<'a> {
         evaluation.residuals()
     }
 
-    fn jacobian(&self, _point: &Point, evaluation: &Simulation<'a>) -> Result<Vec<Vec<f64>>> {
+    fn jacobian(&self, _point: &ParameterPoint, evaluation: &Simulation<'a>) -> Result<Vec<Vec<f64>>> {
         self.stop.check()?;
         match evaluation {
             Simulation::Exact(evaluation) => match &self.exact {
@@ -132,11 +133,11 @@ impl<'a> Problem for OutputErrorProblem<'a> {
         }
     }
 
-    fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+    fn apply_step(&self, point: &ParameterPoint, steps: &[f64]) -> (ParameterPoint, f64) {
         step_within_bounds(self.model, &self.time_unit, point, steps)
     }
 
-    fn coordinate_derivative(&self, point: &Point, parameter: usize) -> f64 {
+    fn coordinate_derivative(&self, point: &ParameterPoint, parameter: usize) -> f64 {
         parameter.checked_sub(point.orders.len()).filter(|j| *j < point.coefficients.len()).map_or(1.0, |j| {
             let factor = self.time_unit.factor(j, &point.orders);
             self.model.coordinates[j].derivative(factor * point.coefficients[j]) / factor
@@ -144,7 +145,7 @@ impl<'a> Problem for OutputErrorProblem<'a> {
     }
 
     /// Derivatives of the coefficients with respect to an order, at constant values in the unit of time.
-    fn coupled_derivatives(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
+    fn coupled_derivatives(&self, point: &ParameterPoint, parameter: usize) -> Vec<(usize, f64)> {
         if parameter >= point.orders.len() {
             return Vec::new();
         }
@@ -155,7 +156,7 @@ impl<'a> Problem for OutputErrorProblem<'a> {
     }
 
     /// Distance of a parameter from its bounds. Coefficients are bounded only if they keep their sign.
-    fn distance_to_bounds(&self, point: &Point, parameter: usize) -> (f64, f64) {
+    fn distance_to_bounds(&self, point: &ParameterPoint, parameter: usize) -> (f64, f64) {
         let behind = point.orders.len() + point.coefficients.len();
         let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
             (Some(order), _) => (*order, self.model.order_bounds[parameter]),
@@ -171,7 +172,7 @@ impl<'a> Problem for OutputErrorProblem<'a> {
     }
 
     /// True for input parameters: the response is piecewise linear in delays and limits.
-    fn has_kinks(&self, point: &Point, parameter: usize) -> bool {
+    fn has_kinks(&self, point: &ParameterPoint, parameter: usize) -> bool {
         parameter >= point.orders.len() + point.coefficients.len()
     }
 
@@ -180,7 +181,7 @@ impl<'a> Problem for OutputErrorProblem<'a> {
     }
 
     /// True if the grids resolve the dynamics of each equation. Unresolved modes would fit noise.
-    fn is_admissible(&self, point: &Point) -> bool {
+    fn is_admissible(&self, point: &ParameterPoint) -> bool {
         let is_resolved = match &self.exact {
             Some(exact) => exact.is_resolved(self.model, self.experiments, point),
             None => self.model.is_resolved(self.experiments, point),
@@ -201,7 +202,12 @@ impl<'a> Problem for OutputErrorProblem<'a> {
 ///
 /// Changes of orders are absolute. Those of coefficients are relative in the unit of time, those of input parameters
 /// relative to their interval.
-fn step_within_bounds(model: &FreeModel, clock: &TimeUnit, point: &Point, deltas: &[f64]) -> (Point, f64) {
+fn step_within_bounds(
+    model: &FreeModel,
+    clock: &TimeUnit,
+    point: &ParameterPoint,
+    deltas: &[f64],
+) -> (ParameterPoint, f64) {
     let mut next = point.clone();
     let mut moved: f64 = 0.0;
     let (orders, rest) = deltas.split_at(point.orders.len());
@@ -263,13 +269,18 @@ fn step_within_bounds(model: &FreeModel, clock: &TimeUnit, point: &Point, deltas
 ///     coupled: false,
 ///     initial: Initial::Rest,
 /// };
-/// let start = Point { orders: vec![1.0], coefficients: vec![1.0], inputs: vec![] };
-/// let found = fit(&model, &[experiment], &start, Settings::default())?;
+/// let start = ParameterPoint { orders: vec![1.0], coefficients: vec![1.0], inputs: vec![] };
+/// let found = fit(&model, &[experiment], &start, MinimizationSettings::default())?;
 /// assert!((found.point.orders[0] - 0.8).abs() < 1e-6 && (found.point.coefficients[0] - 3.0).abs() < 1e-6);
 /// # Ok(())
 /// # }
 /// ```
-pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+pub fn fit(
+    model: &FreeModel,
+    experiments: &[Experiment],
+    start: &ParameterPoint,
+    settings: MinimizationSettings,
+) -> Result<OutputErrorFit> {
     fit_until(model, experiments, start, settings, false, &Stop::default())
 }
 
@@ -280,7 +291,12 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
 ///
 /// # Errors
 /// As [`fit`].
-pub fn fit_stable(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+pub fn fit_stable(
+    model: &FreeModel,
+    experiments: &[Experiment],
+    start: &ParameterPoint,
+    settings: MinimizationSettings,
+) -> Result<OutputErrorFit> {
     fit_until(model, experiments, start, settings, true, &Stop::default())
 }
 
@@ -291,11 +307,11 @@ pub fn fit_stable(model: &FreeModel, experiments: &[Experiment], start: &Point, 
 pub fn fit_until(
     model: &FreeModel,
     experiments: &[Experiment],
-    start: &Point,
-    settings: Settings,
+    start: &ParameterPoint,
+    settings: MinimizationSettings,
     steady: bool,
     stop: &Stop,
-) -> Result<Fit> {
+) -> Result<OutputErrorFit> {
     check_length("orders", model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
     check_length("inputs", model.inputs.len(), start.inputs.len())?;
@@ -333,7 +349,7 @@ pub fn fit_until(
         stop,
     };
     let found = minimize(&problem, point, settings)?;
-    Ok(Fit {
+    Ok(OutputErrorFit {
         point: found.point,
         cost: found.cost,
         residuals: found.evaluation.residuals().to_vec(),
@@ -346,7 +362,7 @@ pub fn fit_until(
 }
 
 /// Check that an initial guess is finite and in the range of its coordinates.
-fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
+fn check_start(model: &FreeModel, start: &ParameterPoint) -> Result<()> {
     for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
         if !coordinate.contains(c) {
             return Err(Error::OutOfRange {

@@ -13,7 +13,7 @@ use std::rc::Rc;
 
 use super::evaluation::{solve_linear_steps, Evaluation, LinearSide, RANK_TOLERANCE};
 use super::experiment::Experiment;
-use super::parameterization::{FreeModel, InputLaw, Point};
+use super::parameterization::{FreeModel, InputLaw, ParameterPoint};
 
 use crate::error::{Error, Result};
 use crate::estimation::least_squares;
@@ -288,7 +288,7 @@ fn factorial(n: usize) -> f64 {
 impl IntegerOrders {
     /// Integer orders of a model at a point; None if an order is free or fractional, if equations are coupled, or if an
     /// experiment has a sensor filter, nonuniform samples, or an input that is neither held nor linear.
-    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &Point) -> Option<Self> {
+    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
         let structures = model.structures(&point.orders);
         let fixed = |weights: &[f64]| {
             weights.iter().zip(&model.order_bounds).all(|(w, (low, high))| *w == 0.0 || low.to_bits() == high.to_bits())
@@ -332,7 +332,7 @@ impl IntegerOrders {
     }
 
     /// True if the shortest sampling interval of the experiments resolves every pole.
-    pub(crate) fn is_resolved(&self, model: &FreeModel, experiments: &[Experiment], point: &Point) -> bool {
+    pub(crate) fn is_resolved(&self, model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> bool {
         let shortest_interval =
             experiments.iter().map(|e| e.record.step() * e.pulses_per_sample as f64).fold(f64::INFINITY, f64::min);
         self.equations.iter().enumerate().all(|(i, _)| {
@@ -343,7 +343,7 @@ impl IntegerOrders {
     }
 
     /// Coefficients of D^0 y … D^(n − 1) y of an equation.
-    fn own_coefficients(&self, model: &FreeModel, i: usize, point: &Point) -> Vec<f64> {
+    fn own_coefficients(&self, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
         let mut own = vec![0.0; self.equations[i].order];
         for &(k, nu) in &self.equations[i].own {
             own[nu] += model.equations[i].terms[k].2.at(&point.coefficients);
@@ -356,7 +356,7 @@ impl IntegerOrders {
         &self,
         model: &FreeModel,
         experiments: &'a [Experiment],
-        point: &Point,
+        point: &ParameterPoint,
         linear: &[usize],
     ) -> Result<Evaluation<ExactSimulation<'a>>> {
         let structures = model.structures(&point.orders);
@@ -416,7 +416,7 @@ impl IntegerOrders {
         &self,
         model: &FreeModel,
         experiment: &'a Experiment,
-        (point, linear): (&Point, &[usize]),
+        (point, linear): (&ParameterPoint, &[usize]),
         exponents: &[Vec<f64>],
         companions: &mut [Vec<Rc<Companion>>],
     ) -> Result<(ExactSimulation<'a>, Vec<(Option<usize>, Vec<f64>)>)> {
@@ -546,7 +546,7 @@ pub(crate) fn source_input<'a>(
     model: &FreeModel,
     experiment: &'a Experiment,
     signal: usize,
-    point: &Point,
+    point: &ParameterPoint,
 ) -> Result<SourceInput<'a>> {
     let record = &experiment.record;
     let (means, instants) = (record.signal(signal), &experiment.point_values[signal]);
@@ -622,7 +622,7 @@ impl ExactSimulation<'_> {
     }
 
     /// Samples of an equation from rest, without weights.
-    fn response(&self, orders: &IntegerOrders, model: &FreeModel, i: usize, point: &Point) -> Vec<f64> {
+    fn response(&self, orders: &IntegerOrders, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
         let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
         let mut samples = vec![0.0; self.equations[i].sources.first().map_or(0, |s| s.values.len())];
         for source in &self.equations[i].sources {
@@ -640,7 +640,7 @@ impl ExactSimulation<'_> {
         orders: &IntegerOrders,
         model: &FreeModel,
         experiment: &Experiment,
-        point: &Point,
+        point: &ParameterPoint,
         j: usize,
     ) -> Vec<f64> {
         let count = experiment.compared_count();
@@ -667,7 +667,7 @@ impl ExactSimulation<'_> {
         orders: &IntegerOrders,
         model: &FreeModel,
         experiment: &Experiment,
-        (i, point): (usize, &Point),
+        (i, point): (usize, &ParameterPoint),
         initial: &[Vec<f64>],
     ) -> Option<Vec<f64>> {
         let EquationSimulation { companion, sources } = &self.equations[i];
@@ -701,7 +701,7 @@ impl ExactSimulation<'_> {
         orders: &IntegerOrders,
         model: &FreeModel,
         experiment: &Experiment,
-        (j, point): (usize, &Point),
+        (j, point): (usize, &ParameterPoint),
         responses: &[Vec<f64>],
         column: &mut [f64],
     ) {
@@ -726,7 +726,7 @@ impl ExactSimulation<'_> {
         orders: &IntegerOrders,
         model: &FreeModel,
         experiment: &Experiment,
-        point: &Point,
+        point: &ParameterPoint,
         law: usize,
     ) -> Result<Vec<f64>> {
         let (count, input) = (experiment.compared_count(), model.inputs[law]);

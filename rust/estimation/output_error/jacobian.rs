@@ -6,7 +6,7 @@ use std::rc::Rc;
 use super::evaluation::Evaluation;
 use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
-use super::parameterization::{FreeModel, Point};
+use super::parameterization::{FreeModel, ParameterPoint};
 use super::residuals::Linearization;
 use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
@@ -43,7 +43,7 @@ impl FreeModel {
         experiment: &Experiment,
         shelf: &mut EvaluationCache,
         part: &Linearization,
-        point: &Point,
+        point: &ParameterPoint,
         initial: &[Vec<f64>],
         linear: &[usize],
         jacobian: &mut [Vec<f64>],
@@ -122,7 +122,7 @@ impl FreeModel {
     ///
     /// It multiplies the operator for a coefficient, its derivative for an order, and the derivative of the input for
     /// an input parameter.
-    fn right_hand_side_weight(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
+    fn right_hand_side_weight(&self, (i, k): (usize, usize), point: &ParameterPoint, parameter: usize) -> f64 {
         let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
         let (signal, order, monomial) = &equation.terms[k];
         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {

@@ -6,7 +6,7 @@
 
 use super::experiment::{Experiment, NonuniformSamples};
 use super::feedthrough::{Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
-use super::parameterization::{FreeModel, Point};
+use super::parameterization::{FreeModel, ParameterPoint};
 use crate::equation::Structure;
 
 /// Step of the central difference in an order, which has an error of 1e−10.
@@ -99,7 +99,7 @@ impl KinkCorrection {
         &self,
         model: &FreeModel,
         experiment: &Experiment,
-        point: &Point,
+        point: &ParameterPoint,
         direct: Option<&Feedthrough>,
     ) -> Vec<f64> {
         let weight = |c: &Kink| {
@@ -115,7 +115,7 @@ impl KinkCorrection {
         model: &FreeModel,
         experiment: &Experiment,
         direct: Option<&Feedthrough>,
-        point: &Point,
+        point: &ParameterPoint,
         parameter: usize,
         column: &mut [f64],
     ) {

@@ -21,7 +21,7 @@ mod residuals;
 pub mod stability;
 mod system_inverse;
 
-pub use crate::estimation::optimization::levenberg_marquardt::{Settings, Status};
+pub use crate::estimation::optimization::levenberg_marquardt::{MinimizationSettings, Status};
 pub use experiment::{Experiment, NonuniformSamples, PointValues};
-pub use fit::{fit, fit_stable, fit_until, Fit};
-pub use parameterization::{Coordinate, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, Point};
+pub use fit::{fit, fit_stable, fit_until, OutputErrorFit};
+pub use parameterization::{Coordinate, FreeEquation, FreeInput, FreeModel, InputLaw, Monomial, ParameterPoint};

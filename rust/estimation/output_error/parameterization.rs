@@ -109,7 +109,7 @@ pub struct FreeEquation {
 
 /// Values of all free parameters.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Point {
+pub struct ParameterPoint {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
@@ -241,7 +241,7 @@ impl FreeModel {
     }
 
     /// Order of each equation, and coefficients and orders of its autoregressive terms.
-    fn autoregressive_terms(&self, point: &Point) -> Vec<(f64, Vec<(f64, f64)>)> {
+    fn autoregressive_terms(&self, point: &ParameterPoint) -> Vec<(f64, Vec<(f64, f64)>)> {
         let own = |(structure, equation): (&Structure, &FreeEquation)| {
             let terms = structure.terms.iter().zip(&equation.terms);
             let own = terms.filter(|(term, _)| term.signal == structure.output);
@@ -251,7 +251,7 @@ impl FreeModel {
     }
 
     /// True if an equation is unstable; false for coupled equations, which are not checked.
-    pub(crate) fn is_unstable(&self, point: &Point) -> bool {
+    pub(crate) fn is_unstable(&self, point: &ParameterPoint) -> bool {
         let alone = !self.coupled || self.equations.len() == 1;
         alone && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
     }
@@ -261,7 +261,7 @@ impl FreeModel {
     /// The ratio of the divisor at the Nyquist frequency ([`nyquist_margin`]) to its leading coefficient is checked. If
     /// it is negative, the scheme has a mode that is unstable from pulse to pulse, near 0 one that hardly decays. A fit
     /// would use such a mode to follow noise.
-    pub(crate) fn is_resolved(&self, experiments: &[Experiment], point: &Point) -> bool {
+    pub(crate) fn is_resolved(&self, experiments: &[Experiment], point: &ParameterPoint) -> bool {
         if self.coupled && self.equations.len() > 1 {
             return true;
         }

@@ -12,7 +12,7 @@ use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
 use super::feedthrough::{add_feedthrough_derivative, Feedthrough, JumpCorrection};
 use super::kink_correction::KinkCorrection;
-use super::parameterization::{Coordinate, FreeModel, Point};
+use super::parameterization::{Coordinate, FreeModel, ParameterPoint};
 use super::system_inverse::{Operator, PulseMeans, SystemInverse};
 use crate::equation::Structure;
 use crate::error::{Error, Result};
@@ -20,7 +20,7 @@ use crate::estimation::least_squares;
 use crate::fractional::kernels::MAX_EXCESS;
 use crate::linalg::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
-use crate::series::{Buffers, Recursion, SumOfProducts};
+use crate::series::{Buffers, RunningSumSystem, SumOfProducts};
 
 /// Smallest difference of α and the order of an autoregressive term; at 0 the equation would be an identity.
 const MIN_INTEGRATION_ORDER: f64 = 1e-3;
@@ -48,7 +48,7 @@ impl FreeModel {
         &self,
         experiments: &[Experiment],
         shelves: &mut [EvaluationCache],
-        point: &Point,
+        point: &ParameterPoint,
         linear: &[usize],
     ) -> Result<Evaluation<Linearization>> {
         let structures = self.structures(&point.orders);
@@ -88,7 +88,7 @@ impl FreeModel {
         experiment: &Experiment,
         shelf: &mut EvaluationCache,
         structures: &[Structure],
-        point: &Point,
+        point: &ParameterPoint,
         linear: &[usize],
         out: &mut Evaluation<Linearization>,
     ) -> Result<RestSimulation> {
@@ -207,7 +207,7 @@ impl FreeModel {
         experiment: &Experiment,
         shelf: &mut EvaluationCache,
         operators: &[Vec<Rc<Operator>>],
-        point: &Point,
+        point: &ParameterPoint,
         acted: &[(Vec<f64>, Vec<f64>)],
     ) -> Result<(PulseMeans, Rc<SystemInverse>)> {
         let (record, n) = (&experiment.record, operators.len());
@@ -221,8 +221,12 @@ impl FreeModel {
                 Some((i, j, order, coefficient(i, k)))
             });
             let highest = orders.iter().copied().max().unwrap_or(0);
-            let solved =
-                SystemInverse::from_running_sums(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
+            let solved = SystemInverse::from_running_sums(RunningSumSystem::new(
+                n,
+                highest,
+                record.step(),
+                &own.collect::<Vec<_>>(),
+            )?);
             let mut response = vec![vec![0.0; m]; n];
             solved.inverse()?.solve_each(
                 (n, m),
@@ -367,7 +371,7 @@ impl FreeModel {
         experiment: &Experiment,
         shelf: &mut EvaluationCache,
         part: &Linearization,
-        point: &Point,
+        point: &ParameterPoint,
         coefficients: &[usize],
     ) -> Result<Vec<ParameterEffect>> {
         if coefficients.is_empty() {
@@ -439,7 +443,7 @@ impl Linearization {
         &self,
         parameter: usize,
         means: Vec<Vec<f64>>,
-        (model, experiment, point): (&FreeModel, &Experiment, &Point),
+        (model, experiment, point): (&FreeModel, &Experiment, &ParameterPoint),
     ) -> Result<ParameterEffect> {
         let mut samples = experiment.weighted_samples(&means);
         self.jump_correction.correct_slope(model, experiment, point, parameter, &mut samples)?;

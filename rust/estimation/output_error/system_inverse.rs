@@ -11,14 +11,16 @@ use crate::error::{Error, Result};
 use crate::fractional::kernels::{
     kernel, kernel_with_derivative, power_means, power_means_slope, power_pulses, power_pulses_slope,
 };
-use crate::series::{multiply, Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, MAX_SUMS, RIGHT_SIDE_LANES};
+use crate::series::{
+    multiply, Buffers, Kernel, RunningSumSystem, Solver, Source, SumOfProducts, MAX_SUMS, RIGHT_SIDE_LANES,
+};
 
 /// Representation of A⁻¹ at a point.
 pub(crate) enum Inverse {
     /// Spectra of the entries, and their length for products.
     Spectra { rows: Vec<Vec<Kernel>>, total: usize },
     /// Running sums, one solution per right-hand side.
-    Sums(Recursion),
+    Sums(RunningSumSystem),
 }
 
 /// Right-hand sides of the equations: sums of integrals of signals.
@@ -150,7 +152,7 @@ impl SystemInverse {
     }
 
     /// Inverse by running sums.
-    pub(crate) fn from_running_sums(sums: Recursion) -> Self {
+    pub(crate) fn from_running_sums(sums: RunningSumSystem) -> Self {
         Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), initial_responses: RefCell::default() }
     }
 

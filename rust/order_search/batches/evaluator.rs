@@ -310,7 +310,9 @@ pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 pub fn algorithm_version(candidates: u64, options: &Options) -> u64 {
     let bounded =
         options.criterion == Criterion::OutputError || (candidates >= MIN_BOX_CANDIDATES && !options.refines());
-    if options.pruning && bounded && matches!(options.estimator, Estimator::MultiInnovation(_)) {
+    if uses_close_bounds(candidates, options) {
+        7
+    } else if options.pruning && bounded && matches!(options.estimator, Estimator::MultiInnovation(_)) {
         6
     } else if options.pruning && bounded {
         5

@@ -123,7 +123,7 @@ struct SliceScreening<'a> {
     limit: f64,
 }
 
-impl simd::Kernel for SliceScreening<'_> {
+impl simd::SimdKernel for SliceScreening<'_> {
     type Output = Option<(Vec<OpenCandidate>, Vec<u64>, u64)>;
 
     #[inline(always)]

@@ -3,7 +3,9 @@
 //! The spectra of all regressors are computed once for all candidates.
 
 use crate::error::{Error, Result};
-use crate::estimation::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
+use crate::estimation::instrumental_variables::{
+    low_pass, power_frequency, refine, InstrumentSource, InstrumentalSettings, Scratch,
+};
 use crate::order_search::result::Failure;
 use crate::parallel::{self, Stop};
 use crate::regressors::{Bank, Index, Record};
@@ -24,13 +26,19 @@ struct RecordSpectra {
 /// Refinement of coefficients by instrumental variables.
 pub(crate) struct Refiner {
     spectra: Vec<RecordSpectra>,
-    settings: Settings,
+    settings: InstrumentalSettings,
 }
 
 impl Refiner {
     /// Compute the spectra of the columns of `banks`, which belong to the records' noise-free signals. Unusable after a
     /// stop request.
-    pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings, stop: &Stop) -> Self {
+    pub(crate) fn new(
+        records: &[Record],
+        output: usize,
+        banks: &[Bank],
+        settings: InstrumentalSettings,
+        stop: &Stop,
+    ) -> Self {
         let spectra = records
             .iter()
             .zip(banks)
@@ -62,12 +70,12 @@ impl Refiner {
         weights: &mut [f64],
         stop: &Stop,
     ) -> std::result::Result<(), Failure> {
-        let sources: Vec<Source<'_>> = self
+        let sources: Vec<InstrumentSource<'_>> = self
             .spectra
             .iter()
             .zip(banks)
             .zip(targets)
-            .map(|((shelf, bank), target)| Source {
+            .map(|((shelf, bank), target)| InstrumentSource {
                 own: positions.iter().map(|&p| shelf.kernels[p].as_ref().map(|k| (bank.kernel(p), k))).collect(),
                 measured: positions.iter().map(|&p| &shelf.columns[p]).collect(),
                 clean: positions.iter().map(|&p| &shelf.columns[p]).collect(),

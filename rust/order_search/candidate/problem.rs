@@ -60,7 +60,7 @@ struct BoundKernel<'a, F> {
     columns: F,
 }
 
-impl<'a, F> simd::Kernel for BoundKernel<'a, F>
+impl<'a, F> simd::SimdKernel for BoundKernel<'a, F>
 where
     F: Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
 {
@@ -83,7 +83,7 @@ struct InfeasibilityKernel<'a> {
     reach: &'a mut InfeasibilityProof,
 }
 
-impl simd::Kernel for InfeasibilityKernel<'_> {
+impl simd::SimdKernel for InfeasibilityKernel<'_> {
     type Output = bool;
 
     #[inline(always)]
@@ -101,7 +101,7 @@ struct TailoredVectorKernel<'a> {
     memory: &'a mut NormCache,
 }
 
-impl simd::Kernel for TailoredVectorKernel<'_> {
+impl simd::SimdKernel for TailoredVectorKernel<'_> {
     type Output = bool;
 
     #[inline(always)]
@@ -119,7 +119,7 @@ struct LinearizedVectorKernel<'a> {
     held: &'a mut VectorLookup,
 }
 
-impl simd::Kernel for LinearizedVectorKernel<'_> {
+impl simd::SimdKernel for LinearizedVectorKernel<'_> {
     type Output = bool;
 
     #[inline(always)]

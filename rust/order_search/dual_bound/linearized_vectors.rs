@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
-use crate::order_search::dual_bound::tailored_vectors::{sum_of_moduli, RoundingBounds};
+use crate::order_search::dual_bound::tailored_vectors::RoundingBounds;
 use crate::order_search::dual_bound::test_vectors::NO_INDEX;
 use crate::order_search::options::Norm;
 use crate::regressors::{Bank, Index, Key, Record};
@@ -18,8 +18,8 @@ use crate::simd;
 
 /// Maximum own terms of a candidate.
 pub(crate) const MAX_OWN_TERMS: usize = 4;
-/// Largest ratio of error to limit for which a vector is built. Candidates near one with a larger error are excluded by
-/// other bounds.
+/// Largest ratio of error to limit for which a vector is built. A vector for a candidate with a larger error covers the
+/// first samples only, whose error bounds that of all.
 const MAX_ERROR_LIMIT_RATIO: f64 = 4.0;
 /// Magnitude below which products stay finite.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
@@ -76,7 +76,7 @@ pub fn excluded_by_linearized_vector(
             remedy: "give both equations these".into(),
         });
     }
-    let made = tangents.fit((&banks, &targets), &positions[0], &made_for.coefficients, f64::INFINITY);
+    let made = tangents.fit((&banks, &targets), &positions[0], &made_for.coefficients, limit);
     tangents.add(own, made.into_iter().collect());
     Ok(tangents.excludes_candidate(&positions[1], &equation.coefficients, limit, &mut VectorLookup::default()))
 }
@@ -166,8 +166,8 @@ impl LinearizedVectors {
         self.ranges.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
     }
 
-    /// Build the vector of the candidate with these columns and coefficients. `None` if its error far exceeds the
-    /// limit, or on overflow.
+    /// Build the vector of the candidate with these columns and coefficients, over the samples up to which its error is
+    /// not far above the limit. `None` if there are none, or on overflow.
     pub(crate) fn fit(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -190,19 +190,24 @@ impl LinearizedVectors {
                 };
                 sum.iter_mut().zip(values).for_each(|(sum, x)| *sum += c * x);
             }
-            let error: Vec<f64> = divide(&driven, &divisor).ok()?.iter().zip(target).map(|(v, y)| y - v).collect();
-            let wanted: Vec<f64> = match self.rounding_bounds.norm {
-                Norm::L1 => error.iter().map(|e| if *e < 0.0 { -1.0 } else { 1.0 }).collect(),
-                Norm::L2 => error.clone(),
-            };
-            raw += match self.rounding_bounds.norm {
-                Norm::L1 => sum_of_moduli(&error),
-                Norm::L2 => error.iter().map(|e| e * e).sum(),
-            };
-            // This form of the condition also rejects NaN.
-            if !(raw <= MAX_ERROR_LIMIT_RATIO * limit && raw < f64::MAX) {
-                return None;
+            let mut wanted: Vec<f64> = Vec::new();
+            for (v, y) in divide(&driven, &divisor).ok()?.iter().zip(target) {
+                let error = y - v;
+                let (size, slope) = match self.rounding_bounds.norm {
+                    Norm::L1 => (error.abs(), if error < 0.0 { -1.0 } else { 1.0 }),
+                    Norm::L2 => (error * error, error),
+                };
+                // This form of the condition also rejects NaN.
+                if !(raw + size <= MAX_ERROR_LIMIT_RATIO * limit && raw + size < f64::MAX) {
+                    break;
+                }
+                raw += size;
+                wanted.push(slope);
             }
+            if wanted.is_empty() {
+                break;
+            }
+            divisor.truncate(wanted.len());
             // In reversed time, transposed operators become the operators themselves.
             let vector = divide(&backwards(&wanted), &divisor).ok()?;
             parts.push(RecordVectors {
@@ -222,10 +227,11 @@ impl LinearizedVectors {
         for (part, bank) in parts.iter_mut().zip(banks) {
             let vector = Kernel::new(&part.vectors[0]);
             for &(p, _) in &own {
-                let mut step = vec![0.0; part.divisor.len()];
-                Kernel::new(bank.kernel(p)).times(&vector, &mut step, &mut buffers);
+                let series = bank.kernel(p)[..part.divisor.len()].to_vec();
+                let mut step = vec![0.0; series.len()];
+                Kernel::new(&series).times(&vector, &mut step, &mut buffers);
                 part.first_order_terms.push(step);
-                part.series.push(bank.kernel(p).to_vec());
+                part.series.push(series);
             }
         }
         // Orthogonalize the terms. They are nearly collinear, with coefficients of opposite sign.
@@ -291,7 +297,8 @@ impl LinearizedVectors {
             let vectors: Vec<Vec<f64>> = part.vectors.iter().map(|v| backwards(v)).collect();
             let driven = (0..bank.len()).filter(|&p| self.input_index[p] != NO_INDEX);
             let columns = std::iter::once(&target[..]).chain(own.iter().map(|&(p, _)| bank.column(p)));
-            let columns: Vec<&[f64]> = columns.chain(driven.map(|p| bank.column(p))).collect();
+            let columns = columns.chain(driven.map(|p| bank.column(p)));
+            let columns: Vec<&[f64]> = columns.map(|column| &column[..part.divisor.len()]).collect();
             simd::dispatch_simd(Products { vectors: &vectors, columns: &columns, out: &mut products });
         }
         products
@@ -470,7 +477,7 @@ struct Products<'a> {
     out: &'a mut [f64],
 }
 
-impl simd::Kernel for Products<'_> {
+impl simd::SimdKernel for Products<'_> {
     type Output = ();
 
     #[inline(always)]

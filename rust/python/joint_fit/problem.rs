@@ -11,7 +11,7 @@ use crate::error::Error;
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::structure::Law;
 use crate::estimation::joint_fit::Iterate;
-use crate::estimation::output_error::Settings;
+use crate::estimation::output_error::MinimizationSettings;
 use crate::python::convert::{stack_rows, to_vectors, vector, List};
 use crate::python::errors::{run_attached, run_detached};
 use crate::python::estimation::{count_evaluated_pulses, experiment, status, ExperimentArg};
@@ -95,7 +95,7 @@ impl JointProblem {
             let what = format!("number {beyond} of {size} to be held");
             return Err(Error::Structure { what, remedy: "count them from 0".into() }.into());
         }
-        let (free, settings) = (Arc::clone(&self.inner), Settings { evaluations, tolerance });
+        let (free, settings) = (Arc::clone(&self.inner), MinimizationSettings { evaluations, tolerance });
         let points = count_evaluated_pulses(&experiments, evaluations);
         let found = run_interruptible(py, points, stop, move |stop| {
             free.problem_at(&place, plain, &held).minimize(&experiments, &place, settings, steady, stop)

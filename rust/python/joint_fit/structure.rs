@@ -4,7 +4,7 @@ use pyo3::prelude::*;
 
 use crate::error::Error;
 use crate::estimation::joint_fit::structure::{
-    Coefficient, Equation, FrictionParameters, Hints, Input, Law, Order, Structure, Term,
+    Coefficient, FrictionParameters, Hints, Input, Law, Order, ParametricEquation, ParametricStructure, ParametricTerm,
 };
 use crate::estimation::output_error::FreeInput;
 use crate::python::convert::{derived_signals, initial, DerivedArg, InitialArg, List};
@@ -73,14 +73,14 @@ fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> FrictionParameters {
 }
 
 /// Structure whose signals and coefficients exist.
-pub fn parse_structure(argument: StructureArg) -> PyResult<Structure> {
-    let term = |(signal, at, coefficient, factor): TermArg| Term {
+pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> {
+    let term = |(signal, at, coefficient, factor): TermArg| ParametricTerm {
         signal,
         order: order(at),
         coefficient: coefficient.into(),
         factor,
     };
-    let equation = |(output, at, terms, friction): EquationArg| Equation {
+    let equation = |(output, at, terms, friction): EquationArg| ParametricEquation {
         output,
         order: order(at),
         terms: terms.into_iter().map(term).collect(),
@@ -92,7 +92,7 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<Structure> {
     }
     let hints = argument.hints;
     let law = |(name, sign, factors): (String, f64, List<String>)| Law { name, sign, factors: factors.into() };
-    let found = Structure {
+    let found = ParametricStructure {
         signals: argument.signals.into(),
         derived: derived_signals(argument.derived)?,
         equations: argument.equations.into_iter().map(equation).collect(),

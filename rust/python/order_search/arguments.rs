@@ -5,7 +5,7 @@ use pyo3::types::PyDict;
 
 use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
-use crate::estimation::instrumental_variables::{with_projections, Settings};
+use crate::estimation::instrumental_variables::{with_projections, InstrumentalSettings};
 use crate::estimation::multi_innovation::{Innovation, RowBasis};
 use crate::order_search::control::{mismatch_error, BatchPosition, Checkpoint, Control};
 use crate::order_search::grid::independent::{OrderGrid, TermAxis};
@@ -68,7 +68,7 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
                 other => return Err(unknown(format!("norm '{other}' is not known"), "use l1 or l2").into()),
             },
             estimator: if given.iterations > 0 {
-                Estimator::InstrumentalVariables(Settings {
+                Estimator::InstrumentalVariables(InstrumentalSettings {
                     iterations: given.iterations,
                     tolerance: IV_CONVERGENCE_TOLERANCE,
                 })

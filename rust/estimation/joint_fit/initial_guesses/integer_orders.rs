@@ -18,12 +18,12 @@ use crate::estimation::joint_fit::objective::Objective;
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::{Candidate, Iterate};
 use crate::estimation::optimization::damped_step;
-use crate::estimation::optimization::levenberg_marquardt::{minimize, Settings};
+use crate::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings};
 use crate::estimation::output_error::evaluation::{self, solve_linear_steps, LinearSide, RANK_TOLERANCE};
 use crate::estimation::output_error::integer_orders::{
     source_input, Companion, ExactSimulation, IntegerOrders, SourceInput,
 };
-use crate::estimation::output_error::{Experiment, FreeModel, InputLaw, Monomial, Point};
+use crate::estimation::output_error::{Experiment, FreeModel, InputLaw, Monomial, ParameterPoint};
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 use crate::linalg::small::{polynomial_roots, EquilibratedLu};
 use crate::parallel::Stop;
@@ -77,7 +77,7 @@ struct Equation<'a> {
 /// Guess with its cost.
 struct Guess {
     cost: f64,
-    point: Point,
+    point: ParameterPoint,
     origin: String,
 }
 
@@ -98,7 +98,7 @@ pub fn integer_order_optima(
         && free.orders.is_empty()
         && (model.equations.len() == 1 || (!model.coupled && model.inputs.is_empty()))
         && model.inputs.iter().all(|input| input.law == InputLaw::Delay);
-    let start = Point {
+    let start = ParameterPoint {
         orders: Vec::new(),
         coefficients: vec![0.0; free.coefficients.len()],
         inputs: delays.first().cloned().unwrap_or_default(),
@@ -207,7 +207,7 @@ impl<'a> Equation<'a> {
     }
 
     /// Optima of the equation, best first.
-    fn optima(&self, start: &Point, delays: &[Vec<f64>]) -> Result<Vec<Guess>> {
+    fn optima(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Guess>> {
         let delays = self.likely_delays(start, delays)?;
         let mut lower: Vec<Vec<Vec<Pole>>> = vec![Vec::new(); delays.len()];
         let mut found = Vec::new();
@@ -216,7 +216,7 @@ impl<'a> Equation<'a> {
             let equation = self.at_order(order);
             let mut here = Vec::new();
             for (delay, poles) in delays.iter().zip(&mut lower) {
-                let begin = Point { inputs: delay.clone(), ..start.clone() };
+                let begin = ParameterPoint { inputs: delay.clone(), ..start.clone() };
                 let mut guesses = equation.instrumental_variables(&begin)?;
                 guesses.extend(equation.with_added_poles(&begin, poles)?);
                 let ends = equation.refine(guesses)?;
@@ -233,14 +233,14 @@ impl<'a> Equation<'a> {
     }
 
     /// Delays at which a filter of second order fits best: local minima of its cost.
-    fn likely_delays(&self, start: &Point, delays: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
+    fn likely_delays(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         if delays.len() <= CONTINUED_DELAYS {
             return Ok(if delays.is_empty() { vec![Vec::new()] } else { delays.to_vec() });
         }
         let equation = self.at_order(self.order().min(self.integrators + 2));
         let mut costs = Vec::with_capacity(delays.len());
         for delay in delays {
-            let point = Point { inputs: delay.clone(), ..start.clone() };
+            let point = ParameterPoint { inputs: delay.clone(), ..start.clone() };
             let mut least = f64::INFINITY;
             for ratio in [1.0, 4.0] {
                 if let Some(found) = equation.filtered_least_squares(&point, ratio * self.frequency)? {
@@ -255,7 +255,7 @@ impl<'a> Equation<'a> {
     }
 
     /// Guesses by state-variable filters and refined instrumental variables.
-    fn instrumental_variables(&self, start: &Point) -> Result<Vec<Guess>> {
+    fn instrumental_variables(&self, start: &ParameterPoint) -> Result<Vec<Guess>> {
         let mut guesses = Vec::new();
         for ratio in FILTER_RATIOS {
             let corner = ratio * self.frequency;
@@ -276,7 +276,7 @@ impl<'a> Equation<'a> {
     }
 
     /// Guesses with one real pole or one pair more than the optima of lower orders.
-    fn with_added_poles(&self, start: &Point, lower: &[Vec<Pole>]) -> Result<Vec<Guess>> {
+    fn with_added_poles(&self, start: &ParameterPoint, lower: &[Vec<Pole>]) -> Result<Vec<Guess>> {
         let mut guesses = Vec::new();
         for more in 1..=2_usize {
             let Some(poles) = lower.len().checked_sub(more).map(|k| &lower[k]) else { continue };
@@ -322,7 +322,7 @@ impl<'a> Equation<'a> {
             let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &guess.point) else { continue };
             let problem =
                 SectionsProblem { equation: self, exact, linear: self.model.linear_coefficients(), base: &guess.point };
-            let settings = Settings { evaluations: SECTION_EVALUATIONS, tolerance: COST_TOLERANCE };
+            let settings = MinimizationSettings { evaluations: SECTION_EVALUATIONS, tolerance: COST_TOLERANCE };
             let sections = self.sections(&self.poles(&guess.point));
             let start = [sections, guess.point.inputs.clone()].concat();
             match minimize(&problem, problem.clamp_to_bounds(start), settings) {
@@ -338,7 +338,7 @@ impl<'a> Equation<'a> {
     }
 
     /// Simulation at a point with its best input coefficients; None if it is not finite.
-    fn evaluate(&self, point: &Point) -> Result<Option<Evaluation<'a>>> {
+    fn evaluate(&self, point: &ParameterPoint) -> Result<Option<Evaluation<'a>>> {
         self.stop.check()?;
         let Some(exact) = IntegerOrders::of(&self.model, self.experiments, point) else { return Ok(None) };
         let linear = self.model.linear_coefficients();
@@ -346,24 +346,24 @@ impl<'a> Equation<'a> {
     }
 
     /// Coefficients of s^0 … s^(n − 1) of the divisor.
-    fn divisor(&self, point: &Point) -> Vec<f64> {
+    fn divisor(&self, point: &ParameterPoint) -> Vec<f64> {
         let own = self.own.iter().map(|&j| -point.coefficients[j]);
         std::iter::repeat_n(0.0, self.integrators).chain(own).collect()
     }
 
     /// Poles without the integrators.
-    fn poles(&self, point: &Point) -> Vec<Pole> {
+    fn poles(&self, point: &ParameterPoint) -> Vec<Pole> {
         let mut divisor = self.divisor(point)[self.integrators..].to_vec();
         divisor.push(1.0);
         polynomial_roots(&divisor).unwrap_or_default()
     }
 
-    fn is_stable(&self, point: &Point) -> bool {
+    fn is_stable(&self, point: &ParameterPoint) -> bool {
         let poles = self.poles(point);
         poles.len() == self.own.len() && poles.iter().all(|(re, _)| *re < 0.0)
     }
 
-    fn at_poles(&self, point: &Point, poles: &[Pole]) -> Point {
+    fn at_poles(&self, point: &ParameterPoint, poles: &[Pole]) -> ParameterPoint {
         let mut moved = point.clone();
         for (&j, c) in self.own.iter().zip(polynomial(poles)) {
             moved.coefficients[j] = -c;
@@ -372,7 +372,7 @@ impl<'a> Equation<'a> {
     }
 
     /// Point with unstable poles reflected and poles within the bounds of the sampling.
-    fn stabilize(&self, point: &Point) -> Point {
+    fn stabilize(&self, point: &ParameterPoint) -> ParameterPoint {
         let (fastest, slowest) = (MAX_FREQUENCY_STEP / self.step, MIN_POLE_DURATION / self.duration);
         let poles = self.poles(point);
         if poles.len() != self.own.len() {
@@ -406,7 +406,7 @@ impl<'a> Equation<'a> {
 
     /// Point from filtered samples by least squares: [s^n/F] y = Σ a_i [s^i/F] y + Σ b_j [s^j/F] u, F = (s + λ)^n.
     #[allow(clippy::type_complexity)]
-    fn filtered_least_squares(&self, start: &Point, corner: f64) -> Result<Option<Point>> {
+    fn filtered_least_squares(&self, start: &ParameterPoint, corner: f64) -> Result<Option<ParameterPoint>> {
         self.stop.check()?;
         let n = self.order();
         let filter: Vec<f64> = polynomial(&vec![(-corner, 0.0); n]).iter().map(|c| -c).collect();
@@ -470,7 +470,7 @@ impl<'a> Equation<'a> {
     }
 
     /// Improve a point by refined instrumental variables; None if it has no finite simulation.
-    fn refine_instruments(&self, start: &Point) -> Result<Option<Evaluation<'a>>> {
+    fn refine_instruments(&self, start: &ParameterPoint) -> Result<Option<Evaluation<'a>>> {
         let Some(mut here) = self.evaluate(start)? else { return Ok(None) };
         for _ in 0..INSTRUMENT_STEPS {
             let Some(step) = self.instrument_step(&here)? else { break };
@@ -602,7 +602,7 @@ struct SectionsProblem<'e, 'a> {
     equation: &'e Equation<'a>,
     exact: IntegerOrders,
     linear: Vec<usize>,
-    base: &'e Point,
+    base: &'e ParameterPoint,
 }
 
 impl SectionsProblem<'_, '_> {
@@ -640,7 +640,7 @@ impl SectionsProblem<'_, '_> {
     }
 }
 
-impl<'a> damped_step::Problem for SectionsProblem<'_, 'a> {
+impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
     type Point = Vec<f64>;
     type Evaluation = Evaluation<'a>;
 

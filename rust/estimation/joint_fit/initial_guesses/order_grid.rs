@@ -7,8 +7,8 @@ use crate::error::{Error, Result};
 use crate::estimation::joint_fit::format::format_general;
 use crate::estimation::joint_fit::parameter_set::{ParameterSet, ALPHA_BOUNDS, SEARCHED_ORDER};
 use crate::estimation::joint_fit::problem::{Candidate, Iterate};
-use crate::estimation::joint_fit::structure::{Equation, Law, Order, Structure, Term};
-use crate::estimation::output_error::Point;
+use crate::estimation::joint_fit::structure::{Law, Order, ParametricEquation, ParametricStructure, ParametricTerm};
+use crate::estimation::output_error::ParameterPoint;
 use crate::order_search::batches;
 use crate::order_search::control::Control;
 use crate::order_search::grid::{LawEquation, OrderGrid, OrderLawGrid, TermAxis};
@@ -70,7 +70,7 @@ impl GridSearch<'_> {
     }
 
     /// Best rows of a coarse order grid by least squares, at most `keep`.
-    pub(super) fn best_rows(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
+    pub(super) fn best_rows(&self, structure: &ParametricStructure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
         if !structure.has_order_law() {
             let tables: Result<Vec<_>> =
                 structure.equations.iter().map(|e| self.search_equation(structure, e, axes, keep)).collect();
@@ -81,7 +81,7 @@ impl GridSearch<'_> {
             return self.search_coupled(structure, axes, keep);
         }
         // Groups of equations without common orders are searched separately; their best rows are combined.
-        let table = |stage: &Structure| {
+        let table = |stage: &ParametricStructure| {
             let names = stage.order_names();
             let own: Axes = axes.iter().filter(|(name, _)| names.contains(name)).cloned().collect();
             self.best_rows(stage, &own, keep)
@@ -100,9 +100,9 @@ impl GridSearch<'_> {
 
     /// Best rows of coupled equations with an order law.
     #[allow(clippy::cast_precision_loss)]
-    fn search_coupled(&self, structure: &Structure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
+    fn search_coupled(&self, structure: &ParametricStructure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
         let (names, along): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
-        let law = |e: &Equation| LawEquation {
+        let law = |e: &ParametricEquation| LawEquation {
             output: e.output,
             order: e.order.affine(&names),
             terms: e.terms.iter().map(|t| (t.signal, t.order.affine(&names))).collect(),
@@ -110,8 +110,9 @@ impl GridSearch<'_> {
         let equations = &structure.equations;
         let laws: Vec<LawEquation> = equations.iter().map(law).collect();
         let fixed: Vec<Vec<Option<f64>>> = equations.iter().map(fixed_coefficients).collect();
-        let size =
-            |e: &Equation| self.records.iter().map(|r| standard_deviation(r.signal(e.output)) * r.m() as f64).sum();
+        let size = |e: &ParametricEquation| {
+            self.records.iter().map(|r| standard_deviation(r.signal(e.output)) * r.m() as f64).sum()
+        };
         let scales: Vec<f64> = equations.iter().map(size).collect();
         let lattice = OrderLawGrid::new(&along, &laws, self.inputs)?.with_fixed_coefficients(&fixed);
         let found = stage_join::search(self.records, &lattice, &fixed, &scales, &self.options(keep), &self.control())?;
@@ -126,8 +127,8 @@ impl GridSearch<'_> {
     /// Best rows of one equation with independent free orders.
     fn search_equation(
         &self,
-        structure: &Structure,
-        item: &Equation,
+        structure: &ParametricStructure,
+        item: &ParametricEquation,
         axes: &Axes,
         keep: usize,
     ) -> Result<Vec<GridRow>> {
@@ -136,7 +137,7 @@ impl GridSearch<'_> {
             Some(name) => axis_values(axes, name).to_vec(),
             None => vec![order.constant],
         };
-        let term = |t: &Term| TermAxis {
+        let term = |t: &ParametricTerm| TermAxis {
             signal: t.signal,
             values: axis(&t.order),
             interchangeable: t.order.is_free() && t.fixed_coefficient().is_none(),
@@ -160,7 +161,7 @@ impl GridSearch<'_> {
 }
 
 /// Combine rows of independent tables rank by rank; a shorter table repeats its last row.
-pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &Structure) -> Vec<GridRow> {
+pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &ParametricStructure) -> Vec<GridRow> {
     let wanted = structure.coefficient_names().len();
     let merged = |rank: usize| {
         let mut merged = GridRow::default();
@@ -172,18 +173,21 @@ pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &Structure) -> Ve
 }
 
 /// Free coefficients by name, from products of factor and coefficient.
-pub(super) fn named_coefficients<'a>(item: &'a Equation, raw: &'a [f64]) -> impl Iterator<Item = (String, f64)> + 'a {
+pub(super) fn named_coefficients<'a>(
+    item: &'a ParametricEquation,
+    raw: &'a [f64],
+) -> impl Iterator<Item = (String, f64)> + 'a {
     let pairs = item.terms.iter().zip(raw);
     pairs.filter_map(|(term, c)| Some((term.coefficient.name()?.clone(), c / term.factor)))
 }
 
 /// Products of factor and coefficient of the fixed terms; None for free ones.
-pub(super) fn fixed_coefficients(item: &Equation) -> Vec<Option<f64>> {
-    item.terms.iter().map(Term::fixed_coefficient).collect()
+pub(super) fn fixed_coefficients(item: &ParametricEquation) -> Vec<Option<f64>> {
+    item.terms.iter().map(ParametricTerm::fixed_coefficient).collect()
 }
 
 /// Reject friction in methods that are linear in the coefficients.
-pub(super) fn check_linear(structure: &Structure, item: &Equation, what: &str) -> Result<()> {
+pub(super) fn check_linear(structure: &ParametricStructure, item: &ParametricEquation, what: &str) -> Result<()> {
     if item.friction.is_none() {
         return Ok(());
     }
@@ -226,7 +230,10 @@ const ORDER_TOLERANCES: (f64, f64) = (1e-9, 1e-5);
 
 /// Candidate from orders and coefficients.
 pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &str) -> Candidate {
-    Candidate::at(Iterate { point: Point { orders, coefficients, inputs: Vec::new() }, states: Vec::new() }, origin)
+    Candidate::at(
+        Iterate { point: ParameterPoint { orders, coefficients, inputs: Vec::new() }, states: Vec::new() },
+        origin,
+    )
 }
 
 /// Candidate from the best row of an order grid; None if an earlier candidate has its orders.
@@ -376,7 +383,7 @@ pub(super) fn axis_values<'a>(axes: &'a Axes, name: &str) -> &'a [f64] {
 }
 
 /// Number of grid points of an equation, including invalid ones.
-fn candidate_count(equation: &Equation, axes: &Axes) -> u128 {
+fn candidate_count(equation: &ParametricEquation, axes: &Axes) -> u128 {
     let names: BTreeSet<&String> = equation.orders().flat_map(Order::names).collect();
     names.iter().fold(1, |size, name| size.saturating_mul(axis_values(axes, name).len() as u128))
 }
@@ -384,8 +391,8 @@ fn candidate_count(equation: &Equation, axes: &Axes) -> u128 {
 /// Groups of equations that share no free order, so that an order search can treat them separately.
 ///
 /// Equations tied by an order law form one group. Equations without free orders are omitted.
-pub(super) fn independent_groups(structure: &Structure) -> Vec<Structure> {
-    let mut groups: Vec<(BTreeSet<&String>, Vec<&Equation>)> = Vec::new();
+pub(super) fn independent_groups(structure: &ParametricStructure) -> Vec<ParametricStructure> {
+    let mut groups: Vec<(BTreeSet<&String>, Vec<&ParametricEquation>)> = Vec::new();
     for item in &structure.equations {
         let own: BTreeSet<&String> = item.orders().flat_map(Order::names).collect();
         let (mut names, mut together, mut apart) = (own.clone(), vec![item], Vec::new());
@@ -401,7 +408,7 @@ pub(super) fn independent_groups(structure: &Structure) -> Vec<Structure> {
         groups = apart;
     }
     let ordered = groups.into_iter().filter(|(names, _)| !names.is_empty());
-    let part = |(_, equations): (_, Vec<&Equation>)| Structure {
+    let part = |(_, equations): (_, Vec<&ParametricEquation>)| ParametricStructure {
         equations: equations.into_iter().cloned().collect(),
         laws: Vec::new(),
         ..structure.clone()
@@ -415,17 +422,19 @@ mod tests {
     use crate::equation::Initial;
     use crate::error::Result;
     use crate::estimation::joint_fit::parameter_set::ParameterSet;
-    use crate::estimation::joint_fit::structure::{Coefficient, Equation, Hints, Order, Structure, Term};
+    use crate::estimation::joint_fit::structure::{
+        Coefficient, Hints, Order, ParametricEquation, ParametricStructure, ParametricTerm,
+    };
 
     #[test]
     fn order_grid_is_within_bounds() -> Result<()> {
         let term = |signal, order| {
             let coefficient = Coefficient::Free(format!("c_{order}"));
-            Term { signal, order: Order::free(order), coefficient, factor: 1.0 }
+            ParametricTerm { signal, order: Order::free(order), coefficient, factor: 1.0 }
         };
         let terms = vec![term(0, "nu"), term(1, "beta")];
-        let equations = vec![Equation { output: 0, order: Order::free("alpha"), terms, friction: None }];
-        let structure = Structure {
+        let equations = vec![ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None }];
+        let structure = ParametricStructure {
             signals: vec!["y".into(), "u".into()],
             derived: Vec::new(),
             equations,

@@ -13,7 +13,7 @@ use crate::equation::{Initial, Structure as Bare, Term as BareTerm};
 use crate::error::Result;
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::Candidate;
-use crate::estimation::joint_fit::structure::{Equation, Structure, Term};
+use crate::estimation::joint_fit::structure::{ParametricEquation, ParametricStructure, ParametricTerm};
 use crate::estimation::resonance_scan::fit_with_fixed_poles;
 use crate::signal::statistics::median;
 
@@ -64,7 +64,8 @@ pub(super) fn scan_candidates(
         if has_duplicate_offset(&fixed) {
             continue;
         }
-        let scan = |(item, of): (&Equation, &Vec<f64>)| scan_equation(&fixed, item, coarse, median(of.clone()));
+        let scan =
+            |(item, of): (&ParametricEquation, &Vec<f64>)| scan_equation(&fixed, item, coarse, median(of.clone()));
         let scans = fixed.equations.iter().zip(frequencies).map(scan).collect::<Result<Vec<_>>>()?;
         let rows = merge_tables(&scans, structure);
         out.extend(
@@ -76,19 +77,19 @@ pub(super) fn scan_candidates(
 }
 
 /// True if an offset coincides with a given initial term: they are not separately identifiable.
-fn has_duplicate_offset(fixed: &Structure) -> bool {
+fn has_duplicate_offset(fixed: &ParametricStructure) -> bool {
     let given = match fixed.initial.under() {
         Initial::Powers(powers) if !fixed.history => powers,
         _ => return false,
     };
-    let offsets = |e: &Equation| fixed.initial.offset_exponents(e.order.constant);
+    let offsets = |e: &ParametricEquation| fixed.initial.offset_exponents(e.order.constant);
     fixed.equations.iter().flat_map(offsets).any(|power| given.iter().any(|e| (power - e).abs() < EXPONENT_TOLERANCE))
 }
 
 /// Autoregressive coefficients of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y; None if any is fixed.
 #[allow(clippy::cast_precision_loss)]
-fn resonance_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
-    let mut own: Vec<(usize, &Term)> = item.autoregressive_terms().enumerate().collect();
+fn resonance_coefficients(item: &ParametricEquation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
+    let mut own: Vec<(usize, &ParametricTerm)> = item.autoregressive_terms().enumerate().collect();
     own.sort_by(|(_, a), (_, b)| a.order.constant.total_cmp(&b.order.constant));
     let mut out = vec![(String::new(), 0.0); own.len()];
     let others = own.len().saturating_sub(1) as f64;
@@ -104,13 +105,13 @@ fn resonance_coefficients(item: &Equation, omega: f64, damping: f64) -> Option<V
 ///
 /// The scan is relative to `frequency` \[rad/s\]. Points are sorted by their root mean square output error.
 fn scan_equation(
-    structure: &Structure,
-    item: &Equation,
+    structure: &ParametricStructure,
+    item: &ParametricEquation,
     coarse: &GridSearch<'_>,
     frequency: f64,
 ) -> Result<Vec<GridRow>> {
-    let others: Vec<Term> = item.input_terms().cloned().collect();
-    let own: Vec<&Term> = item.autoregressive_terms().collect();
+    let others: Vec<ParametricTerm> = item.input_terms().cloned().collect();
+    let own: Vec<&ParametricTerm> = item.autoregressive_terms().collect();
     if others.is_empty() || own.is_empty() {
         return Ok(Vec::new());
     }
@@ -122,7 +123,7 @@ fn scan_equation(
     check_linear(structure, item, "what is linear in its coefficients")?;
     coarse.stop.check()?;
     // The Caputo exponents must be those of the full equation, including the autoregressive terms.
-    let rest = Equation { terms: others, ..item.clone() };
+    let rest = ParametricEquation { terms: others, ..item.clone() };
     let bare = Bare {
         output: rest.output,
         order: rest.order.constant,

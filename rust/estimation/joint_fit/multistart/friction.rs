@@ -15,7 +15,9 @@ use crate::estimation::joint_fit::format::format_general;
 use crate::estimation::joint_fit::objective::{Objective, Weights};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::{Candidate, Iterate};
-use crate::estimation::joint_fit::structure::{Coefficient, Equation, FrictionParameters, Order, Structure, Term};
+use crate::estimation::joint_fit::structure::{
+    Coefficient, FrictionParameters, Order, ParametricEquation, ParametricStructure, ParametricTerm,
+};
 use crate::recording::{Channel, Recording, Recordings, Role, Sampling};
 use crate::signal::nonuniform::interpolate_gaps;
 use crate::signal::statistics::{root_mean_square, white_noise_deviation};
@@ -103,12 +105,12 @@ fn run_on(free: &ParameterSet, source: &Recordings, course: MultistartContext<'_
 }
 
 /// Equations with friction.
-fn bodies(structure: &Structure) -> impl Iterator<Item = (&Equation, &FrictionParameters)> {
+fn bodies(structure: &ParametricStructure) -> impl Iterator<Item = (&ParametricEquation, &FrictionParameters)> {
     structure.equations.iter().filter_map(|item| Some((item, item.friction.as_ref()?)))
 }
 
 /// Return an error if a body with friction moves in no run.
-fn check_motion(structure: &Structure, source: &Recordings) -> Result<()> {
+fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<()> {
     for (item, _) in bodies(structure) {
         let still = |samples: &&[f64]| {
             let known = samples.iter().filter(|v| !v.is_nan());
@@ -131,11 +133,14 @@ fn check_motion(structure: &Structure, source: &Recordings) -> Result<()> {
 
 /// Structure with other friction.
 fn with_friction(
-    structure: &Structure,
+    structure: &ParametricStructure,
     other: impl Fn(&FrictionParameters) -> Option<FrictionParameters>,
-) -> Structure {
-    let of = |item: &Equation| Equation { friction: item.friction.as_ref().and_then(&other), ..item.clone() };
-    Structure { equations: structure.equations.iter().map(of).collect(), ..structure.clone() }
+) -> ParametricStructure {
+    let of = |item: &ParametricEquation| ParametricEquation {
+        friction: item.friction.as_ref().and_then(&other),
+        ..item.clone()
+    };
+    ParametricStructure { equations: structure.equations.iter().map(of).collect(), ..structure.clone() }
 }
 
 fn has_stribeck(friction: &FrictionParameters) -> bool {
@@ -166,10 +171,10 @@ pub(super) fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> 
 
 /// Structure and recordings of some equations alone, with measured signals as inputs.
 fn with_measured_inputs(
-    structure: &Structure,
+    structure: &ParametricStructure,
     source: &Recordings,
-    equations: Vec<Equation>,
-) -> Result<(Structure, Recordings)> {
+    equations: Vec<ParametricEquation>,
+) -> Result<(ParametricStructure, Recordings)> {
     let mut used: Vec<usize> = equations.iter().map(|item| item.output).collect();
     let outputs = used.len();
     let others = equations.iter().flat_map(|item| &item.terms).map(|term| term.signal);
@@ -178,17 +183,18 @@ fn with_measured_inputs(
     others.dedup();
     used.extend(others);
     let place = |signal: usize| used.iter().position(|&of| of == signal).unwrap_or_default();
-    let equation = |item: Equation| {
+    let equation = |item: ParametricEquation| {
         let output = place(item.output);
-        let mut terms: Vec<Term> =
-            item.terms.into_iter().map(|term| Term { signal: place(term.signal), ..term }).collect();
+        let mut terms: Vec<ParametricTerm> =
+            item.terms.into_iter().map(|term| ParametricTerm { signal: place(term.signal), ..term }).collect();
         terms.sort_by_key(|term| (term.signal != output, term.signal));
-        Equation { output, terms, ..item }
+        ParametricEquation { output, terms, ..item }
     };
-    let equations: Vec<Equation> = equations.into_iter().map(equation).collect();
+    let equations: Vec<ParametricEquation> = equations.into_iter().map(equation).collect();
     let channel = |run: &Recording, signal: usize| -> Result<Channel> {
         let place = place(signal);
-        let enters = |item: &Equation| item.output != place && item.terms.iter().any(|term| term.signal == place);
+        let enters =
+            |item: &ParametricEquation| item.output != place && item.terms.iter().any(|term| term.signal == place);
         Ok(Channel { enters_others: equations.iter().any(enters), ..run.channel(signal)?.clone() })
     };
     let is_filtered = source.runs().iter().any(|run| used.iter().any(|&signal| run.channels()[signal].is_filtered));
@@ -213,18 +219,21 @@ fn with_measured_inputs(
         alone.initial = *under;
     }
     alone.signals = used.iter().map(|&signal| structure.signals[signal].clone()).collect();
-    Ok((Structure { equations, coupled: false, ..alone }, Recordings::new(runs)?))
+    Ok((ParametricStructure { equations, coupled: false, ..alone }, Recordings::new(runs)?))
 }
 
 /// Structure and recordings with the sign of the measured velocity of each body as an input in place of its friction.
-fn with_measured_sign(structure: &Structure, source: &Recordings) -> Result<(Structure, Recordings)> {
+fn with_measured_sign(
+    structure: &ParametricStructure,
+    source: &Recordings,
+) -> Result<(ParametricStructure, Recordings)> {
     let (mut signed, first) = (structure.clone(), structure.signals.len());
     let moving: Vec<usize> = bodies(structure).map(|(item, _)| item.output).collect();
     let mut next = first;
     for item in &mut signed.equations {
         let Some(FrictionParameters { coulomb: (factor, coefficient), .. }) = item.friction.take() else { continue };
         signed.signals.push(format!("{SIGN_PREFIX}{}", signed.signals[item.output]));
-        item.terms.push(Term { signal: next, order: Order::number(0.0), coefficient, factor: -factor });
+        item.terms.push(ParametricTerm { signal: next, order: Order::number(0.0), coefficient, factor: -factor });
         next += 1;
     }
     let mut runs = Vec::new();
@@ -271,7 +280,11 @@ fn order_sets(free: &ParameterSet) -> Vec<Values> {
 }
 
 /// Orders, and coefficients of each equation without friction fitted by itself; 0 for those of the other equations.
-fn fit_frictionless_equations(structure: &Structure, course: MultistartContext<'_>, orders: &Values) -> Result<Values> {
+fn fit_frictionless_equations(
+    structure: &ParametricStructure,
+    course: MultistartContext<'_>,
+    orders: &Values,
+) -> Result<Values> {
     let mut values = orders.clone();
     values.extend(structure.coefficient_names().into_iter().map(|name| (name, 0.0)));
     for (item, &weight) in structure.equations.iter().zip(course.weights) {
@@ -279,7 +292,7 @@ fn fit_frictionless_equations(structure: &Structure, course: MultistartContext<'
             continue;
         }
         let (alone, source) = with_measured_inputs(structure, course.source, vec![item.clone()])?;
-        let alone = Structure { laws: Vec::new(), ..alone };
+        let alone = ParametricStructure { laws: Vec::new(), ..alone };
         let alone = ParameterSet::from_structure(alone.with_orders(orders)?)?;
         let reached = run_on(&alone, &source, MultistartContext { weights: &[weight], told: None, ..course })?;
         if let Some(best) = reached.first() {
@@ -344,7 +357,7 @@ fn loaded_body_guesses(
 fn fit_isolated_body(
     free: &ParameterSet,
     MultistartContext { source, stop, .. }: MultistartContext<'_>,
-    item: &Equation,
+    item: &ParametricEquation,
     values: &Values,
 ) -> Result<(Values, Values)> {
     let structure = &free.structure;
@@ -363,7 +376,7 @@ fn fit_isolated_body(
         usual.extend(term.order.names().map(|name| (name.clone(), 1.0)));
     }
     usual.extend(item.order.names().map(|name| (name.clone(), MAX_BODY_ORDER)));
-    let others = || structure.equations.iter().filter(|e| e.output != item.output).flat_map(Equation::orders);
+    let others = || structure.equations.iter().filter(|e| e.output != item.output).flat_map(ParametricEquation::orders);
     for (name, value) in &mut usual {
         let shared = others().any(|order| order.names().any(|of| of == name));
         if shared && !item.order.names().any(|of| of == name) {
@@ -388,10 +401,15 @@ fn value_at(values: &Values, name: &str) -> f64 {
 }
 
 /// Coefficients by which attached bodies act on a body, scaled by the inertia ratio.
-fn reaction_coefficients(structure: &Structure, item: &Equation, values: &Values, share: f64) -> Values {
-    let order = |term: &Term| term.order.at(|name| value_at(values, name));
-    let sorted = |of: &Equation, signal: usize| {
-        let mut terms: Vec<Term> = of.terms.iter().filter(|term| term.signal == signal).cloned().collect();
+fn reaction_coefficients(
+    structure: &ParametricStructure,
+    item: &ParametricEquation,
+    values: &Values,
+    share: f64,
+) -> Values {
+    let order = |term: &ParametricTerm| term.order.at(|name| value_at(values, name));
+    let sorted = |of: &ParametricEquation, signal: usize| {
+        let mut terms: Vec<ParametricTerm> = of.terms.iter().filter(|term| term.signal == signal).cloned().collect();
         terms.sort_by(|a, b| order(a).total_cmp(&order(b)));
         terms
     };
@@ -409,7 +427,7 @@ fn reaction_coefficients(structure: &Structure, item: &Equation, values: &Values
 }
 
 /// Coefficient of a term, multiplied by its factor.
-fn value_of(term: &Term, values: &Values) -> f64 {
+fn value_of(term: &ParametricTerm, values: &Values) -> f64 {
     number((term.factor, &term.coefficient), values)
 }
 
@@ -429,7 +447,7 @@ fn coulomb_guesses(
     runner: &Candidate,
 ) -> Result<Vec<Candidate>> {
     let (mut values, origin) = (values_of(signed, runner), &runner.origin);
-    let named: Vec<(&Equation, f64, &String)> = bodies(&free.structure)
+    let named: Vec<(&ParametricEquation, f64, &String)> = bodies(&free.structure)
         .filter_map(|(item, friction)| Some((item, friction.coulomb.0, friction.coulomb.1.name()?)))
         .collect();
     if named.is_empty() {
@@ -460,8 +478,9 @@ fn coulomb_guesses(
         Ok(found) => Candidate { result: found, origin: String::new(), duplicates: Vec::new() },
     };
     values.extend(values_of(&linear, &found));
-    let largest =
-        |(item, factor, _): &(&Equation, f64, _)| Ok(largest_input_force(grid.source(), item, &values)? / factor);
+    let largest = |(item, factor, _): &(&ParametricEquation, f64, _)| {
+        Ok(largest_input_force(grid.source(), item, &values)? / factor)
+    };
     let forces = named.iter().map(largest).collect::<Result<Vec<f64>>>()?;
     if forces.iter().any(|force| *force > 0.0) {
         for ratio in COULOMB_FORCE_RATIOS {
@@ -518,7 +537,7 @@ fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
 }
 
 /// Largest root-mean-square force of one input of a body, in the unit of D^α y.
-fn largest_input_force(source: &Recordings, item: &Equation, values: &Values) -> Result<f64> {
+fn largest_input_force(source: &Recordings, item: &ParametricEquation, values: &Values) -> Result<f64> {
     let mut largest: f64 = 0.0;
     for term in item.input_terms().filter(|term| !term.order.is_free() && term.order.constant == 0.0) {
         let known: Vec<f64> = source.samples(term.signal)?.concat().into_iter().filter(|v| !v.is_nan()).collect();

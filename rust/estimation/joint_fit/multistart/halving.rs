@@ -8,7 +8,7 @@ use crate::estimation::joint_fit::objective::{Objective, RELATIVE_COST_TOLERANCE
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::progress::ProgressListener;
-use crate::estimation::output_error::{Experiment, Settings};
+use crate::estimation::output_error::{Experiment, MinimizationSettings};
 use crate::parallel::Stop;
 
 /// Evaluations of every candidate. Then those near the best get [`SECOND_BUDGET_EVALUATIONS`].
@@ -133,7 +133,7 @@ struct Rung<'a> {
 impl Rung<'_> {
     /// Optimize one candidate; None if its simulation is not finite.
     fn optimize(&self, runner: &Candidate) -> Result<Option<Candidate>> {
-        let settings = Settings { evaluations: self.evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        let settings = MinimizationSettings { evaluations: self.evaluations, tolerance: RELATIVE_COST_TOLERANCE };
         let place = &runner.result.iterate;
         let turned = self.free.problem_at(place, false, &[]);
         match turned.minimize(self.experiments, place, settings, self.steady, self.stop) {
@@ -221,10 +221,10 @@ pub fn merge_duplicates(runners: &[Candidate], same: impl Fn(&Candidate, &Candid
 mod tests {
     use super::*;
     use crate::estimation::joint_fit::problem::{Iterate, OptimizationResult};
-    use crate::estimation::output_error::Point;
+    use crate::estimation::output_error::ParameterPoint;
 
     fn candidate_at(level: f64, order: f64) -> Candidate {
-        let point = Point { orders: vec![order], coefficients: vec![1.0], inputs: Vec::new() };
+        let point = ParameterPoint { orders: vec![order], coefficients: vec![1.0], inputs: Vec::new() };
         let attempt = OptimizationResult::initial_result(Iterate { point, states: Vec::new() });
         Candidate {
             result: OptimizationResult { cost: level, residuals: vec![0.0; 2], ..attempt },

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use crate::estimation::joint_fit::format::format_general;
 use crate::estimation::joint_fit::parameter_set::{ParameterSet, TimeScaling};
 use crate::estimation::joint_fit::problem::{Candidate, Iterate, OptimizationResult};
-use crate::estimation::joint_fit::structure::{Coefficient, Equation, Order};
-use crate::estimation::output_error::Point;
+use crate::estimation::joint_fit::structure::{Coefficient, Order, ParametricEquation};
+use crate::estimation::output_error::ParameterPoint;
 
 /// Submodel with one term removed or its coefficient fixed.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,10 +24,10 @@ impl ReducedProblem {
     /// Restrict a candidate of the full problem to this one.
     #[must_use]
     pub fn restrict(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
-        let Point { orders, coefficients, inputs } = &runner.result.iterate.point;
+        let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
         let order = |name: &String| whole.orders.iter().position(|o| o == name).map(|at| orders[at]);
         let value = |name: &String| whole.coefficients.iter().position(|c| c == name).map(|at| coefficients[at]);
-        let point = Point {
+        let point = ParameterPoint {
             orders: self.free.orders.iter().filter_map(order).collect(),
             coefficients: self.free.coefficients.iter().filter_map(value).collect(),
             inputs: inputs.clone(),
@@ -38,11 +38,11 @@ impl ReducedProblem {
     /// Embed a candidate in the full problem. The free order of a term with coefficient 0 is set to half the highest.
     #[must_use]
     pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
-        let Point { orders, coefficients, inputs } = &runner.result.iterate.point;
+        let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
         let known: BTreeMap<&String, f64> = self.free.orders.iter().zip(orders.iter().copied()).collect();
         let highest = self.order.at(|name| known.get(&name.to_owned()).copied().unwrap_or(0.0));
         let values: BTreeMap<&String, f64> = self.free.coefficients.iter().zip(coefficients.iter().copied()).collect();
-        let point = Point {
+        let point = ParameterPoint {
             orders: whole.orders.iter().map(|name| known.get(name).copied().unwrap_or(0.5 * highest)).collect(),
             coefficients: whole.coefficients.iter().map(|n| values.get(n).copied().unwrap_or(self.value)).collect(),
             inputs: inputs.clone(),
@@ -87,7 +87,7 @@ pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
             if let Coefficient::Free(name) = &term.coefficient {
                 let mut terms = item.terms.clone();
                 terms.remove(k);
-                let rest = Equation { terms, ..item.clone() };
+                let rest = ParametricEquation { terms, ..item.clone() };
                 add(structure.with_equation(place, rest), name, &item.order, 0.0, false);
             }
         }
@@ -209,7 +209,7 @@ impl FixedOrderProblem {
         values.remove(self.order);
         let (orders, rest) = values.split_at(self.free.orders.len());
         let (coefficients, inputs) = rest.split_at(self.free.coefficients.len());
-        let point = Point { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
+        let point = ParameterPoint { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
         Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
     }
 

@@ -16,7 +16,7 @@ use crate::error::Result;
 use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::Candidate;
-use crate::estimation::joint_fit::structure::{Equation, Structure};
+use crate::estimation::joint_fit::structure::{ParametricEquation, ParametricStructure};
 use crate::expression::{DerivedSignal, Values};
 use crate::fractional::kernels::grunwald_letnikov_weights;
 use crate::nonlinear::refuse_beside;
@@ -37,7 +37,7 @@ const MAX_START_PULSES_PER_SAMPLE: usize = 4;
 /// As [`run_multistart`]; [`crate::error::Error::Interrupted`].
 pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
-    let linear = ParameterSet::from_structure(Structure { derived: Vec::new(), ..structure.clone() })?;
+    let linear = ParameterSet::from_structure(ParametricStructure { derived: Vec::new(), ..structure.clone() })?;
     let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
     let sampling = coarse_sampling(free, course.source)?;
     let mut grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
@@ -115,13 +115,13 @@ fn embed(free: &ParameterSet, less: &ParameterSet, found: &[Candidate]) -> Resul
 }
 
 /// Problem without the non-linear terms; None if an equation has no others.
-fn without_nonlinear_terms(structure: &Structure) -> Option<ParameterSet> {
+fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterSet> {
     let recorded = structure.recorded_count();
-    let of = |item: &Equation| {
+    let of = |item: &ParametricEquation| {
         let terms = item.terms.iter().filter(|term| term.signal < recorded).cloned().collect();
-        Equation { terms, ..item.clone() }
+        ParametricEquation { terms, ..item.clone() }
     };
-    let less = Structure {
+    let less = ParametricStructure {
         signals: structure.signals[..recorded].to_vec(),
         derived: Vec::new(),
         equations: structure.equations.iter().map(of).collect(),
@@ -129,11 +129,11 @@ fn without_nonlinear_terms(structure: &Structure) -> Option<ParameterSet> {
     };
     let names = less.order_names();
     let bounds = less.bounds.iter().filter(|(name, _)| names.contains(name)).map(|(n, b)| (n.clone(), *b)).collect();
-    ParameterSet::from_structure(Structure { bounds, ..less }).ok()
+    ParameterSet::from_structure(ParametricStructure { bounds, ..less }).ok()
 }
 
 /// Recordings with the derived signals as measured ones, after smoothing of what is differentiated.
-fn with_derived_signals(structure: &Structure, source: &Recordings, half_width: usize) -> Result<Recordings> {
+fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, half_width: usize) -> Result<Recordings> {
     let of = |run: &Recording| {
         if run.has_nonuniform_samples() {
             return Err(refuse_beside("samples at times of their own", "resample the runs"));

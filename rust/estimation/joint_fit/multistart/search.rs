@@ -15,7 +15,7 @@ use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER
 use crate::estimation::joint_fit::parameter_set::{ParameterSet, TimeScaling};
 use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::progress::ProgressListener;
-use crate::estimation::joint_fit::structure::Structure;
+use crate::estimation::joint_fit::structure::ParametricStructure;
 use crate::parallel::Stop;
 use crate::recording::{Recordings, Sampling};
 
@@ -302,7 +302,7 @@ impl<'a> MultistartState<'a> {
         if structure.coupled || plain == structure.initial {
             return Ok(());
         }
-        let plain = ParameterSet::from_structure(Structure { initial: plain, ..structure.clone() })?;
+        let plain = ParameterSet::from_structure(ParametricStructure { initial: plain, ..structure.clone() })?;
         let mut ended = run_multistart(&plain, self.course.for_submodel())?;
         ended.truncate(MAX_FINAL_SURVIVORS);
         self.add(ended);

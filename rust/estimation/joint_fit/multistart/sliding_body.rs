@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::error::Result;
-use crate::estimation::joint_fit::structure::{Coefficient, Equation};
+use crate::estimation::joint_fit::structure::{Coefficient, ParametricEquation};
 use crate::fractional::kernels::{kernel, power_means};
 use crate::linalg::dense::triangular_factor;
 use crate::linalg::orthogonal::norm;
@@ -36,7 +36,11 @@ struct Part {
 ///
 /// # Errors
 /// As [`Recording::pulses`]; [`Error::Interrupted`](crate::error::Error::Interrupted).
-pub(super) fn fit_sliding_body(runs: &[Recording], item: &Equation, stop: &Stop) -> Result<BTreeMap<String, f64>> {
+pub(super) fn fit_sliding_body(
+    runs: &[Recording],
+    item: &ParametricEquation,
+    stop: &Stop,
+) -> Result<BTreeMap<String, f64>> {
     let Some((factor, Coefficient::Free(strength))) = item.friction.as_ref().map(|friction| &friction.coulomb) else {
         return Ok(BTreeMap::new());
     };
@@ -92,7 +96,7 @@ impl Part {
 }
 
 /// Least-squares solution with correct signs; empty if it is not finite.
-fn signed_least_squares(item: &Equation, parts: &[Part]) -> BTreeMap<String, f64> {
+fn signed_least_squares(item: &ParametricEquation, parts: &[Part]) -> BTreeMap<String, f64> {
     let (alpha, rows) = (item.order.constant, parts.iter().map(|part| part.sign.len()).sum());
     let stacked = |of: &dyn Fn(&Part) -> Vec<f64>| parts.iter().flat_map(of).collect::<Vec<f64>>();
     let mut target = stacked(&|part| part.record.signal(item.output).to_vec());
@@ -163,7 +167,7 @@ fn signed_least_squares(item: &Equation, parts: &[Part]) -> BTreeMap<String, f64
 mod tests {
     use super::*;
     use crate::equation;
-    use crate::estimation::joint_fit::structure::{FrictionParameters, Order, Term};
+    use crate::estimation::joint_fit::structure::{FrictionParameters, Order, ParametricTerm};
     use crate::friction::{Body, FrictionLaw};
     use crate::recording::{Channel, Role};
     use crate::signal::block_pulse::Intersample;
@@ -183,9 +187,13 @@ mod tests {
         let (y, u) = (Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold)));
         let run = Recording::new("run", step, None, vec![y, u], vec![0])?;
         let free = |name: &str| Coefficient::Free(name.into());
-        let term =
-            |signal, order, name| Term { signal, order: Order::number(order), coefficient: free(name), factor: 1.0 };
-        let item = Equation {
+        let term = |signal, order, name| ParametricTerm {
+            signal,
+            order: Order::number(order),
+            coefficient: free(name),
+            factor: 1.0,
+        };
+        let item = ParametricEquation {
             output: 0,
             order: Order::number(2.0),
             terms: vec![term(0, 1.0, "v"), term(1, 0.0, "b"), term(0, 0.0, "k")],

@@ -63,7 +63,7 @@ impl Interval {
 }
 
 /// Result of a search for a bound.
-pub enum Outcome {
+pub enum BoundOutcome {
     /// The interval on this side of the optimum.
     Found(Interval),
     /// The budget is exhausted, or the search was cancelled.
@@ -143,11 +143,11 @@ impl BoundSearch {
         around: &ProfileLikelihood<'_>,
         allowed: usize,
         is_cancelled: &dyn Fn() -> bool,
-    ) -> Result<Outcome> {
+    ) -> Result<BoundOutcome> {
         while self.refits < MAX_REFITS_PER_BOUND && (self.origin.is_some() || self.way > self.inside) {
             around.stop().check()?;
             if is_cancelled() {
-                return Ok(Outcome::Paused);
+                return Ok(BoundOutcome::Paused);
             }
             let origin = self.origin.take().unwrap_or_else(|| self.within.clone());
             let lap = MAX_REFIT_EVALUATIONS.min(allowed.saturating_sub(self.evaluations));
@@ -158,7 +158,7 @@ impl BoundSearch {
             let there = match refit {
                 Refit::Lower(lower) => {
                     self.evaluations += lower.evaluations;
-                    return Ok(Outcome::Lower(lower.values()));
+                    return Ok(BoundOutcome::Lower(lower.values()));
                 }
                 Refit::Optimum(there) => Some(there),
                 Refit::Infeasible => None,
@@ -168,17 +168,17 @@ impl BoundSearch {
             if lap < MAX_REFIT_EVALUATIONS && took >= lap {
                 // A refit that is cut short tells nothing.
                 self.origin = Some(there.unwrap_or(origin));
-                return Ok(Outcome::Paused);
+                return Ok(BoundOutcome::Paused);
             }
             self.refits += 1;
             if let Some(distance) = self.step(around, there) {
-                return Ok(Outcome::Found(self.side_of(self.start + self.side * distance)));
+                return Ok(BoundOutcome::Found(self.side_of(self.start + self.side * distance)));
             }
         }
         // A bound between two points of which the outer one has a cost; else the cost never rose that far.
         let risen = self.outside.is_finite() && self.points.iter().any(|(_, rise)| *rise >= self.width * self.width);
         let bound = if risen { self.start + self.side * self.outside } else { self.side * f64::INFINITY };
-        Ok(Outcome::Found(self.side_of(bound)))
+        Ok(BoundOutcome::Found(self.side_of(bound)))
     }
 
     /// Interval on this side of the optimum.

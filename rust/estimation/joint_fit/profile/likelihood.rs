@@ -5,7 +5,7 @@ use crate::estimation::joint_fit::covariance::{covariance, covariance_of_residua
 use crate::estimation::joint_fit::objective::{Objective, Weights, RELATIVE_COST_TOLERANCE};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::{Iterate, OptimizationResult};
-use crate::estimation::output_error::Settings;
+use crate::estimation::output_error::MinimizationSettings;
 use crate::linalg::dense::{self, SingularValues};
 use crate::linalg::orthogonal::norm;
 use crate::parallel::Stop;
@@ -401,7 +401,7 @@ fn minimize(
     (evaluations, tolerance): (usize, f64),
 ) -> Result<OptimizationResult> {
     let start = Iterate { point: free.problem.point(values)?, states: Vec::new() };
-    let (problem, settings) = (free.problem_at(&start, true, held), Settings { evaluations, tolerance });
+    let (problem, settings) = (free.problem_at(&start, true, held), MinimizationSettings { evaluations, tolerance });
     problem.minimize(grid.experiments(), &start, settings, grid.requires_stability, grid.stop())
 }
 

@@ -14,7 +14,7 @@ use crate::error::Result;
 use crate::parallel::pool;
 use crate::signal::statistics::median;
 
-pub use bound_search::{BoundSearch, Interval, Outcome};
+pub use bound_search::{BoundOutcome, BoundSearch, Interval};
 pub use likelihood::{CostSurface, FitState, ProfileLikelihood, MAX_REFIT_EVALUATIONS};
 
 use bound_search::MAX_REFITS_PER_BOUND;
@@ -151,13 +151,13 @@ fn search_bounds(
             break;
         }
         let (send, receive) = channel();
-        let mut outcomes: Vec<Option<Outcome>> = (0..total).map(|_| None).collect();
+        let mut outcomes: Vec<Option<BoundOutcome>> = (0..total).map(|_| None).collect();
         workers.in_place_scope(|scope| {
             for (k, search) in searches.iter_mut().enumerate().filter(|(k, _)| bounds[*k].1.is_none()) {
                 let (send, allowed, first_lower) = (send.clone(), took[k] + share, &first_lower);
                 scope.spawn(move |_| {
                     let found = search.advance(around, allowed, &|| first_lower.load(Ordering::Relaxed) < k);
-                    if matches!(found, Ok(Outcome::Lower(_))) {
+                    if matches!(found, Ok(BoundOutcome::Lower(_))) {
                         first_lower.fetch_min(k, Ordering::Relaxed);
                     }
                     drop(send.send((k, found)));
@@ -167,7 +167,7 @@ fn search_bounds(
             let mut done = total - open;
             for (k, found) in receive {
                 let found = found.inspect_err(|_| around.stop().set())?;
-                if let Outcome::Found(_) = found {
+                if let BoundOutcome::Found(_) = found {
                     done += 1;
                     report(done, total).inspect_err(|_| around.stop().set())?;
                 }
@@ -179,9 +179,9 @@ fn search_bounds(
             let Some(outcome) = outcome else { continue };
             took[k] = searches[k].evaluations();
             match outcome {
-                Outcome::Found(interval) => bounds[k].1 = Some(interval),
-                Outcome::Paused => {}
-                Outcome::Lower(values) => {
+                BoundOutcome::Found(interval) => bounds[k].1 = Some(interval),
+                BoundOutcome::Paused => {}
+                BoundOutcome::Lower(values) => {
                     lower = Some(values);
                     break;
                 }

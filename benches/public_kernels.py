@@ -1,0 +1,104 @@
+"""Functions of ftlm.kernels and operational matrices beside NumPy and SciPy.
+
+``python benches/public_kernels.py [--write]`` prints processor times of one thread; ``--write`` writes them to
+benches/results.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import fftconvolve
+
+import ftlm
+from ftlm import _core, kernels
+from results import heading, save
+from search import plant_a_run
+
+M, STEP, ORDER, SIGNALS = 2048, 10.0 / 2048, 0.85, 256
+#: Candidates that are scored without a limit.
+SCORED = 512
+
+
+def shortest(work: Callable[[], object], seconds: float = 0.5) -> float:
+    """Shortest processor time of a call [s], after a first one that is not counted."""
+    work()
+    best, spent = np.inf, 0.0
+    while spent < seconds:
+        start = time.process_time()
+        work()
+        each = time.process_time() - start
+        best, spent = min(best, each), spent + each
+    return best
+
+
+def main() -> None:
+    """Time, compare, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help="write benches/results.json")
+    given = parser.parse_args()
+    lines: list[str] = []
+
+    def say(text: str) -> None:
+        lines.append(text)
+        print(text, flush=True)
+
+    say(f"{heading()}, processor time")
+    random = np.random.default_rng(1)
+    x = random.standard_normal((SIGNALS, M))
+    kernel = kernels.block_pulse_kernel(ORDER, M, step=STEP)
+    spectrum = np.fft.rfft(kernel, 2 * M)
+
+    def prepared() -> np.ndarray:
+        return np.fft.irfft(np.fft.rfft(x, 2 * M, axis=-1) * spectrum, 2 * M, axis=-1)[:, :M]
+
+    assert np.allclose(kernels.integrate(x, ORDER, step=STEP), prepared(), atol=1e-10)
+    ours, numpy_time = shortest(lambda: kernels.integrate(x, ORDER, step=STEP)), shortest(prepared)
+    scipy_time = shortest(lambda: fftconvolve(x, kernel[None], axes=-1)[:, :M])
+    say(
+        f"integrate, {SIGNALS} signals of {M}: {ours / SIGNALS * 1e6:.1f} us a signal; NumPy with a prepared spectrum "
+        f"{numpy_time / SIGNALS * 1e6:.1f} us, ratio {ours / numpy_time:.2f}; SciPy's fftconvolve "
+        f"{scipy_time / SIGNALS * 1e6:.1f} us"
+    )
+    first, row = np.concatenate([[1.0], random.standard_normal(M - 1) / M]), np.zeros(M)
+    row[0] = first[0]
+    assert np.allclose(kernels.toeplitz_solve(first, x[0]), solve_toeplitz((first, row), x[0]))
+    ours = shortest(lambda: kernels.toeplitz_solve(first, x[0]))
+    scipy_time = shortest(lambda: solve_toeplitz((first, row), x[0]))
+    say(
+        f"toeplitz_solve, {M}: {ours * 1e6:.0f} us; SciPy's solve_toeplitz {scipy_time * 1e6:.0f} us, "
+        f"{scipy_time / ours:.0f} times ours"
+    )
+    ours, dense = (shortest(lambda of=of: _core.operational_matrix(ORDER, M, STEP, dense=of)) for of in (False, True))
+    phi, square = ftlm.haar_matrix(M), ftlm.block_pulse_matrix(ORDER, M, step=STEP)
+    numpy_time = shortest(lambda: phi @ square @ phi.T)
+    say(
+        f"operational matrix of {M} Haar functions, which the Toeplitz structure gives: {ours * 1e3:.0f} ms; dense "
+        f"products by faer {dense * 1e3:.0f} ms, {dense / ours:.0f} times ours; by NumPy {numpy_time * 1e3:.0f} ms"
+    )
+    ours, dense = shortest(lambda: kernels.integrate(x, ORDER, step=STEP)), shortest(lambda: x @ square)
+    assert np.allclose(kernels.integrate(x, ORDER, step=STEP), x @ square, atol=1e-10)
+    say(
+        f"operational matrix of {M} block pulses times {SIGNALS} signals: {ours * 1e3:.1f} ms as Toeplitz products; "
+        f"dense product by NumPy {dense * 1e3:.1f} ms, {dense / ours:.1f} times ours"
+    )
+    run = plant_a_run()
+    means = np.stack([kernels.pulse_means(run[name], M, hold=name == "I1") for name in ("theta12", "theta11", "I1")])
+    plan = kernels.Candidates(means, [0, 1, 0, 2], output=0, step=STEP)
+    alpha = random.uniform(1.05, 2.0, SCORED)
+    shares = np.sort(random.uniform(0.0, 0.95, (SCORED, 2)))
+    orders = np.column_stack([alpha, alpha * shares[:, 1], alpha * shares[:, 0], alpha * shares[:, 0] * 0.5, 0 * alpha])
+    plan.score(orders)
+    ours = shortest(lambda: plan.score(orders))
+    say(f"Candidates.score without a limit, {SCORED} order tuples of four terms: {ours / SCORED * 1e6:.1f} us each")
+
+    if given.write:
+        save([f"- {line}" for line in lines])
+
+
+if __name__ == "__main__":
+    main()
