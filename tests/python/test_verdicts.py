@@ -22,8 +22,16 @@ from ftlm.reproduction.optimizer_comparison import (
     seeds_for,
     simulated_panel,
 )
-from ftlm.reproduction.published_models import one_angle, papers_current, printed_numbers, run_printed_models
-from ftlm.reproduction.published_values import PRIOR_GRID, as_printed, implied_spreads, papers_record
+from ftlm.reproduction.published_values import (
+    PRIOR_GRID,
+    as_printed,
+    implied_spreads,
+    one_angle,
+    papers_current,
+    papers_record,
+    printed_numbers,
+    run_printed_models,
+)
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, demo_run
 from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
 from ftlm.simulation.discretization import prepare
@@ -244,13 +252,14 @@ def test_rivals_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(h
     assert made.candidates == 224
     # The maker's 2271 is not the middle of anything.
     other = compare_optimizers(run, replace(single, reference={"a3": 1.0, "b3": 1.0}), lattice, settings, threads=1)
-    assert made.genetic.bounds == made.evolution.bounds == other.genetic.bounds
-    assert made.genetic.errors == other.genetic.errors
-    assert 400 <= made.genetic.evaluations[0] <= 600
-    assert 400 <= made.evolution.evaluations[0] < 400 + 15 * 8
+    genetic, evolution = made.optimizers.values()
+    assert genetic.bounds == evolution.bounds == other.optimizers["genetic"].bounds
+    assert genetic.errors == other.optimizers["genetic"].errors
+    assert 400 <= genetic.evaluations[0] <= 600
+    assert 400 <= evolution.evaluations[0] < 400 + 15 * 8
     # With the data alone to decide the lattice is better than both, with K0 = 1 it is worse.
     strong, weak = (search.score for search in made.order_grid.values())
-    assert weak < min(made.genetic.errors[0], made.evolution.errors[0]) < strong
+    assert weak < min(genetic.errors[0], evolution.errors[0]) < strong
 
 
 def test_differential_evolution_finds_what_is_there_and_the_same_again():

@@ -207,7 +207,7 @@ def run_demo(
             for output in work.measured.outputs
         ]
         demo.results[stage] = {label: c.result for label, c in models.items() if c.result is not None}
-        demo.traces.update(work.traces(models))
+        demo.traces.update(work.traces({p: models[f"p = {p}"].model for p in INNOVATION_LENGTHS}))
         demo.derived[stage] = work.dropped_derivative(models["output error"].model)
         for stem, label in SAVED_MODELS.items():
             demo.files.append(folder / f"stage{stage}-{stem}.json")

@@ -3,40 +3,42 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
 from ftlm.arm.flexible_link import flexible_link, integer_order, link_model
 from ftlm.data.run import Run
-from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_evolution_search, genetic_search
+from ftlm.estimation.genetic import GeneticAlgorithm, differential_evolution_search, genetic_search
 from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
 from ftlm.estimation.methods import OutputError
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import improves_prediction, is_degenerate
 from ftlm.kernels import pulse_means
-from ftlm.order_search.result import SearchResult
-from ftlm.order_search.search import rank_orders
+from ftlm.model.model import Model
 from ftlm.reproduction.published_values import INNOVATION_LENGTHS
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
 from ftlm.reproduction.stage_result import (
     GRID_ALPHA,
-    MULTI_INNOVATION_LABELS,
     PRIOR_COVARIANCES,
     RIVAL_ALPHA,
-    SEARCH_OPTIONS,
     TRACE_EVERY,
+    Rival,
     Stage,
+    best_orders,
+    integer_orders,
     published_structure,
 )
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.simulate import explicit_euler
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
-from ftlm.validation.comparison import Comparison, compare_means, finite, metrics
+from ftlm.utils.formatting import symbol
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import Comparison, attributes, compare_means, metrics
 
 #: Largest and smallest number of seeds, and most evaluations of one optimizer on one angle over all seeds.
 MAX_SEEDS, MIN_SEEDS, MAX_EVALUATIONS = 10, 3, 40_000
@@ -47,19 +49,10 @@ CONTEST_STEP = 0.1
 CONVERGENCE_MARGIN = 0.02
 #: Joint fits use every fourth sample: 8 ms on the virtual rig, a fifteenth of the fastest link mode's period.
 ROW_STRIDE = 4
+#: Joint fits by output error.
+JOINT_METHOD = OutputError(loss="squares", intervals="auto", noise="white")
 #: Increment of the order grids of trials.
 PANEL_STEP = 0.25
-
-
-@dataclass(frozen=True)
-class OptimizerComparison:
-    """Results on one equation: multi-innovation with p = 7 by K0, genetic algorithm, differential evolution."""
-
-    settings: GeneticAlgorithm
-    candidates: int
-    order_grid: dict[float, SearchResult]
-    genetic: GeneticRun
-    evolution: GeneticRun
 
 
 def rivals_order_grid(increment: float, smallest: float = CONTEST_STEP) -> OrderGrid:
@@ -72,17 +65,6 @@ def seeds_for(candidates: int) -> tuple[int, ...]:
     return tuple(range(min(MAX_SEEDS, max(MIN_SEEDS, MAX_EVALUATIONS // max(candidates, 1)))))
 
 
-def _best_orders(run: Run, single: Structure, grid: OrderGrid, p: int, prior: float, **work: Any) -> SearchResult:
-    """Return the best candidate of multi-innovation on an order grid."""
-    options: dict[str, Any] = {
-        **SEARCH_OPTIONS,
-        "coefficients": "multi-innovation",
-        "innovation_length": p,
-        "prior_covariance": prior,
-    }
-    return rank_orders(run, single, grid, top=1, **options, **work)
-
-
 def compare_optimizers(
     run: Run,
     single: Structure,
@@ -91,8 +73,10 @@ def compare_optimizers(
     *,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> OptimizerComparison:
+) -> Rival:
     """Compare multi-innovation with a genetic algorithm and differential evolution at equal budgets per seed.
+
+    The result has no models yet.
 
     Parameters
     ----------
@@ -114,20 +98,18 @@ def compare_optimizers(
     """
     # Reference values of a structure would inform the bounds.
     blind = replace(single, reference={})
-    searches = {
-        prior: _best_orders(run, blind, order_grid, INNOVATION_LENGTHS[-1], prior, threads=threads, progress=progress)
-        for prior in PRIOR_COVARIANCES
-    }
+    work: dict[str, Any] = {"threads": threads, "progress": progress}
+    searches = {k: best_orders(run, blind, order_grid, INNOVATION_LENGTHS[-1], k, **work) for k in PRIOR_COVARIANCES}
     count = searches[PRIOR_COVARIANCES[0]].candidates
     settings = asked or GeneticAlgorithm(seeds=seeds_for(count))
     budget = settings.evaluations or max(count, 2 * settings.population)
     settings = replace(settings, order_grid=order_grid, evaluations=budget)
     records = prepare([run], blind, None, power_of_two=True)
-    rivals = [
-        search(records, blind, settings, threads=threads, progress=progress)
-        for search in (genetic_search, differential_evolution_search)
-    ]
-    return OptimizerComparison(settings, count, searches, *rivals)
+    optimizers = {
+        "genetic": genetic_search(records, blind, settings, **work),
+        "differential evolution": differential_evolution_search(records, blind, settings, **work),
+    }
+    return Rival(count, order_grid.increment, settings.population, searches, optimizers)
 
 
 @dataclass(frozen=True)
@@ -156,19 +138,6 @@ class Trial:
     nr: float
     manual: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the trial for JSON."""
-        return {
-            "arm": self.arm,
-            "seed": self.seed,
-            "output": self.output,
-            "K0": self.prior,
-            "nr": finite(self.nr),
-            "manual nr": finite(self.manual),
-            "errors": {str(p): finite(v) for p, v in self.errors.items()},
-            "steps": {str(p): finite(v) for p, v in self.convergence_steps.items()},
-        }
-
 
 @dataclass(frozen=True)
 class Contest:
@@ -182,8 +151,8 @@ class Contest:
         Candidates of the order grid, which are the evaluations per seed, and its increment.
     order_grid
         Error (45) of p = 7 by K0.
-    genetic, evolution
-        Error (45) by seed.
+    optimizers
+        Error (45) by optimizer and seed.
     """
 
     arm: str
@@ -191,20 +160,15 @@ class Contest:
     candidates: int
     increment: float
     order_grid: dict[float, float]
-    genetic: dict[int, float]
-    evolution: dict[int, float]
+    optimizers: dict[str, dict[int, float]]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the contest for JSON."""
-        return {
-            "arm": self.arm,
-            "output": self.output,
-            "candidates": self.candidates,
-            "step": self.increment,
-            "multi-innovation": {f"{k:g}": finite(v) for k, v in self.order_grid.items()},
-            "genetic": {str(s): finite(v) for s, v in self.genetic.items()},
-            "differential evolution": {str(s): finite(v) for s, v in self.evolution.items()},
-        }
+    @classmethod
+    def of(cls, arm: str, output: str, rival: Rival) -> Contest:
+        """Return the errors of a comparison."""
+        grid = {k: search.score for k, search in rival.order_grid.items()}
+        return cls(
+            arm, output, rival.candidates, rival.increment, grid, {n: r.errors for n, r in rival.optimizers.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -245,19 +209,15 @@ class OrderComparison:
         """Orders whose interval excludes the integer one."""
         return [n for n, (_, low, high) in self.orders.items() if not low <= integer_order(n) <= high]
 
+    @property
+    def fractional_text(self) -> str:
+        """Orders whose interval excludes the integer one, as text."""
+        return ", ".join(f"{symbol(n)} {self.orders[n][0]:.3g}" for n in self.fractional_orders) or "none"
+
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
-        return {
-            "arm": self.arm,
-            "stage": self.stage,
-            "whole nr": {n: finite(v) for n, v in self.integer_nr.items()},
-            "free nr": {n: finite(v) for n, v in self.free_nr.items()},
-            "orders": {n: list(map(finite, v)) for n, v in self.orders.items()},
-            "not whole": self.fractional_orders,
-            "gain on another run": {n: finite(v) for n, v in self.gains.items()},
-            "degenerate": self.is_degenerate,
-            "earns": {n: self.earns(n) for n in self.free_nr},
-        }
+        names = ("arm", "stage", "integer_nr", "free_nr", "orders", "fractional_orders", "gains", "is_degenerate")
+        return attributes(self, names) | {"earns": {n: self.earns(n) for n in self.free_nr}}
 
 
 @dataclass(frozen=True)
@@ -268,19 +228,10 @@ class Panel:
     contests: tuple[Contest, ...] = ()
     order_comparisons: tuple[OrderComparison, ...] = ()
 
-    def merge_with(self, other: Panel) -> Panel:
-        """Return the union of two panels."""
-        return Panel(
-            self.trials + other.trials, self.contests + other.contests, self.order_comparisons + other.order_comparisons
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all cases for JSON."""
-        return {
-            "trials": [t.to_dict() for t in self.trials],
-            "contests": [c.to_dict() for c in self.contests],
-            "whole and free orders": [f.to_dict() for f in self.order_comparisons],
-        }
+    @classmethod
+    def union(cls, parts: Sequence[Panel]) -> Panel:
+        """Return all cases of some panels."""
+        return cls(*(tuple(c for part in parts for c in getattr(part, each.name)) for each in fields(cls)))
 
 
 def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
@@ -292,35 +243,44 @@ def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
     return float(trace.step[away[-1] + 1]) if away[-1] + 1 < trace.step.size else math.inf
 
 
-def manual_nr(stage: StageNumber, run: Run) -> dict[str, float]:
-    """NR of the manual's integer-order model by explicit Euler, as in the paper."""
-    m = default_m([run], power_of_two=True)
+def euler_means(model: Model, run: Run, m: int) -> dict[str, Floats]:
+    """Pulse means of a model's response by explicit Euler, as in the paper; infinite if it overflows."""
     found = {}
-    for name, samples in explicit_euler(link_model(stage=stage, form="published"), run).items():
+    for name, samples in explicit_euler(model, run).items():
         with np.errstate(over="ignore", invalid="ignore"):
-            finite_run = bool(np.all(np.isfinite(samples)))
-        found[name] = metrics(pulse_means(run[name], m), pulse_means(samples, m)).nr if finite_run else math.inf
+            found[name] = pulse_means(samples, m) if np.all(np.isfinite(samples)) else np.full(m, np.inf)
     return found
 
 
 def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int | None) -> list[Trial]:
     """Run multi-innovation on both angles of a stage, with all p and both values of K0."""
     structure, grid = published_structure(stage), OrderGrid(increment=PANEL_STEP, alpha=GRID_ALPHA)
-    run = square.select(list(structure.signals))
-    manual, found = manual_nr(stage, run), []
+    run, found = square.select(list(structure.signals)), []
+    m = default_m([run], power_of_two=True)
+    manual = euler_means(link_model(stage=stage, form="published"), run, m)
     for output in structure.outputs:
-        single = structure.equation(output)
+        single, manual_nr = structure.equation(output), metrics(pulse_means(run[output], m), manual[output]).nr
         for prior in PRIOR_COVARIANCES:
-            best = {p: _best_orders(run, single, grid, p, prior, threads=threads) for p in INNOVATION_LENGTHS}
+            best = {p: best_orders(run, single, grid, p, prior, threads=threads) for p in INNOVATION_LENGTHS}
             last = best[INNOVATION_LENGTHS[-1]].model
-            known = single.with_orders({n: last.orders[n] for n in single.order_names})
-            common: dict[str, Any] = {"prior_covariance": prior, "row_basis": "haar", "every": TRACE_EVERY}
-            traces = {p: multi_innovation_trace(run, known, innovation_length=p, **common) for p in INNOVATION_LENGTHS}
+            traces = traces_of(run, single, dict.fromkeys(INNOVATION_LENGTHS, last), prior, TRACE_EVERY)
             end = float(traces[INNOVATION_LENGTHS[0]].error[-1])
             steps = {p: convergence_step(t, end) for p, t in traces.items()}
             nr = compare_means(last, run).output_error[output].nr
             errors = {p: s.score for p, s in best.items()}
-            found.append(Trial(arm, seed, output, prior, errors, steps, nr, manual[output]))
+            found.append(Trial(arm, seed, output, prior, errors, steps, nr, manual_nr))
+    return found
+
+
+def traces_of(
+    run: Run, single: Structure, models: Mapping[int, Model], prior: float, every: int
+) -> dict[int, MultiInnovationTrace]:
+    """Convergence of one equation with every p, at the orders of the model of that p."""
+    found = {}
+    for p, model in models.items():
+        known = single.with_orders({n: model.orders[n] for n in single.order_names})
+        options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, "row_basis": "haar"}
+        found[p] = multi_innovation_trace(run, known, every=every, **options)
     return found
 
 
@@ -345,11 +305,12 @@ def compare_orders(
     structure = replace(flexible_link(stage=stage, form="lagrange", coupling="simulated"), initial="rest")
     own, other = (run.select(list(structure.signals)) for run in (square, unseen))
     run = decimate_run(own, ROW_STRIDE)
-    whole = structure.with_orders({n: integer_order(n) for n in structure.order_names})
-    method = OutputError(loss="squares", intervals="auto", noise="white")
     # Coefficients of integer orders overflow on an arm without them.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        fits = [identify(run, item, method=method, threads=threads, progress=progress) for item in (whole, structure)]
+        fits = [
+            identify(run, item, method=JOINT_METHOD, threads=threads, progress=progress)
+            for item in (integer_orders(structure), structure)
+        ]
     models = [replace(fit.model, m=default_m([own], power_of_two=True)) for fit in fits]
     seen, judged = ([compare_means(model, each) for model in models] for each in (own, other))
     return _order_comparison(arm, stage, seen, judged, fits)
@@ -360,33 +321,23 @@ def _order_comparison(
     stage: int,
     seen: Sequence[Comparison],
     unseen: Sequence[Comparison | None],
-    fits: Sequence[Identification | None],
+    fits: Sequence[Identification],
 ) -> OrderComparison:
     """Return the comparison of integer and free orders, in this order."""
     nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in seen)
     before, after = ({} if c is None else c.fit_percent for c in unseen)
     gains = {o: after[o] - before[o] for o in nr if o in before and math.isfinite(after[o] - before[o])}
-    free = fits[1]
-    assert free is not None
-    orders = {n: (v, *free.intervals[n]) for n, v in free.orders.items()}
-    degenerate = any(fit is None or is_degenerate(fit) for fit in fits)
-    return OrderComparison(arm, stage, nr, free_nr, orders, gains, degenerate)
+    orders = {n: (v, *fits[1].intervals[n]) for n, v in fits[1].orders.items()}
+    return OrderComparison(arm, stage, nr, free_nr, orders, gains, any(map(is_degenerate, fits)))
 
 
 def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
     """Return the cases of one run and its stage results; trials only for runs that start at rest."""
-    contests, freed = [], []
-    for output, rival in stage.rivals.items():
-        lattice = dict(zip(PRIOR_COVARIANCES, (rival.models[n] for n in MULTI_INNOVATION_LABELS), strict=True))
-        errors = {k: c.estimation.output_error[output].error for k, c in lattice.items()}
-        sizes = rival.candidates, rival.increment
-        contests.append(Contest(arm, output, *sizes, errors, rival.genetic_run.errors, rival.evolution_run.errors))
     both = [stage.candidates[n] for n in ("integer, identified", "output error")]
-    if both[1].result is not None and both[1].result.fit is not None:
-        seen, unseen, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
-        freed.append(_order_comparison(arm, stage.number, seen, unseen, fits))
-    trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else []
-    return Panel(tuple(trials), tuple(contests), tuple(freed))
+    seen, unseen, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
+    freed = (_order_comparison(arm, stage.number, seen, unseen, fits),)
+    trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else ()
+    return Panel(tuple(trials), tuple(Contest.of(arm, o, rival) for o, rival in stage.rivals.items()), freed)
 
 
 def simulated_panel(
@@ -418,13 +369,11 @@ def simulated_panel(
             continue
         structure = published_structure(stage)
         own = run.select(list(structure.signals))
+        work: dict[str, Any] = {"threads": threads, "progress": progress}
         for output in structure.outputs if has_contests else ():
             begin("rivals")
-            single = structure.equation(output)
-            made = compare_optimizers(own, single, order_grid, genetic, threads=threads, progress=progress)
-            errors = {k: search.score for k, search in made.order_grid.items()}
-            sizes = made.candidates, order_grid.increment
-            contests.append(Contest(arm, output, *sizes, errors, made.genetic.errors, made.evolution.errors))
+            made = compare_optimizers(own, structure.equation(output), order_grid, genetic, **work)
+            contests.append(Contest.of(arm, output, made))
         begin("freed")
-        freed.append(compare_orders(stage, run, arm, threads, progress, unseen=unseen))
+        freed.append(compare_orders(stage, run, arm, **work, unseen=unseen))
     return Panel(tuple(trials), tuple(contests), tuple(freed))

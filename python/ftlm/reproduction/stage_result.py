@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from ftlm.arm.flexible_link import flexible_link
+from ftlm.arm.flexible_link import flexible_link, integer_order
+from ftlm.data.run import Run
 from ftlm.estimation.genetic import GeneticRun
 from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import is_degenerate
 from ftlm.model.model import Model
+from ftlm.order_search.result import SearchResult
+from ftlm.order_search.search import rank_orders
 from ftlm.reproduction.simulated_arm import StageNumber
+from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.formatting import SUPERSCRIPT_DIGITS
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Comparison, Metrics, finite
+from ftlm.validation.comparison import Comparison, Metrics, attributes, plain
 
 #: Steps between two points of a convergence curve; the effect of p is limited to the first steps.
 TRACE_EVERY = 2
@@ -42,6 +46,22 @@ def published_structure(stage: StageNumber, **changes: Any) -> Structure:
         stage=stage, form="published", coupling="measured", laws=(), parameters="effective", offset="none"
     )
     return replace(made, **{"initial": "rest", **changes})
+
+
+def integer_orders(structure: Structure) -> Structure:
+    """Return a structure of the arm with integer orders."""
+    return structure.with_orders({n: integer_order(n) for n in structure.order_names})
+
+
+def around(value: float, increment: float, steps: int) -> list[float]:
+    """Return the values of an order grid around one of them."""
+    return [round(value + k * increment, 9) for k in range(-steps, steps + 1)]
+
+
+def best_orders(run: Run, single: Structure, grid: OrderGrid, p: int, prior: float, **work: Any) -> SearchResult:
+    """Return the best candidate of multi-innovation on an order grid."""
+    options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, **SEARCH_OPTIONS, **work}
+    return rank_orders(run, single, grid, top=1, coefficients="multi-innovation", **options)
 
 
 def prior_text(prior: float) -> str:
@@ -81,17 +101,9 @@ class Candidate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model and its errors for JSON."""
-        result = self.result
-        return {
-            "orders": {n: float(v) for n, v in self.model.orders.items()},
-            "coefficients": {n: float(v) for n, v in self.model.coefficients.items()},
-            "intervals": {} if result is None else {n: list(map(finite, i)) for n, i in result.intervals.items()},
-            "estimation": self.estimation.to_dict(),
-            "validation": None if self.validation is None else self.validation.to_dict(),
-            "alone": {run: {o: f.to_dict() for o, f in figures.items()} for run, figures in self.input_driven.items()},
-            "settings": {} if result is None else result.settings,
-            "warnings": [] if result is None else list(result.warnings),
-        }
+        result = {} if self.result is None else attributes(self.result, ("intervals", "settings", "warnings"))
+        errors = attributes(self, ("estimation", "validation", "input_driven"))
+        return attributes(self.model, ("orders", "coefficients")) | errors | result
 
 
 @dataclass(frozen=True)
@@ -104,7 +116,9 @@ class Rival:
         Candidates of the order grid, which are also the default evaluations per seed, and its increment.
     population
         Population size of the genetic algorithm.
-    genetic_run, evolution_run
+    order_grid
+        Searches by multi-innovation with p = 7, by K0.
+    optimizers
         Results of the genetic algorithm and of differential evolution by seed, with their bounds.
     models
         Best model of each by label: genetic, differential evolution, p = 7 with K0 = 1 and with a weak prior.
@@ -113,22 +127,14 @@ class Rival:
     candidates: int
     increment: float
     population: int
-    genetic_run: GeneticRun
-    evolution_run: GeneticRun
-    models: dict[str, Candidate]
+    order_grid: dict[float, SearchResult]
+    optimizers: dict[str, GeneticRun]
+    models: dict[str, Candidate] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
-        runs = {"genetic": self.genetic_run, "differential evolution": self.evolution_run}
-        return {
-            "candidates": self.candidates,
-            "step": self.increment,
-            "population": self.population,
-            "models": {n: c.to_dict() for n, c in self.models.items()},
-            "errors": {n: {str(s): finite(e) for s, e in r.errors.items()} for n, r in runs.items()},
-            "evaluations": {n: {str(s): e for s, e in r.evaluations.items()} for n, r in runs.items()},
-            "bounds": {n: list(b) for n, b in self.genetic_run.bounds.items()},
-        }
+        runs = {n: attributes(run, ("errors", "evaluations", "bounds")) for n, run in self.optimizers.items()}
+        return attributes(self, ("candidates", "increment", "population", "models")) | {"optimizers": runs}
 
 
 @dataclass(frozen=True)
@@ -166,8 +172,6 @@ class Stage:
         Models by label, in the order of the tables.
     traces, weak_traces
         Convergence by output and p: each p at its own orders and K0 = 1; with a weak prior, at the orders of p = 7.
-    weak
-        Coefficients by output and p with a weak prior, at the orders of p = 7.
     rivals
         Optimizer comparisons by output; empty without PyGAD or for a run that does not start at rest.
     printed_orders
@@ -184,7 +188,6 @@ class Stage:
     candidates: dict[str, Candidate]
     traces: dict[str, dict[int, MultiInnovationTrace]]
     weak_traces: dict[str, dict[int, MultiInnovationTrace]]
-    weak: dict[str, dict[int, dict[str, float]]]
     rivals: dict[str, Rival]
     printed_orders: Candidate
     by_equation: Candidate
@@ -196,17 +199,17 @@ class Stage:
         """Hub angle and deflection."""
         return f"theta{self.number}1", f"theta{self.number}2"
 
+    @property
+    def weak(self) -> dict[str, dict[int, dict[str, float]]]:
+        """Coefficients by output and p with a weak prior, at the orders of p = 7."""
+        return {
+            o: {p: {n: float(c[-1]) for n, c in trace.coefficients.items()} for p, trace in each.items()}
+            for o, each in self.weak_traces.items()
+        }
+
     def to_dict(self) -> dict[str, Any]:
         """Return the stage results for JSON."""
         return {
-            "models": {label: c.to_dict() for label, c in self.candidates.items()},
-            "printed orders": self.printed_orders.to_dict(),
-            "weak prior": {o: {str(p): c for p, c in each.items()} for o, each in self.weak.items()},
-            "genetic": {o: r.to_dict() for o, r in self.rivals.items()},
-            "smallest equation error": self.by_equation.to_dict(),
-            "derived input order": {
-                "output": self.derived.output,
-                "order": self.derived.order,
-                "correlations": {n: finite(v) for n, v in self.derived.correlations.items()},
-            },
-        }
+            "models": plain(self.candidates),
+            "derived input order": attributes(self.derived, ("output", "order", "correlations")),
+        } | attributes(self, ("printed_orders", "by_equation", "weak", "rivals"))

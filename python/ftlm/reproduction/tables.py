@@ -15,7 +15,13 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import table_3_coefficients
-from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, TERM_INTERPRETATIONS, implied_spreads
+from ftlm.reproduction.published_values import (
+    COEFFICIENT_LETTERS,
+    ORDER_LETTERS,
+    ORDER_OF,
+    TERM_INTERPRETATIONS,
+    implied_spreads,
+)
 from ftlm.reproduction.stage_result import (
     MULTI_INNOVATION_LABELS,
     PRIOR_COVARIANCES,
@@ -42,13 +48,12 @@ from ftlm.validation.comparison import Comparison, Metrics
 if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
 
-#: Order of each coefficient's term in the paper's equations (22)-(25).
-ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 #: Heads of the columns of parameters and criteria, and groups of the parameter columns.
 NUMBER_HEADS = tuple(map(symbol_html, (*ORDER_LETTERS, *COEFFICIENT_LETTERS)))
 CRITERION_HEADS = ("error (45)", "RMSE", "NR")
 COLUMN_GROUPS = (("", 1), ("orders", 4), ("coefficients", 4))
 PRIOR_HEADS = tuple(Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in PRIOR_COVARIANCES)
+OPTIMIZER_LABELS = {"genetic": "genetic algorithm", "differential evolution": "differential evolution"}
 PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
 
 
@@ -364,7 +369,7 @@ def genetic_table(found: Reproduction) -> Table:
     rows: list[list[Cell]] = []
     for output, rival in found.rivals.items():
         angle, row = symbol_html(output), printed.GENETIC_ROWS[output]
-        best = Markup("{}, best of {} seeds").format(angle, len(rival.genetic_run.errors))
+        best = Markup("{}, best of {} seeds").format(angle, len(rival.optimizers["genetic"].errors))
         rows.append([best, *computed_cells(rival.models["genetic"], output)])
         rows.append([printed_head(angle), *number_cells(row.orders, row.coefficients)])
     title = "Table 6. Orders and coefficients by the genetic algorithm"
@@ -373,10 +378,9 @@ def genetic_table(found: Reproduction) -> Table:
 
 def rivals_table(found: Reproduction) -> Table:
     """Table 7 at equal budgets."""
-    labels = {
+    labels = OPTIMIZER_LABELS | {
         n: f"p = 7, K₀ = {prior_text(k)}" for n, k in zip(MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, strict=True)
     }
-    labels["genetic"] = "genetic algorithm"
     rows: dict[str, list[list[Cell]]] = {}
     for output, rival in found.rivals.items():
         rows[output] = []
@@ -402,12 +406,14 @@ def rivals_table(found: Reproduction) -> Table:
 
 def seeds_table(found: Reproduction) -> Table:
     """Error (45) of each optimizer and seed, with the number of evaluations."""
-    seeds = list(dict.fromkeys(seed for rival in found.rivals.values() for seed in rival.genetic_run.errors))
+    seeds = list(dict.fromkeys(seed for rival in found.rivals.values() for seed in rival.optimizers["genetic"].errors))
     rows: dict[str, list[list[Cell]]] = {}
     for output, rival in found.rivals.items():
-        for name, run in (("genetic algorithm", rival.genetic_run), ("differential evolution", rival.evolution_run)):
+        for name, run in rival.optimizers.items():
             each = max(run.evaluations.values())
-            rows.setdefault(output, []).append([name, rival.candidates, each, *map(run.errors.get, seeds)])
+            rows.setdefault(output, []).append(
+                [OPTIMIZER_LABELS[name], rival.candidates, each, *map(run.errors.get, seeds)]
+            )
     heads = ("algorithm", "candidates", "evaluations a seed", *(f"seed {s}" for s in seeds))
     return table_by_angle("Error (45) by seed", heads, rows)
 
@@ -469,8 +475,8 @@ def case_tables(found: Reproduction) -> list[Table]:
     orders: list[list[Cell]] = []
     for f in found.panel.order_comparisons:
         for output in f.free_nr:
-            away = ", ".join(f"{symbol(n)} {f.orders[n][0]:.3g}" for n in f.fractional_orders) or "none"
-            orders.append([f"{f.arm}, {symbol(output)}", f.integer_nr[output], f.free_nr[output], away])
+            head = f"{f.arm}, {symbol(output)}"
+            orders.append([head, f.integer_nr[output], f.free_nr[output], f.fractional_text])
     p = [f"p = {p}" for p in printed.INNOVATION_LENGTHS]
     return [
         Table(
