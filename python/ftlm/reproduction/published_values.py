@@ -423,8 +423,9 @@ def _rank_orders(
         (x,) = angle.solve_coefficients(haar, (reading.prior,), INNOVATION_LENGTHS[-1])
         errors[each] = float(np.sum(np.abs(angle.y - time @ x)))
     own = errors[tuple(round(float(orders[n]), 9) for n in varied)]
-    first = dict(zip(varied, min(errors, key=errors.__getitem__), strict=True))
-    return 1 + sum(e < own for e in errors.values()), len(errors), {"alpha": float(orders["alpha"]), **first}
+    best = min(errors, key=lambda each: errors[each])
+    first = {"alpha": float(orders["alpha"]), **dict(zip(varied, best, strict=True))}
+    return 1 + sum(e < own for e in errors.values()), len(errors), first
 
 
 #: Increment and radius [increments] of the order grid around the printed orders.

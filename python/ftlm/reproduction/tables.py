@@ -22,6 +22,7 @@ from ftlm.reproduction.published_values import (
     TERM_INTERPRETATIONS,
     implied_spreads,
 )
+from ftlm.reproduction.simulated_arm import letter_of
 from ftlm.reproduction.stage_result import (
     MULTI_INNOVATION_LABELS,
     PRIOR_COVARIANCES,
@@ -84,11 +85,6 @@ class PaperRow:
     validation: Metrics | None = None
 
 
-def letter_of(name: str) -> str:
-    """Strip the index of a name: alpha1 becomes alpha."""
-    return name.rstrip("0123456789")
-
-
 def letters_of(item: Equation) -> tuple[dict[str, float], dict[str, float]]:
     """Orders and coefficients of an equation of the arm by letter."""
     orders, coefficients = {"alpha": item.order.constant}, {}
@@ -132,15 +128,10 @@ def paper_row(
 
 
 def table_by_angle(
-    title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **rest: Any
+    title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **options: Any
 ) -> Table:
     """Return a table whose rows are grouped under the symbol of their angle."""
-    flat: list[Sequence[Cell]] = []
-    headings = {}
-    for output, each in rows.items():
-        headings[len(flat)] = symbol_html(output)
-        flat += each
-    return Table(title, columns, flat, headings=headings, **rest)
+    return Table.grouped(title, columns, {symbol_html(o): each for o, each in rows.items()}, **options)
 
 
 def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -> Table:
