@@ -14,14 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.optimizer_comparison import Trial
-from ftlm.reproduction.published_values import (
-    ANGLE_NAMES,
-    INNOVATION_LENGTHS,
-    MAX_COEFFICIENT_RATIO,
-    AsPrinted,
-    PrintedModelRun,
-    implied_spreads,
-)
+from ftlm.reproduction.published_values import ANGLE_NAMES, INNOVATION_LENGTHS, AsPrinted, PrintedModelRun
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS
 from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, TRACE_EVERY, WEAK_PRIOR, are_usable, prior_text
 from ftlm.utils.formatting import symbol
@@ -316,7 +309,7 @@ def _table_checks(tables: Mapping[str, AsPrinted]) -> Iterable[Check]:
         f"printed, p = {LAST_P}: {by_angle({o: [t.ratios[c][-1] for c in 'bdg'] for o, t in tables.items()})}. "
         f"Closest settings: {settings}",
         f"a of p = {LAST_P}: {_stated(lambda row: row.coefficients['a'], tables)}",
-        f"a, b, d, g and NR of all four rows within a factor of {MAX_COEFFICIENT_RATIO:g}, signs included",
+        f"a, b, d, g and NR of all four rows within a factor of {printed.MAX_COEFFICIENT_RATIO:g}, signs included",
     )
     places = ", ".join(f"{symbol(o)} {t.rank} of {t.among}" for o, t in tables.items())
     best = by_angle({o: [t.best[n] for n in ("beta", "gamma", "mu")] for o, t in tables.items()})
@@ -552,7 +545,7 @@ def _paper_checks(found: Reproduction) -> Iterable[Check]:
         f"{worst} = {rows[worst][2]:g}",
         f"every coefficient within {100 * MIN_RELATIVE_DIFFERENCE:g} %",
     )
-    spreads = implied_spreads()
+    spreads = printed.implied_spreads()
     yield Check(
         "Table 7 compares both algorithms on one record.",
         _of_angles({o: abs(g / m - 1) <= MAX_DEVIATION_MISMATCH for o, (g, m) in spreads.items()}),

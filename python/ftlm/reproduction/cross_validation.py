@@ -21,11 +21,11 @@ from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import Progress
 from ftlm.report.html_report import grouped_findings
 from ftlm.report.typesetting import equation_html
+from ftlm.reproduction.figures import angle_chart
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
-from ftlm.svg.line_chart import line_chart
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
@@ -454,17 +454,10 @@ def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
             lines.append((kind, fitted.comparisons[judged].simulated[output][0]))
             words.append(f"{kind} {percent(fitted.fit(judged))} % with {fitted.numbers} numbers")
         caption = "; ".join(words)
+        options = {"points": LINE_POINTS, "width": SMALL_WIDTH_PX}
+        title = f"{symbol(output)} on {judged}, fitted to {run}"
         charts.append(
-            line_chart(
-                pulse_times(at),
-                lines,
-                title=f"{symbol(output)} on {judged}, fitted to {run}",
-                x_label="time [s]",
-                y_label=f"{symbol(output)} [rad]",
-                points=LINE_POINTS,
-                width=SMALL_WIDTH_PX,
-                caption=f"{caption[0].upper()}{caption[1:]}.",
-            )
+            angle_chart(pulse_times(at), lines, output, title, f"{caption[0].upper()}{caption[1:]}.", **options)
         )
     return charts
 

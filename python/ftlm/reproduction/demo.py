@@ -106,14 +106,6 @@ class Demo:
         """Orders and free coefficients of the simulated arm, by stage."""
         return {stage: truth_of(stage) for stage in STAGE_NUMBERS}
 
-    def fits(self, stage: int) -> dict[str, list[float]]:
-        """Fit of the free run of every model in percent: for each output on the square run and on the sine run."""
-        found: dict[str, list[float]] = {}
-        for r in self.rows[stage]:
-            fits = [math.nan if f is None else f.fit for f in (r.output_error, r.validation)]
-            found.setdefault(r.label, []).extend(fits)
-        return found
-
     def to_dict(self) -> dict[str, Any]:
         """Return rows and estimates for JSON."""
         return {
@@ -220,7 +212,7 @@ def demo_text(demo: Demo) -> str:
     lines.append(f"{'free run, fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
     lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
     for label in SHOWN_MODELS:
-        fits = [fit for stage in demo.rows for fit in demo.fits(stage)[label]]
+        fits = [fit for models in demo.models.values() for fit in models[label].fits]
         shown = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
         lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(shown)))
     lines += ["", "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well."]
@@ -237,10 +229,10 @@ def demo_details(demo: Demo) -> str:
         lines += [f"Stage {stage}, square current (the shape of the paper's Table {3 + stage})"]
         lines += [paper_table_text(demo.rows[stage]), ""]
     lines += ["Fit of the free run in percent: on the square run, and on the sine run that no model has seen"]
-    for stage, models in demo.models.items():
+    for models in demo.models.values():
         outputs = models["output error"].model.outputs
         lines.append(" " * 24 + "".join(f"{o + ' square':>18}{o + ' sine':>16}" for o in outputs))
-        lines += fits_text(demo.fits(stage), 24, (18, 16) * len(outputs))
+        lines += fits_text(models, 24, (18, 16) * len(outputs))
     lines += ["", TABLE_NOTE, "", "Which way a link bends: correlation of the deflection with its current"]
     heads = ("simulated arm", "(14)–(15) identified", "the same in (22)–(25)")
     lines.append(" " * 24 + "".join(f"{words:>26}" for words in heads))

@@ -99,6 +99,12 @@ class Candidate:
     input_driven: dict[str, dict[str, Metrics]]
     result: Identification | None = None
 
+    @property
+    def fits(self) -> list[float]:
+        """Fit of the free run in percent, for each output on both runs; NaN without a run."""
+        runs = self.estimation, self.validation
+        return [math.nan if c is None else c.output_error[o].fit for o in self.estimation.output_error for c in runs]
+
     def to_dict(self) -> dict[str, Any]:
         """Return the model and its errors for JSON."""
         result = {} if self.result is None else attributes(self.result, ("intervals", "settings", "warnings"))
