@@ -108,25 +108,25 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
         groups = outcomes(lambda factors: tuple(level for n, level in factors.items() if n != name))
         return sum(sum(g) * (len(g) - sum(g)) for g in groups.values())
 
-    def ruling(word: Word, factors: Sequence[str] = (), by: str | None = None) -> ClaimVerdict:
+    def verdict(word: Word, factors: Sequence[str] = (), by: str | None = None) -> ClaimVerdict:
         groups = {} if by is None else outcomes(itemgetter(by))
         levels = tuple((level, len(each), sum(each)) for level, each in groups.items())
         return ClaimVerdict(word, tuple(factors), len(cases), held, levels)
 
     if not cases:
-        return ruling("cannot be told")
+        return verdict("cannot be told")
     if of_the_machine and len({c.factors.get(ARM_FACTOR) for c in cases}) < 2:
-        return ruling("cannot be told from a simulated truth", [ARM_FACTOR])
+        return verdict("cannot be told from a simulated truth", [ARM_FACTOR])
     if held in (0, len(cases)):
-        return ruling("holds" if held else "does not hold")
+        return verdict("holds" if held else "does not hold")
     names = list(cases[0].factors)
     turning = sorted(filter(flips, names), key=flips, reverse=True)
     if of_the_machine and ARM_FACTOR in turning:
-        return ruling("cannot be told from a simulated truth", [ARM_FACTOR], ARM_FACTOR)
+        return verdict("cannot be told from a simulated truth", [ARM_FACTOR], ARM_FACTOR)
     # One factor that decides every outcome says all.
     deciding = [n for n in names if all(len(set(g)) == 1 for g in outcomes(itemgetter(n)).values())]
     factors = deciding[:1] or turning or names
-    return ruling("turns with", factors, factors[0])
+    return verdict("turns with", factors, factors[0])
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _by_prior(found: Reproduction, numbers: Callable[[Trial], Iterable[float]]) 
     return "; ".join(texts)
 
 
-def _stated(
+def _printed_text(
     number: Callable[[printed.PublishedRow], float],
     outputs: Iterable[str] = ANGLE_NAMES,
     lengths: Sequence[int] = (LAST_P,),
@@ -269,7 +269,7 @@ def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
         "no pole has a positive real part",
     )
     back = [
-        (r, k, r.returned_coefficients.get(k, {}).get(printed.indexed("a", r.output), math.nan))
+        (r, k, r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan))
         for r in ran
         for k in PRIOR_COVARIANCES
     ]
@@ -294,7 +294,7 @@ def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
         "Identified from its own response, a printed model returns its coefficients.",
         combine_cases(cases),
         f"{values}. Orders of a search around the printed ones: {orders}",
-        f"a of p = {LAST_P}: {_stated(lambda row: row.coefficients['a'], deviations)}",
+        f"a of p = {LAST_P}: {_printed_text(lambda row: row.coefficients['a'], deviations)}",
         f"a within {100 * MIN_RELATIVE_DIFFERENCE:g} %, without noise, at the printed orders, with the row's own p",
     )
 
@@ -308,7 +308,7 @@ def _table_checks(tables: Mapping[str, AsPrinted]) -> Iterable[Check]:
         f"as equation errors, K0 chosen for each angle, a and NR are within a mean factor of {away}; b, d, g over "
         f"printed, p = {LAST_P}: {by_angle({o: [t.ratios[c][-1] for c in 'bdg'] for o, t in tables.items()})}. "
         f"Closest settings: {settings}",
-        f"a of p = {LAST_P}: {_stated(lambda row: row.coefficients['a'], tables)}",
+        f"a of p = {LAST_P}: {_printed_text(lambda row: row.coefficients['a'], tables)}",
         f"a, b, d, g and NR of all four rows within a factor of {printed.MAX_COEFFICIENT_RATIO:g}, signs included",
     )
     places = ", ".join(f"{symbol(o)} {t.rank} of {t.among}" for o, t in tables.items())
@@ -350,7 +350,7 @@ def _innovation_checks(found: Reproduction) -> Iterable[Check]:
         ruling,
         f"{ruling.counts}. Errors of p = 1, 3, 5, 7 on the first record: "
         f"{_by_prior(found, lambda t: t.errors.values())}",
-        f"errors of p = 1, 3, 5, 7: {_stated(lambda row: row.error, lengths=INNOVATION_LENGTHS)}",
+        f"errors of p = 1, 3, 5, 7: {_printed_text(lambda row: row.error, lengths=INNOVATION_LENGTHS)}",
         rule,
     )
     apart = [t for t in trials if converges_faster(t.convergence_steps) is not None]
@@ -447,7 +447,7 @@ def _machine_checks(found: Reproduction) -> Iterable[Check]:
             of_the_machine=found.simulated,
         ),
         f"NR of the equation and of the free run, best coefficients for these orders: {by_angle(nr)}",
-        f"NR of p = {LAST_P}: {_stated(lambda row: row.nr, near, digits=4)}",
+        f"NR of p = {LAST_P}: {_printed_text(lambda row: row.nr, near, digits=4)}",
         f"NR of the free run below {MAX_EXPLAINING_NR:g} and below {MAX_ERROR_RATIO:g} times that of the equation",
     )
 
@@ -511,7 +511,7 @@ def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
         stage = printed.stage_of(output)
         table, effective = (parameters[stage].coefficients(stage) for parameters in sets)
         for letter, value in row.coefficients.items():
-            name = printed.indexed(letter, output)
+            name = printed.parameter_name(letter, output)
             found[name] = (table[name], effective[name], value)
     return found
 

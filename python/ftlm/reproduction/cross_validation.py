@@ -473,7 +473,7 @@ def places_table(found: UnseenOrders) -> Table | None:
     }
     if not rows:
         return None
-    return Table.grouped(
+    return Table.from_groups(
         "Does the order earn its place?",
         ("order", "without rate", "with rate"),
         rows,
@@ -497,7 +497,7 @@ def fits_table(found: UnseenOrders) -> Table:
             ]
             rows[heading].append([kind, numbers, *cells])
     heads = [f"{run}, fitted" if run == other else f"{run} → {other}" for run, other in pairs]
-    return Table.grouped(
+    return Table.from_groups(
         "Fit of the free run in percent",
         ("structure", "numbers free", *heads),
         rows,
@@ -517,7 +517,7 @@ def estimates_table(deflection: Deflection, suffix: str = "") -> Table:
         for run, fitted in each.items()
     }
     title = f"{symbol(deflection.output)}{suffix}: estimates and their 95 % intervals"
-    return Table.grouped(title, ("number", "estimate", "from", "to"), rows)
+    return Table.from_groups(title, ("number", "estimate", "from", "to"), rows)
 
 
 def _deflection_section(full: Deflection) -> Section:

@@ -134,7 +134,7 @@ TABLE_3: dict[str, tuple[float, str]] = {
 }
 
 
-def indexed(letter: str, output: str) -> str:
+def parameter_name(letter: str, output: str) -> str:
     """Return the name of an angle's order or coefficient, such as alpha1."""
     return f"{letter}{1 + ANGLE_NAMES.index(output)}"
 
@@ -146,7 +146,7 @@ def stage_of(output: str) -> StageNumber:
 
 def last_orders(output: str) -> dict[str, float]:
     """Orders of an angle's row of p = 7 by name, such as alpha1."""
-    return {indexed(n, output): v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
+    return {parameter_name(n, output): v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
 
 
 def printed_saturation(output: str) -> tuple[float, float, float]:
@@ -483,8 +483,8 @@ class PrintedModelRun:
 def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[str, float]]:
     """Orders and coefficients of a stage's two printed equations, by the names of (22)-(25)."""
     rows = {o: FRACTIONAL_ROWS[o][p] for o in ANGLE_NAMES if stage_of(o) == stage}
-    orders = {indexed(n, o): float(v) for o, row in rows.items() for n, v in row.orders.items()}
-    return orders, {indexed(n, o): float(v) for o, row in rows.items() for n, v in row.coefficients.items()}
+    orders = {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.orders.items()}
+    return orders, {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.coefficients.items()}
 
 
 def printed_model(stage: StageNumber, p: int) -> Model:

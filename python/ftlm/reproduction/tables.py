@@ -15,7 +15,7 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import table_3_coefficients
-from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, indexed
+from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, parameter_name
 from ftlm.reproduction.simulated_arm import letter_of
 from ftlm.reproduction.stage_result import (
     MULTI_INNOVATION_LABELS,
@@ -133,7 +133,7 @@ def table_by_angle(
     **options: Any,
 ) -> Table:
     """Return a table with the rows of every angle under its symbol."""
-    return Table.grouped(title, columns, {symbol_html(o): list(rows(o)) for o in dict.fromkeys(outputs)}, **options)
+    return Table.from_groups(title, columns, {symbol_html(o): list(rows(o)) for o in dict.fromkeys(outputs)}, **options)
 
 
 def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -> Table:
@@ -214,7 +214,7 @@ def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
     """Orders, and coefficients at least as large as their standard errors, of one equation."""
     orders, coefficients = letters_of(candidate.model, output)
     errors = {} if candidate.result is None else candidate.result.standard_errors
-    known = {n: v for n, v in coefficients.items() if not errors.get(indexed(n, output), 0.0) > abs(v)}
+    known = {n: v for n, v in coefficients.items() if not errors.get(parameter_name(n, output), 0.0) > abs(v)}
     return number_cells(orders, known)
 
 
@@ -344,7 +344,7 @@ def saturation_table(found: Reproduction) -> Table:
     """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
-        stage, name = found.stages[printed.stage_of(output)], indexed("a", output)
+        stage, name = found.stages[printed.stage_of(output)], parameter_name("a", output)
         of_p = {p: stage.candidates[f"p = {p}"].model for p in printed.INNOVATION_LENGTHS}
         last = letters_of(of_p[printed.INNOVATION_LENGTHS[-1]], output)[0]
         x, c, _ = printed.printed_saturation(output)
@@ -448,7 +448,7 @@ def printed_runs_table(found: Reproduction) -> Table:
     def rows(output: str) -> Iterator[list[Cell]]:
         for r in found.ran:
             if r.output == output:
-                back = [r.returned_coefficients.get(k, {}).get(indexed("a", output)) for k in PRIOR_COVARIANCES]
+                back = [r.returned_coefficients.get(k, {}).get(parameter_name("a", output)) for k in PRIOR_COVARIANCES]
                 deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
                 stated = printed.FRACTIONAL_ROWS[output][r.p].coefficients["a"]
                 yield [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, stated, *back]

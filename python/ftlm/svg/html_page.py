@@ -72,7 +72,7 @@ class Table:
     stacked: bool = False
 
     @classmethod
-    def grouped(
+    def from_groups(
         cls, title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **options: Any
     ) -> Table:
         """Return a table whose rows are given by the heading above them; the options are those of a table."""
