@@ -17,10 +17,10 @@ from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import _order_check, checks, table_3_coefficients
-from ftlm.reproduction.optimizer_comparison import OrderComparison, Panel, compare_optimizers
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
 from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
+from ftlm.reproduction.stage_result import OrderComparison, Panel, compare_optimizers
 from ftlm.validation.comparison import compare_means
 from lagrange import truth
 from test_cli import ftlm_command
@@ -581,7 +581,7 @@ def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reprod
         return replace(reproduction.stages[work.number], rivals=work.rivals(genetic))
 
     monkeypatch.setattr("ftlm.reproduction.stage_models.StageWork.compute_stage", stage_without_searches)
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.reproduction.stage_result.trials_of", lambda *_: [])
     monkeypatch.setitem(sys.modules, absent, None)
     lines = []
     found = ftlm.reproduce(increment=0.25, arms=["whole orders"], records=1, log=lines.append)

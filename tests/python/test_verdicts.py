@@ -14,14 +14,6 @@ from ftlm.fractional_calculus import block_pulse_matrix
 from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import beats, case, combine_cases, converges_faster, deviation_text
-from ftlm.reproduction.optimizer_comparison import (
-    compare_optimizers,
-    compare_orders,
-    convergence_step,
-    rivals_order_grid,
-    seeds_for,
-    simulated_panel,
-)
 from ftlm.reproduction.published_values import (
     PRIOR_GRID,
     as_printed,
@@ -34,6 +26,14 @@ from ftlm.reproduction.published_values import (
 )
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, demo_run
 from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
+from ftlm.reproduction.stage_result import (
+    compare_optimizers,
+    compare_orders,
+    convergence_step,
+    rivals_order_grid,
+    seeds_for,
+    simulated_panel,
+)
 from ftlm.simulation.discretization import prepare
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -302,9 +302,9 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         given.append((lattice, asked))
         raise ftlm.ModelError("enough")
 
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.compare_optimizers", like)
+    monkeypatch.setattr("ftlm.reproduction.stage_result.compare_optimizers", like)
     monkeypatch.setattr("ftlm.reproduction.stage_models.compare_optimizers", like)
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.reproduction.stage_result.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
         simulated_panel(1, "whole orders", [1], 0.0, 1, order_grid=rivals_order_grid(step))
     preset = Preset(ftlm.OrderGrid(increment=step), 1, 2, common_pulses=True)
@@ -355,7 +355,7 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
         seen.append(structure.initial)
         raise ftlm.ConvergenceError("enough")
 
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.identify", identify)
+    monkeypatch.setattr("ftlm.reproduction.stage_result.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
         compare_orders(1, demo_run("square"), "fractional", 1, unseen=demo_run("sine"))
     preset = Preset(ftlm.OrderGrid(increment=0.25), 1, 2, common_pulses=True)

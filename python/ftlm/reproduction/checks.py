@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.optimizer_comparison import Trial
 from ftlm.reproduction.published_values import ANGLE_NAMES, INNOVATION_LENGTHS, AsPrinted, PrintedModelRun
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS
-from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, TRACE_EVERY, WEAK_PRIOR, are_usable, prior_text
+from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, TRACE_EVERY, WEAK_PRIOR, Trial, are_usable, prior_text
 from ftlm.utils.formatting import symbol
 from ftlm.validation.comparison import metrics
 

@@ -17,7 +17,6 @@ from ftlm.errors import DataError, ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolution, load_pygad
 from ftlm.progress import format_time_left
 from ftlm.reproduction.checks import Check, checks
-from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, Panel, panel_of, rivals_order_grid, simulated_panel
 from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, run_printed_models
 from ftlm.reproduction.report import reproduction_page
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
@@ -30,7 +29,18 @@ from ftlm.reproduction.stage_models import (
     seconds_of,
     seconds_of_all,
 )
-from ftlm.reproduction.stage_result import GRID_ALPHA, TRACE_EVERY, Rival, Stage, published_structure
+from ftlm.reproduction.stage_result import (
+    CONTEST_STEP,
+    GRID_ALPHA,
+    TRACE_EVERY,
+    Panel,
+    Rival,
+    Stage,
+    panel_of,
+    published_structure,
+    rivals_order_grid,
+    simulated_panel,
+)
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.parameters import Placeholder, parameter, setting

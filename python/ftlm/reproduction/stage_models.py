@@ -25,17 +25,10 @@ from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import ShareTracker, Stoppable
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.optimizer_comparison import (
-    CONTEST_STEP,
-    JOINT_METHOD,
-    compare_optimizers,
-    euler_means,
-    rivals_order_grid,
-    seeds_for,
-    traces_of,
-)
 from ftlm.reproduction.simulated_arm import StageNumber, decimate_run
 from ftlm.reproduction.stage_result import (
+    CONTEST_STEP,
+    JOINT_METHOD,
     MULTI_INNOVATION_LABELS,
     PRIOR_COVARIANCES,
     SEARCH_OPTIONS,
@@ -45,8 +38,13 @@ from ftlm.reproduction.stage_result import (
     Rival,
     Stage,
     around,
+    compare_optimizers,
+    euler_means,
     integer_orders,
     published_structure,
+    rivals_order_grid,
+    seeds_for,
+    traces_of,
 )
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.initial_conditions import starts_at_rest
