@@ -17,10 +17,10 @@ from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import _order_check, checks, table_3_coefficients
-from ftlm.reproduction.optimizer_comparison import OrderComparison, Panel, compare_optimizers
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
 from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
+from ftlm.reproduction.stage_result import OrderComparison, Panel, compare_optimizers
 from ftlm.validation.comparison import compare_means
 from lagrange import truth
 from test_cli import ftlm_command
@@ -114,14 +114,13 @@ def test_every_model_s_errors_follow_from_its_file_and_the_saved_runs(saved):
 
 
 def test_table_7_follows_from_the_saved_run(saved):
-    written = json.loads((saved / "tables.json").read_text())["as it should be"]["1"]["genetic"]["theta12"]
+    written = json.loads((saved / "tables.json").read_text())["as it should be"]["1"]["rivals"]["theta12"]
     run = ftlm.load(saved / "square.csv").select(["I1", "theta11", "theta12"])
     single = ftlm.flexible_link(form="published", stage=1, coupling="measured", laws=()).equation("theta12")
     settings = ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800)
     found = compare_optimizers(run, single, ftlm.OrderGrid(increment=0.25, alpha=(1.95, 2.0)), settings)
-    both = {"genetic": found.genetic, "differential evolution": found.evolution}
-    for label, rival in both.items():
-        assert {str(seed): error for seed, error in rival.errors.items()} == written["errors"][label]
+    for label, rival in found.optimizers.items():
+        assert {str(seed): error for seed, error in rival.errors.items()} == written["optimizers"][label]["errors"]
         row = written["models"][label]
         assert rival.orders == row["orders"]
         model = ftlm.load_model(saved / f"theta12-{label.replace(' ', '-')}.json")
@@ -186,13 +185,13 @@ def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
     assert "K0" in claim.ruling.factors
     for contest in reproduction.panel.contests:
         assert set(contest.order_grid) == {1.0, 1e10}
-        assert set(contest.genetic) == set(contest.evolution) == {0, 1}
+        assert [set(errors) for errors in contest.optimizers.values()] == [{0, 1}] * 2
         if contest.output.endswith("1"):
             # The hubs: the data alone beat every seed of either, K0 = 1 none of the genetic algorithm's best.
-            assert contest.order_grid[1e10] < min(*contest.genetic.values(), *contest.evolution.values())
+            assert contest.order_grid[1e10] < min(e for errors in contest.optimizers.values() for e in errors.values())
             assert contest.order_grid[1.0] > 10 * contest.order_grid[1e10]
     # Bounds of a rival are wider or narrower than the maker's values as the data have it.
-    bounds = reproduction.stages[1].rivals["theta11"].genetic_run.bounds
+    bounds = reproduction.stages[1].rivals["theta11"].optimizers["genetic"].bounds
     assert bounds["a1"][1] != pytest.approx(2 * 628.889, rel=0.01)
 
 
@@ -340,21 +339,24 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
 def test_p_itself_is_judged_by_errors_not_by_coefficients_that_differ(reproduction):
     stage = reproduction.stages[1]
     uneven = dict(zip(printed.INNOVATION_LENGTHS, (1.0, 1.1, 1.2, 5.0), strict=True))
-    weak = {o: {p: {n: uneven[p] for n in c} for p, c in each.items()} for o, each in stage.weak.items()}
-    found = checks(replace(reproduction, stages={1: replace(stage, weak=weak)}))
+    weak = {
+        o: {p: replace(t, coefficients={n: np.array([uneven[p]]) for n in t.coefficients}) for p, t in each.items()}
+        for o, each in stage.weak_traces.items()
+    }
+    found = checks(replace(reproduction, stages={1: replace(stage, weak_traces=weak)}))
     assert by_words(found, "p itself improves").verdict == "does not hold"
 
 
 def test_both_readings_are_saved(saved):
     written = json.loads((saved / "tables.json").read_text())
-    assert set(written["as printed"]) == set(printed.ANGLE_NAMES)
+    assert set(written["as_printed"]) == set(printed.ANGLE_NAMES)
     assert set(written["as it should be"]) == {"1", "2"}
-    row = written["as printed"]["theta22"]["rows"]["7"]
+    row = written["as_printed"]["theta22"]["rows"]["7"]
     assert row["coefficients"]["a"] / -0.7787 == pytest.approx(1.0, abs=0.1)
-    assert row["equation_error"]["error"] / 0.9791 == pytest.approx(1.0, abs=0.15)
+    assert row["equation"]["error"] / 0.9791 == pytest.approx(1.0, abs=0.15)
     assert {c["verdict"].split(" with ")[0] for c in written["checks"]} >= {"does not hold", "turns"}
-    assert len(written["printed models run"]) == 16
-    assert {t["K0"] for t in written["verdicts"]["trials"]} == {1.0, 1e10}
+    assert len(written["ran"]) == 16
+    assert {t["prior"] for t in written["panel"]["trials"]} == {1.0, 1e10}
 
 
 def test_output_error_finds_the_simulated_arm_and_its_intervals_say_so(reproduction):
@@ -579,7 +581,7 @@ def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reprod
         return replace(reproduction.stages[work.number], rivals=work.rivals(genetic))
 
     monkeypatch.setattr("ftlm.reproduction.stage_models.StageWork.compute_stage", stage_without_searches)
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.reproduction.stage_result.trials_of", lambda *_: [])
     monkeypatch.setitem(sys.modules, absent, None)
     lines = []
     found = ftlm.reproduce(increment=0.25, arms=["whole orders"], records=1, log=lines.append)

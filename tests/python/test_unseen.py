@@ -8,8 +8,15 @@ import pytest
 
 import ftlm
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction
-from ftlm.reproduction.cross_validation import link_structure, orders_on_unseen_runs, stages_in
-from ftlm.reproduction.cross_validation_report import places_table, sentence, unseen_page, unseen_text
+from ftlm.reproduction.cross_validation import (
+    link_structure,
+    orders_on_unseen_runs,
+    places_table,
+    sentence,
+    stages_in,
+    unseen_page,
+    unseen_text,
+)
 from test_cli import ftlm_command
 
 ROWS, STEP = 251, 0.02

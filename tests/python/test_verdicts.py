@@ -14,7 +14,19 @@ from ftlm.fractional_calculus import block_pulse_matrix
 from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import beats, case, combine_cases, converges_faster, deviation_text
-from ftlm.reproduction.optimizer_comparison import (
+from ftlm.reproduction.published_values import (
+    PRIOR_GRID,
+    as_printed,
+    implied_spreads,
+    one_angle,
+    papers_current,
+    papers_record,
+    printed_numbers,
+    run_printed_models,
+)
+from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, demo_run
+from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
+from ftlm.reproduction.stage_result import (
     compare_optimizers,
     compare_orders,
     convergence_step,
@@ -22,10 +34,6 @@ from ftlm.reproduction.optimizer_comparison import (
     seeds_for,
     simulated_panel,
 )
-from ftlm.reproduction.published_models import one_angle, papers_current, printed_numbers, run_printed_models
-from ftlm.reproduction.published_values import PRIOR_GRID, as_printed, implied_spreads, papers_record
-from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, demo_run
-from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
 from ftlm.simulation.discretization import prepare
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -244,13 +252,14 @@ def test_rivals_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(h
     assert made.candidates == 224
     # The maker's 2271 is not the middle of anything.
     other = compare_optimizers(run, replace(single, reference={"a3": 1.0, "b3": 1.0}), lattice, settings, threads=1)
-    assert made.genetic.bounds == made.evolution.bounds == other.genetic.bounds
-    assert made.genetic.errors == other.genetic.errors
-    assert 400 <= made.genetic.evaluations[0] <= 600
-    assert 400 <= made.evolution.evaluations[0] < 400 + 15 * 8
+    genetic, evolution = made.optimizers.values()
+    assert genetic.bounds == evolution.bounds == other.optimizers["genetic"].bounds
+    assert genetic.errors == other.optimizers["genetic"].errors
+    assert 400 <= genetic.evaluations[0] <= 600
+    assert 400 <= evolution.evaluations[0] < 400 + 15 * 8
     # With the data alone to decide the lattice is better than both, with K0 = 1 it is worse.
     strong, weak = (search.score for search in made.order_grid.values())
-    assert weak < min(made.genetic.errors[0], made.evolution.errors[0]) < strong
+    assert weak < min(genetic.errors[0], evolution.errors[0]) < strong
 
 
 def test_differential_evolution_finds_what_is_there_and_the_same_again():
@@ -293,9 +302,9 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         given.append((lattice, asked))
         raise ftlm.ModelError("enough")
 
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.compare_optimizers", like)
+    monkeypatch.setattr("ftlm.reproduction.stage_result.compare_optimizers", like)
     monkeypatch.setattr("ftlm.reproduction.stage_models.compare_optimizers", like)
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.reproduction.stage_result.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
         simulated_panel(1, "whole orders", [1], 0.0, 1, order_grid=rivals_order_grid(step))
     preset = Preset(ftlm.OrderGrid(increment=step), 1, 2, common_pulses=True)
@@ -346,7 +355,7 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
         seen.append(structure.initial)
         raise ftlm.ConvergenceError("enough")
 
-    monkeypatch.setattr("ftlm.reproduction.optimizer_comparison.identify", identify)
+    monkeypatch.setattr("ftlm.reproduction.stage_result.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
         compare_orders(1, demo_run("square"), "fractional", 1, unseen=demo_run("sine"))
     preset = Preset(ftlm.OrderGrid(increment=0.25), 1, 2, common_pulses=True)

@@ -15,12 +15,11 @@ from ftlm.errors import ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.progress import Progress
 from ftlm.reproduction import reproduction
-from ftlm.reproduction.cross_validation import orders_on_unseen_runs
-from ftlm.reproduction.cross_validation_report import unseen_page, unseen_text
+from ftlm.reproduction.cross_validation import orders_on_unseen_runs, unseen_page, unseen_text
 from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
-from ftlm.reproduction.optimizer_comparison import CONTEST_STEP
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import ALWAYS_SAVED
+from ftlm.reproduction.stage_result import CONTEST_STEP
 from ftlm.utils.files import check_folder
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads

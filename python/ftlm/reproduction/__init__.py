@@ -1,8 +1,7 @@
 """Reproduction of the paper's section 5, and the demonstration that is a part of it."""
 
 from ftlm.reproduction.checks import Check, table_3_coefficients
-from ftlm.reproduction.cross_validation import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs
-from ftlm.reproduction.cross_validation_report import unseen_page
+from ftlm.reproduction.cross_validation import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs, unseen_page
 from ftlm.reproduction.demo import Demo, run_demo
 from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads, printed_saturation
 from ftlm.reproduction.reproduction import Reproduction, reproduce

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Literal
 
 from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.optimizer_comparison import Trial
-from ftlm.reproduction.published_values import INNOVATION_LENGTHS, MAX_COEFFICIENT_RATIO, implied_spreads
+from ftlm.reproduction.published_values import ANGLE_NAMES, INNOVATION_LENGTHS, AsPrinted, PrintedModelRun
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS
-from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, TRACE_EVERY, WEAK_PRIOR, are_usable, prior_text
+from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, TRACE_EVERY, WEAK_PRIOR, Trial, are_usable, prior_text
 from ftlm.utils.formatting import symbol
 from ftlm.validation.comparison import metrics
 
@@ -95,35 +95,37 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
     depends on the arm, or if there is only one arm.
     """
     held = sum(c.holds for c in cases)
-    counts = len(cases), held
-    names = list(cases[0].factors) if cases else []
 
-    def levels(name: str) -> tuple[tuple[str, int, int], ...]:
-        outcomes: dict[str, list[bool]] = defaultdict(list)
+    def outcomes(level_of: Callable[[Mapping[str, str]], Any]) -> dict[Any, list[bool]]:
+        found: dict[Any, list[bool]] = defaultdict(list)
         for c in cases:
-            outcomes[c.factors[name]].append(c.holds)
-        return tuple((level, len(each), sum(each)) for level, each in outcomes.items())
+            found[level_of(c.factors)].append(c.holds)
+        return found
 
     def flips(name: str) -> int:
         # Pairs of cases that differ in this factor only, and in the outcome.
-        groups: dict[tuple[str, ...], list[bool]] = defaultdict(list)
-        for c in cases:
-            groups[tuple(level for n, level in c.factors.items() if n != name)].append(c.holds)
+        groups = outcomes(lambda factors: tuple(level for n, level in factors.items() if n != name))
         return sum(sum(g) * (len(g) - sum(g)) for g in groups.values())
 
+    def verdict(word: Word, factors: Sequence[str] = (), by: str | None = None) -> ClaimVerdict:
+        groups = {} if by is None else outcomes(itemgetter(by))
+        levels = tuple((level, len(each), sum(each)) for level, each in groups.items())
+        return ClaimVerdict(word, tuple(factors), len(cases), held, levels)
+
     if not cases:
-        return ClaimVerdict("cannot be told")
+        return verdict("cannot be told")
     if of_the_machine and len({c.factors.get(ARM_FACTOR) for c in cases}) < 2:
-        return ClaimVerdict("cannot be told from a simulated truth", (ARM_FACTOR,), *counts)
+        return verdict("cannot be told from a simulated truth", [ARM_FACTOR])
     if held in (0, len(cases)):
-        return ClaimVerdict("holds" if held else "does not hold", (), *counts)
+        return verdict("holds" if held else "does not hold")
+    names = list(cases[0].factors)
     turning = sorted(filter(flips, names), key=flips, reverse=True)
     if of_the_machine and ARM_FACTOR in turning:
-        return ClaimVerdict("cannot be told from a simulated truth", (ARM_FACTOR,), *counts, levels(ARM_FACTOR))
+        return verdict("cannot be told from a simulated truth", [ARM_FACTOR], ARM_FACTOR)
     # One factor that decides every outcome says all.
-    deciding = [n for n in names if all(h in (0, count) for _, count, h in levels(n))]
+    deciding = [n for n in names if all(len(set(g)) == 1 for g in outcomes(itemgetter(n)).values())]
     factors = deciding[:1] or turning or names
-    return ClaimVerdict("turns with", tuple(factors), *counts, levels(factors[0]))
+    return verdict("turns with", factors, factors[0])
 
 
 @dataclass(frozen=True)
@@ -174,23 +176,13 @@ def checks(found: Reproduction) -> list[Check]:
     """Compare the claims of the paper, and its errors, with computed numbers."""
     return [
         *(_printed_model_checks(found) if found.ran else ()),
-        *(_table_checks(found) if found.as_printed else ()),
+        *(_table_checks(found.as_printed) if found.as_printed else ()),
         *_innovation_checks(found),
         *(_optimizer_check(found) if found.panel.contests else ()),
-        _manual_check(found),
-        _order_check(found),
-        _near_order_check(found),
+        *_machine_checks(found),
         *(_form_check(found) if found.simulated else ()),
-        _derivative_check(found),
-        _table_3_check(),
-        _one_record_check(),
-        _integer_row_check(),
+        *_paper_checks(found),
     ]
-
-
-def format_list(values: Iterable[float], digits: int = 3) -> str:
-    """Format numbers as a list."""
-    return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
 def by_angle(numbers: Mapping[str, Iterable[float]], digits: int = 3) -> str:
@@ -198,29 +190,40 @@ def by_angle(numbers: Mapping[str, Iterable[float]], digits: int = 3) -> str:
     return "; ".join(f"{symbol(name)} {format_list(values, digits)}" for name, values in numbers.items())
 
 
-def _of_angles(holding: Mapping[str, bool]) -> list[Case]:
-    return [case(v, the_angle=symbol(o)) for o, v in holding.items()]
+def format_list(values: Iterable[float], digits: int = 3) -> str:
+    """Format numbers as a list."""
+    return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
-def _of_trials(trials: Sequence[Trial], holding: Sequence[bool]) -> list[Case]:
-    return [
-        case(h, K0=prior_text(t.prior), the_arm=t.arm, the_angle=symbol(t.output), the_record=str(t.seed))
-        for t, h in zip(trials, holding, strict=True)
+def _of_angles(holding: Mapping[str, bool], **of: bool) -> ClaimVerdict:
+    return combine_cases([case(v, the_angle=symbol(o)) for o, v in holding.items()], **of)
+
+
+def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: bool) -> ClaimVerdict:
+    cases = [
+        case(bool(holds(t)), K0=prior_text(t.prior), the_arm=t.arm, the_angle=symbol(t.output), the_record=str(t.seed))
+        for t in trials
     ]
+    return combine_cases(cases, **of)
 
 
-def _by_prior(found: Reproduction, numbers: Any) -> str:
+def _by_prior(found: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
     """Format numbers of the trials on the first record of the main arm, by K0 and angle."""
     texts = []
     for prior in PRIOR_COVARIANCES:
-        first = {t.output: t for t in reversed(found.panel.trials) if t.prior == prior}
-        first = {o: first[o] for o in printed.ANGLE_NAMES if o in first}
-        texts.append(f"K0 = {prior_text(prior)}: {by_angle({o: numbers(t) for o, t in first.items()}, 4)}")
+        first = {t.output: numbers(t) for t in reversed(found.panel.trials) if t.prior == prior}
+        texts.append(f"K0 = {prior_text(prior)}: {by_angle({o: first[o] for o in ANGLE_NAMES if o in first}, 4)}")
     return "; ".join(texts)
 
 
-def _printed_a(output: str, p: int) -> float:
-    return printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
+def _printed_text(
+    number: Callable[[printed.PublishedRow], float],
+    outputs: Iterable[str] = ANGLE_NAMES,
+    lengths: Sequence[int] = (LAST_P,),
+    digits: int = 5,
+) -> str:
+    """Format a number of the fractional rows of Tables 4 and 5 for some innovation lengths, by angle."""
+    return by_angle({o: [number(printed.FRACTIONAL_ROWS[o][p]) for p in lengths] for o in outputs}, digits)
 
 
 def deviation_text(found: Reproduction) -> str:
@@ -228,7 +231,7 @@ def deviation_text(found: Reproduction) -> str:
     ratios = sorted(r.deviation_ratio for r in found.ran)
     # A response r times smaller than the angle leaves at least 1 - 1/r of its deviation.
     floors = [max(1 - 1 / r.deviation_ratio, 0.0) for r in found.ran]
-    stated = [float(printed.FRACTIONAL_ROWS[r.output][r.p].nr or 0.0) for r in found.ran]
+    stated = [printed.FRACTIONAL_ROWS[r.output][r.p].nr for r in found.ran]
     beyond = sum(low > nr for low, nr in zip(floors, stated, strict=True))
     middle = f"from {ratios[0]:.3g} to {ratios[-1]:.3g}, median {statistics.median(ratios):.3g}"
     if not beyond:
@@ -241,11 +244,13 @@ def deviation_text(found: Reproduction) -> str:
 
 
 def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
-    def of_rows(rule: Any) -> ClaimVerdict:
-        return combine_cases([case(bool(rule(r)), the_angle=symbol(r.output), p=str(r.p)) for r in found.ran])
+    ran = found.ran
 
-    worst = max(found.ran, key=lambda r: r.deviation_ratio)
-    deviations = {r.output: [r.implied_deviation] for r in found.ran}
+    def of_rows(rule: Callable[[PrintedModelRun], bool]) -> ClaimVerdict:
+        return combine_cases([case(rule(r), the_angle=symbol(r.output), p=str(r.p)) for r in ran])
+
+    worst = max(ran, key=lambda r: r.deviation_ratio)
+    deviations = {r.output: [r.implied_deviation] for r in ran}
     yield Check(
         "The printed models, under the paper's current, move as the paper's arm does.",
         of_rows(lambda r: 1 / MAX_DEVIATION_RATIO < r.deviation_ratio < MAX_DEVIATION_RATIO),
@@ -254,7 +259,7 @@ def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
         f"standard deviation of the angle by RMSE / NR [rad]: {by_angle(deviations)}",
         f"standard deviation of the response from rest within a factor of {MAX_DEVIATION_RATIO:g}",
     )
-    poles = {o: [r.stability.unstable_poles for r in found.ran if r.output == o] for o in deviations}
+    poles = {o: [r.stability.unstable_poles for r in ran if r.output == o] for o in deviations}
     yield Check(
         "The printed models are stable.",
         of_rows(lambda r: r.stability.stable),
@@ -263,8 +268,8 @@ def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
         "no pole has a positive real part",
     )
     back = [
-        (r, k, r.returned_coefficients.get(k, {}).get(f"a{printed.ANGLE_NAMES.index(r.output) + 1}", math.nan))
-        for r in found.ran
+        (r, k, r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan))
+        for r in ran
         for k in PRIOR_COVARIANCES
     ]
     last = {k: {r.output: [a] for r, prior, a in back if r.p == LAST_P and prior == k} for k in PRIOR_COVARIANCES}
@@ -275,44 +280,41 @@ def _printed_model_checks(found: Reproduction) -> Iterable[Check]:
         for r, k, _ in back
         if k in r.orders
     )
+    cases = [
+        case(
+            abs(a / printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"] - 1) < MIN_RELATIVE_DIFFERENCE,
+            K0=prior_text(k),
+            the_angle=symbol(r.output),
+            p=str(r.p),
+        )
+        for r, k, a in back
+    ]
     yield Check(
         "Identified from its own response, a printed model returns its coefficients.",
-        combine_cases(
-            [
-                case(
-                    abs(a / _printed_a(r.output, r.p) - 1) < MIN_RELATIVE_DIFFERENCE,
-                    K0=prior_text(k),
-                    the_angle=symbol(r.output),
-                    p=str(r.p),
-                )
-                for r, k, a in back
-            ]
-        ),
+        combine_cases(cases),
         f"{values}. Orders of a search around the printed ones: {orders}",
-        f"a of p = {LAST_P}: {by_angle({o: [_printed_a(o, LAST_P)] for o in deviations}, 5)}",
+        f"a of p = {LAST_P}: {_printed_text(lambda row: row.coefficients['a'], deviations)}",
         f"a within {100 * MIN_RELATIVE_DIFFERENCE:g} %, without noise, at the printed orders, with the row's own p",
     )
 
 
-def _table_checks(found: Reproduction) -> Iterable[Check]:
-    tables = found.as_printed
-    letters = ("b", "d", "g")
+def _table_checks(tables: Mapping[str, AsPrinted]) -> Iterable[Check]:
     away = ", ".join(f"{t.ratio:.2f} ({symbol(o)})" for o, t in tables.items())
     settings = "; ".join(f"{symbol(o)} {t.reading}, with K0 = 1 {t.ratio_at_unit_prior:.3g}" for o, t in tables.items())
     yield Check(
         "Tables 4 and 5 can be computed again from what the paper says.",
-        combine_cases(_of_angles({o: t.is_close for o, t in tables.items()})),
+        _of_angles({o: t.is_close for o, t in tables.items()}),
         f"as equation errors, K0 chosen for each angle, a and NR are within a mean factor of {away}; b, d, g over "
-        f"printed, p = {LAST_P}: {by_angle({o: [t.ratios[c][-1] for c in letters] for o, t in tables.items()})}. "
+        f"printed, p = {LAST_P}: {by_angle({o: [t.ratios[c][-1] for c in 'bdg'] for o, t in tables.items()})}. "
         f"Closest settings: {settings}",
-        f"a of p = {LAST_P}: {by_angle({o: [_printed_a(o, LAST_P)] for o in tables}, 5)}",
-        f"a, b, d, g and NR of all four rows within a factor of {MAX_COEFFICIENT_RATIO:g}, signs included",
+        f"a of p = {LAST_P}: {_printed_text(lambda row: row.coefficients['a'], tables)}",
+        f"a, b, d, g and NR of all four rows within a factor of {printed.MAX_COEFFICIENT_RATIO:g}, signs included",
     )
     places = ", ".join(f"{symbol(o)} {t.rank} of {t.among}" for o, t in tables.items())
     best = by_angle({o: [t.best[n] for n in ("beta", "gamma", "mu")] for o, t in tables.items()})
     yield Check(
         "The printed orders are the best ones, by any error.",
-        combine_cases(_of_angles({o: t.rank == 1 for o, t in tables.items()})),
+        _of_angles({o: t.rank == 1 for o, t in tables.items()}),
         f"place by the equation error: {places}. First are β, γ, μ: {best}",
         "place 1",
         f"place 1 among β, γ, μ from {printed.MIN_GRID_ORDER:g} to {printed.MAX_GRID_ORDER:g} in increments of "
@@ -338,21 +340,20 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
 
 def _innovation_checks(found: Reproduction) -> Iterable[Check]:
     trials = found.panel.trials
-    ruling = combine_cases(_of_trials(trials, [error_falls(t) for t in trials]))
+    ruling = _of_trials(trials, error_falls)
     rule = (
         f"no step of p is worse, and p = {LAST_P} is better than p = {FIRST_P} by {100 * MIN_RELATIVE_DIFFERENCE:g} %"
     )
-    stated = {o: [float(r.error or 0.0) for r in printed.FRACTIONAL_ROWS[o].values()] for o in printed.ANGLE_NAMES}
     yield Check(
         "A larger innovation length p gives a smaller error (45): Tables 4 and 5.",
         ruling,
         f"{ruling.counts}. Errors of p = 1, 3, 5, 7 on the first record: "
         f"{_by_prior(found, lambda t: t.errors.values())}",
-        f"errors of p = 1, 3, 5, 7: {by_angle(stated, 5)}",
+        f"errors of p = 1, 3, 5, 7: {_printed_text(lambda row: row.error, lengths=INNOVATION_LENGTHS)}",
         rule,
     )
     apart = [t for t in trials if converges_faster(t.convergence_steps) is not None]
-    ruling = combine_cases(_of_trials(apart, [bool(converges_faster(t.convergence_steps)) for t in apart]))
+    ruling = _of_trials(apart, lambda t: converges_faster(t.convergence_steps))
     if trials:
         yield Check(
             "A larger p converges faster: Figures 4(b), 5(b), 7(b), 8(b).",
@@ -364,17 +365,16 @@ def _innovation_checks(found: Reproduction) -> Iterable[Check]:
             f"all p arrive, no larger p later, and p = {LAST_P} {100 * MIN_STEP_SAVING:g} % sooner than p = {FIRST_P}",
         )
     weak = [t for t in trials if t.prior == WEAK_PRIOR]
-    ruling = combine_cases(_of_trials(weak, [error_falls(t) for t in weak]))
-    ratios = [
-        t.errors[LAST_P] / t.errors[FIRST_P] for t in weak if math.isfinite(t.errors[FIRST_P]) and t.errors[FIRST_P]
-    ]
+    ruling = _of_trials(weak, error_falls)
+    errors = [(t.errors[FIRST_P], t.errors[LAST_P]) for t in weak]
+    ratios = [last / first for first, last in errors if math.isfinite(first) and first]
     spread = [weak_prior_variation(each) for s in found.stages.values() for each in s.weak.values()]
     words = "no record that starts at rest"
     if ratios:
         words = f"{ruling.counts}; errors of p = {LAST_P} over p = {FIRST_P}: {min(ratios):.4g} to {max(ratios):.4g}"
     if spread:
         words += f"; coefficients at the same orders differ by at most {100 * max(spread):.2g} %"
-    away = ", ".join(f"{100 * printed.printed_saturation(o)[2]:.2g} % ({symbol(o)})" for o in printed.ANGLE_NAMES)
+    away = ", ".join(f"{100 * printed.printed_saturation(o)[2]:.2g} % ({symbol(o)})" for o in ANGLE_NAMES)
     yield Check(
         "p itself improves the estimate.",
         ruling,
@@ -397,31 +397,22 @@ def beats(error: float, seeds: Iterable[float]) -> bool:
 
 def _optimizer_check(found: Reproduction) -> Iterable[Check]:
     contests = found.panel.contests
-    ruling = combine_cases(
-        [
-            case(
-                beats(error, errors.values()),
-                K0=prior_text(k),
-                the_arm=c.arm,
-                the_angle=symbol(c.output),
-                the_rival=name,
-            )
-            for c in contests
-            for k, error in c.order_grid.items()
-            for name, errors in (("genetic", c.genetic), ("differential evolution", c.evolution))
-        ]
-    )
+    cases = [
+        case(beats(error, errors.values()), K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_rival=name)
+        for c in contests
+        for k, error in c.order_grid.items()
+        for name, errors in c.optimizers.items()
+    ]
+    ruling = combine_cases(cases)
     first = {c.output: c for c in reversed(contests)}
-    own = {o: first[o] for o in printed.ANGLE_NAMES if o in first}
+    own = {o: first[o] for o in ANGLE_NAMES if o in first}
+    of_seeds = (min, statistics.median, max)
     errors = {
-        o: (
-            *c.order_grid.values(),
-            *(f(each.values()) for each in (c.genetic, c.evolution) for f in (min, statistics.median, max)),
-        )
+        o: (*c.order_grid.values(), *(f(each.values()) for each in c.optimizers.values() for f in of_seeds))
         for o, c in own.items()
     }
     budgets = ", ".join(dict.fromkeys(f"{c.candidates} candidates and evaluations a seed" for c in own.values()))
-    seeds = " to ".join(dict.fromkeys(str(f(len(c.genetic) for c in contests)) for f in (min, max)))
+    seeds = " to ".join(dict.fromkeys(str(f(len(c.optimizers["genetic"]) for c in contests)) for f in (min, max)))
     stated = {o: [part[0] for part in printed.TABLE_7_CRITERIA[o]] for o in own}
     yield Check(
         "Multi-innovation has a smaller error than the genetic algorithm: Figure 11, Table 7.",
@@ -433,64 +424,48 @@ def _optimizer_check(found: Reproduction) -> Iterable[Check]:
     )
 
 
-def _manual_check(found: Reproduction) -> Check:
-    trials = found.panel.trials
-    ruling = combine_cases(_of_trials(trials, [t.nr < t.manual for t in trials]), of_the_machine=found.simulated)
-    stated = {
-        o: (printed.INTEGER_ROWS[o].nr or 0.0, printed.FRACTIONAL_ROWS[o][LAST_P].nr or 0.0)
-        for o in printed.ANGLE_NAMES
-    }
-    return Check(
+def _machine_checks(found: Reproduction) -> Iterable[Check]:
+    """Check the claims about the machine, which a simulation decides only as far as its arms agree."""
+    ruling = _of_trials(found.panel.trials, lambda t: t.nr < t.manual, of_the_machine=found.simulated)
+    both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
+    yield Check(
         "The fractional model (p = 7) is closer to the run than the manual's integer-order model: Figures 6 and 9.",
         ruling,
         f"{ruling.counts}. NR of the manual's model and of p = {LAST_P}, first record: "
         f"{_by_prior(found, lambda t: (t.manual, t.nr))}",
-        f"NR of both: {by_angle(stated, 4)}",
+        f"NR of both: {by_angle(both, 4)}",
         f"NR of p = {LAST_P} below that of the manual's model, by explicit Euler, identified from none of these runs",
+    )
+    yield _order_check(found)
+    near = {o: s.printed_orders.estimation for s, o in found.angles}
+    nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
+    yield Check(
+        "The orders of Tables 4 and 5 (2; 1.95 to 1.8) describe the arm.",
+        _of_angles(
+            {o: out < MAX_ERROR_RATIO * eq and out < MAX_EXPLAINING_NR for o, (eq, out) in nr.items()},
+            of_the_machine=found.simulated,
+        ),
+        f"NR of the equation and of the free run, best coefficients for these orders: {by_angle(nr)}",
+        f"NR of p = {LAST_P}: {_printed_text(lambda row: row.nr, near, digits=4)}",
+        f"NR of the free run below {MAX_EXPLAINING_NR:g} and below {MAX_ERROR_RATIO:g} times that of the equation",
     )
 
 
 def _order_check(found: Reproduction) -> Check:
     freed = found.panel.order_comparisons
     known = [(f, o, earns) for f in freed for o in f.free_nr if (earns := f.earns(o)) is not None]
-    ruling = combine_cases(
-        [case(earns, the_arm=f.arm, the_angle=symbol(o)) for f, o, earns in known], of_the_machine=found.simulated
-    )
+    cases = [case(earns, the_arm=f.arm, the_angle=symbol(o)) for f, o, earns in known]
+    ruling = combine_cases(cases, of_the_machine=found.simulated)
     both = [f"{f.arm}: {by_angle({o: (f.integer_nr[o], f.free_nr[o]) for o in f.free_nr})}" for f in freed]
-    away = [
-        f"{f.arm}, stage {f.stage}: "
-        f"{', '.join(f'{symbol(n)} {f.orders[n][0]:.3g}' for n in f.fractional_orders) or 'none'}"
-        for f in freed
-    ]
     return Check(
         "Fractional orders describe the arm better than whole ones.",
         ruling,
         f"{ruling.counts}. Not told in {sum(len(f.free_nr) for f in freed) - len(known)} cases. NR with integer and "
         f"with free orders on their own run: {'; '.join(both)}. Orders whose interval excludes the integer one: "
-        f"{'; '.join(away)}",
+        f"{'; '.join(f'{f.arm}, stage {f.stage}: {f.fractional_text}' for f in freed)}",
         "orders 1.8 to 2 in Tables 4 and 5",
         "(14)–(15) by output error from the current alone, on runs that neither model was fitted to, by the rule of "
         "ftlm orders; a fit that must not be used is no case",
-    )
-
-
-def _near_order_check(found: Reproduction) -> Check:
-    near = {
-        o: tuple(
-            part[o].nr
-            for part in (s.printed_orders.estimation.equation_error, s.printed_orders.estimation.output_error)
-        )
-        for s, o in found.angles
-    }
-    return Check(
-        "The orders of Tables 4 and 5 (2; 1.95 to 1.8) describe the arm.",
-        combine_cases(
-            _of_angles({o: out < MAX_ERROR_RATIO * eq and out < MAX_EXPLAINING_NR for o, (eq, out) in near.items()}),
-            of_the_machine=found.simulated,
-        ),
-        f"NR of the equation and of the free run, best coefficients for these orders: {by_angle(near)}",
-        f"NR of p = {LAST_P}: {by_angle({o: [printed.FRACTIONAL_ROWS[o][LAST_P].nr or 0.0] for o in near}, 4)}",
-        f"NR of the free run below {MAX_EXPLAINING_NR:g} and below {MAX_ERROR_RATIO:g} times that of the equation",
     )
 
 
@@ -499,12 +474,12 @@ def _form_check(found: Reproduction) -> Iterable[Check]:
     cases: list[Case] = []
     away: list[str] = []
     fits: dict[str, list[float]] = {}
-    left_out, count = [], 0
+    omitted, count = "", 0
     for number, stage in found.stages.items():
         both = [stage.candidates[n] for n in ("output error", "published, output error")]
         result = both[1].result
         if result is None or not are_usable(*both):
-            left_out.append(number)
+            omitted += f"; stage {number} is no case, because one of its fits must not be used"
             continue
         fits |= {o: [c.estimation.output_error[o].fit for c in both] for o in stage.outputs}
         before = len(away)
@@ -515,7 +490,6 @@ def _form_check(found: Reproduction) -> Iterable[Check]:
                 away.append(f"{symbol(name)} {value:.4g} ± {error:.2g} ({known:g})")
         count += len(result.orders)
         cases.append(case(len(away) == before, the_stage=str(number)))
-    omitted = "".join(f"; stage {n} is no case, because one of its fits must not be used" for n in left_out)
     yield Check(
         "Equations (22)–(25) find the orders of an arm that (14)–(15) describe.",
         combine_cases(cases),
@@ -528,12 +502,26 @@ def _form_check(found: Reproduction) -> Iterable[Check]:
     )
 
 
-def _derivative_check(found: Reproduction) -> Check:
+def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
+    """Coefficients of (22)-(25) from Table 3, from the effective parameters, and as printed in the integer rows."""
+    sets = [{1: PARAMETER_SETS[n][1], 2: PARAMETER_SETS[n][2]} for n in ("table-3", "effective")]
+    found = {}
+    for output, row in printed.INTEGER_ROWS.items():
+        stage = printed.stage_of(output)
+        table, effective = (parameters[stage].coefficients(stage) for parameters in sets)
+        for letter, value in row.coefficients.items():
+            name = printed.parameter_name(letter, output)
+            found[name] = (table[name], effective[name], value)
+    return found
+
+
+def _paper_checks(found: Reproduction) -> Iterable[Check]:
+    """Check what the paper says in itself, as far as its own numbers decide."""
     orders = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
     parts = [stage.derived for stage in found.stages.values()]
     changed = ", ".join(f"{metrics(p.derived, p.published).nr:.3g} ({symbol(p.output)})" for p in parts)
-    return Check(
+    yield Check(
         "Eliminating the other angle leaves the current as it is: (19), (21).",
         combine_cases([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in dropped.items()]),
         f"order of the current's derivative: {format_list(dropped.values(), 2)} at the printed orders. "
@@ -543,57 +531,34 @@ def _derivative_check(found: Reproduction) -> Check:
         "order 0",
         "order 0 at the printed orders",
     )
-
-
-def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
-    """Coefficients of (22)-(25) from Table 3, from the effective parameters, and as printed in the integer rows."""
-    found = {}
-    for stage in (1, 2):
-        table, effective = (PARAMETER_SETS[n][stage].coefficients(stage) for n in ("table-3", "effective"))
-        for k in (1, 2):
-            for letter, value in printed.INTEGER_ROWS[f"theta{stage}{k}"].coefficients.items():
-                name = f"{letter}{2 * stage - 2 + k}"
-                found[name] = (table[name], effective[name], value)
-    return found
-
-
-def _table_3_check() -> Check:
     rows = table_3_coefficients()
     ratios = {n: t / p for n, (t, _, p) in rows.items()}
-    effective = max(abs(e / p - 1) for _, e, p in rows.values())
-    off = [n for n, r in ratios.items() if abs(r - 1) > MIN_RELATIVE_DIFFERENCE]
-    worst = max(off, key=lambda n: abs(math.log(abs(ratios[n]))), default=None)
-    words = "" if worst is None else f"; {worst} is {ratios[worst]:.3g} times the printed value"
-    return Check(
+    off = {n: r for n, r in ratios.items() if abs(r - 1) > MIN_RELATIVE_DIFFERENCE}
+    worst = max(off, key=lambda n: abs(math.log(abs(off[n]))))
+    yield Check(
         "Table 3 gives the integer-order models of Tables 4 and 5.",
         combine_cases([case(not off)]),
-        f"{len(off)} of {len(rows)} coefficients are not those printed{words}. The maker's effective parameters, "
-        f"torque with gear and efficiency, give all of them to {100 * effective:.1g} %",
-        "" if worst is None else f"{worst} = {rows[worst][2]:g}",
+        f"{len(off)} of {len(rows)} coefficients are not those printed; {worst} is {ratios[worst]:.3g} times the "
+        "printed value. The maker's effective parameters, torque with gear and efficiency, give all of them to "
+        f"{100 * max(abs(e / p - 1) for _, e, p in rows.values()):.1g} %",
+        f"{worst} = {rows[worst][2]:g}",
         f"every coefficient within {100 * MIN_RELATIVE_DIFFERENCE:g} %",
     )
-
-
-def _one_record_check() -> Check:
-    spreads = implied_spreads()
-    return Check(
+    spreads = printed.implied_spreads()
+    yield Check(
         "Table 7 compares both algorithms on one record.",
-        combine_cases(_of_angles({o: abs(g / m - 1) <= MAX_DEVIATION_MISMATCH for o, (g, m) in spreads.items()})),
+        _of_angles({o: abs(g / m - 1) <= MAX_DEVIATION_MISMATCH for o, (g, m) in spreads.items()}),
         "standard deviation of the angle by RMSE / NR, genetic algorithm and multi-innovation [rad]: "
         f"{by_angle(spreads)}",
         "one record, which has one standard deviation",
         f"both standard deviations within {100 * MAX_DEVIATION_MISMATCH:g} %",
     )
-
-
-def _integer_row_check() -> Check:
     row = printed.INTEGER_ROWS["theta22"]
-    error, rmse = float(row.error or 0.0), float(row.rmse or 0.0)
-    mean = error / printed.PULSE_COUNT
-    return Check(
+    mean = row.error / printed.PULSE_COUNT
+    yield Check(
         "The integer row of θ₂₂ in Table 5 is possible.",
-        combine_cases([case(mean <= rmse, the_angle="θ₂₂")]),
+        combine_cases([case(mean <= row.rmse, the_angle="θ₂₂")]),
         f"mean absolute error {mean:.3g} rad over {printed.PULSE_COUNT} points",
-        f"error {error:g}, RMSE {rmse:g} rad",
+        f"error {row.error:g}, RMSE {row.rmse:g} rad",
         "mean absolute error at most the RMSE",
     )

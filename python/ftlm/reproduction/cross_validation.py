@@ -1,11 +1,15 @@
-"""Cross-validation of fractional against integer orders on the links of a measured arm."""
+"""Cross-validation of fractional against integer orders on the links of a measured arm, with its page."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
+
+from markupsafe import Markup
 
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
@@ -13,14 +17,21 @@ from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import MIN_FIT_GAIN, have_common_value, improves_prediction, is_degenerate
+from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import Progress
-from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run
+from ftlm.report.html_report import grouped_findings
+from ftlm.report.typesetting import equation_html
+from ftlm.reproduction.figures import angle_chart
+from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
 from ftlm.structure.structure import Structure
-from ftlm.utils.formatting import symbol
+from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
+from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.utils.files import check_free
+from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, join_names
-from ftlm.validation.comparison import Comparison, finite
+from ftlm.validation.comparison import Comparison, finite, plain
 
 #: Free orders of each structure; the other orders are integer.
 INTEGER_KIND = "whole orders"
@@ -35,6 +46,20 @@ WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 MOST_ROWS = 1250
 #: Label of the structures of ``Deflection.before``.
 WITHOUT_RATE_LABEL = "without the rate of the other deflection"
+
+
+#: Structure in the charts: elasticity and damping fractional, as in the paper.
+CHARTED_KIND = "both fractional"
+#: Subject of a verdict for each kind; one of them is a plural.
+VERDICT_SUBJECTS = {
+    "fractional elasticity": "a fractional order of the elasticity",
+    "fractional damping": "a fractional order of the damping",
+    CHARTED_KIND: "fractional orders",
+}
+#: Verdict in a table cell.
+VERDICT_CELLS = {True: "yes", False: "no", None: "cannot be told"}
+#: Points of a line.
+LINE_POINTS = 700
 
 
 @dataclass(frozen=True)
@@ -66,7 +91,7 @@ class RunFit:
         """
         joint = self.result.joint
         values = {**self.result.orders, **({} if joint is None else joint.coefficients)}
-        letters = {n.rstrip("0123456789"): n for n in values}
+        letters = {letter_of(n): n for n in values}
         names = {n: n for n in values}
         if {"beta", "mu"} <= letters.keys() and values[letters["beta"]] > values[letters["mu"]]:
             for one, other in (("beta", "mu"), ("a", "d")):
@@ -77,6 +102,16 @@ class RunFit:
     def numbers(self) -> int:
         """Number of free orders and coefficients."""
         return len(self.estimates)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fit for JSON."""
+        return {
+            "numbers": self.numbers,
+            "fit": {run: finite(self.fit(run)) for run in self.comparisons},
+            "estimates": {n: float(v) for n, (v, *_) in self.estimates.items()},
+            "intervals": {n: plain(ends) for n, (_, *ends) in self.estimates.items()},
+            "warnings": list(self.result.warnings),
+        }
 
 
 @dataclass(frozen=True)
@@ -143,7 +178,7 @@ class Deflection:
         return {
             name: {run: each.estimates[name][1:] for run, each in self.fits[kind].items()}
             for name in self.structure.order_names
-            if name.rstrip("0123456789") in FREE_ORDERS_BY_KIND[kind]
+            if letter_of(name) in FREE_ORDERS_BY_KIND[kind]
         }
 
     @property
@@ -153,26 +188,26 @@ class Deflection:
 
     def verdict(self, kind: str) -> Verdict:
         """Verdict of one kind, from its gains and intervals."""
-        told = self.intervals(kind)
-        whole = {name: WHOLE_ORDERS[name.rstrip("0123456789")] for name in told}
+        told, whole_fits, fits = self.intervals(kind), self.fits[INTEGER_KIND], self.fits[kind]
         worse = self.worse(kind)
-        degenerate = [r for r, f in self.fits[kind].items() if is_degenerate(f.result)]
-        degenerate += [r for r, f in self.fits[INTEGER_KIND].items() if is_degenerate(f.result) and r not in degenerate]
+        bad = [run for each in (fits, whole_fits) for run, f in each.items() if is_degenerate(f.result)]
+        degenerate = list(dict.fromkeys(bad))
         complete = not worse and not degenerate and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
+        whole = {name: WHOLE_ORDERS[letter_of(name)] for name in told}
         earns = improves_prediction(list(self.gains(kind).values()), told, whole) if complete else None
-        before, after = (
-            {
-                pair: "no fit" if pair[0] not in self.fits[k] else percent(self.fits[k][pair[0]].fit(pair[1]))
-                for pair in self.gains(kind)
-            }
-            for k in (INTEGER_KIND, kind)
+
+        def fit(each: Mapping[str, RunFit], run: str, other: str) -> str:
+            return percent(each[run].fit(other)) if run in each else "no fit"
+
+        pairs = "; ".join(
+            f"{run} → {other} {fit(whole_fits, run, other)}, then {fit(fits, run, other)}"
+            for run, other in self.gains(kind)
         )
-        fits = "; ".join(f"{run} → {other} {before[run, other]}, then {after[run, other]}" for run, other in before)
         orders = "; ".join(
             f"{symbol(name)} " + ", ".join(f"{_range(low, high)} on {run}" for run, (low, high) in each.items())
             for name, each in told.items()
         )
-        words = f"Fit of unseen runs, percent: {fits}. 95 % intervals: {orders}."
+        words = f"Fit of unseen runs, percent: {pairs}. 95 % intervals: {orders}."
         if not all(have_common_value(each.values()) for each in told.values()):
             words += " The runs contradict each other."
         if worse:
@@ -180,6 +215,15 @@ class Deflection:
         if degenerate:
             words += f" On {', '.join(degenerate)} one of the two fits must not be used, so nothing follows from it."
         return Verdict(kind, earns, words)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return fits and verdicts of this structure for JSON."""
+        return {
+            "equation": str(self.structure),
+            "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in self.verdicts},
+            "fits": plain(self.fits),
+            "failed": {f"{kind}, {run}": words for (kind, run), words in self.failed.items()},
+        }
 
 
 def _range(low: float, high: float) -> str:
@@ -223,33 +267,11 @@ class UnseenOrders:
             "filtered": self.filtered,
             "margin": MIN_FIT_GAIN,
             "deflections": {
-                output: _deflection_dict(d) | ({} if d.before is None else {"without_rate": _deflection_dict(d.before)})
+                output: d.to_dict() | ({} if d.before is None else {"without_rate": d.before.to_dict()})
                 for output, d in self.deflections.items()
             },
             "notes": list(self.notes),
         }
-
-
-def _deflection_dict(deflection: Deflection) -> dict[str, Any]:
-    """Return fits and verdicts of one structure for JSON."""
-    return {
-        "equation": str(deflection.structure),
-        "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in deflection.verdicts},
-        "fits": {
-            kind: {
-                run: {
-                    "numbers": f.numbers,
-                    "fit": {other: finite(f.fit(other)) for other in f.comparisons},
-                    "estimates": {n: float(v) for n, (v, *_) in f.estimates.items()},
-                    "intervals": {n: list(map(finite, ends)) for n, (_, *ends) in f.estimates.items()},
-                    "warnings": list(f.result.warnings),
-                }
-                for run, f in each.items()
-            }
-            for kind, each in deflection.fits.items()
-        },
-        "failed": {f"{kind}, {run}": words for (kind, run), words in deflection.failed.items()},
-    }
 
 
 def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool = True) -> Structure:
@@ -378,7 +400,7 @@ def _deflection(
     fits: dict[str, dict[str, RunFit]] = {kind: {} for kind in FREE_ORDERS_BY_KIND}
     failed = {}
     for kind, free in FREE_ORDERS_BY_KIND.items():
-        letters = {n: n.rstrip("0123456789") for n in structure.order_names}
+        letters = {n: letter_of(n) for n in structure.order_names}
         held = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
         for run in runs:
             log(f"{output}{told}: {kind}, fitted to {run.name}")
@@ -390,3 +412,214 @@ def _deflection(
                     raise ModelError(f"{output}, whole orders, fitted to {run.name}: {error}") from error
                 failed[kind, run.name] = str(error)
     return Deflection(output, structure, fits, failed)
+
+
+def sentence(output: str, verdict: Verdict) -> str:
+    """Return a verdict as a sentence."""
+    several = verdict.kind == CHARTED_KIND
+    what, yes = VERDICT_SUBJECTS[verdict.kind], "earn their place" if several else "earns its place"
+    if verdict.earns is None:
+        return f"{symbol(output)}: whether {what} {yes} cannot be told."
+    no = f"do{'' if several else 'es'} not {yes.replace('earns', 'earn')}"
+    return f"{symbol(output)}: {what} {yes if verdict.earns else no}."
+
+
+def _structures(found: UnseenOrders) -> list[tuple[str, Deflection]]:
+    """Return every structure with its heading; those without the rate follow those with it."""
+    both = [(o, suffix, d) for o, full in found.deflections.items() for suffix, d in _with_and_without(full)]
+    return [(f"{symbol(o)}{suffix}", d) for o, suffix, d in both]
+
+
+def _with_and_without(full: Deflection) -> list[tuple[str, Deflection]]:
+    return [("", full)] + ([] if full.before is None else [(f", {WITHOUT_RATE_LABEL}", full.before)])
+
+
+def _verdict(output: str, verdict: Verdict) -> Markup:
+    template = Markup('<span class="verdict"><strong>{}</strong><span class="note">{}</span></span>')
+    return template.format(sentence(output, verdict), verdict.words)
+
+
+def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
+    """Charts of a deflection and its simulations by both structures on the run after the estimation run."""
+    charts, output = [], deflection.output
+    names = [run.name or "" for run in found.runs]
+    for run, judged in zip(names, names[1:] + names[:1], strict=True):
+        at = deflection.fits[INTEGER_KIND][run].comparisons[judged]
+        lines, words = [("measured", at.measured[output][0])], []
+        for kind in (INTEGER_KIND, CHARTED_KIND):
+            fitted = deflection.fits[kind].get(run)
+            if fitted is None:
+                words.append(f"{kind}: no fit")
+                continue
+            lines.append((kind, fitted.comparisons[judged].simulated[output][0]))
+            words.append(f"{kind} {percent(fitted.fit(judged))} % with {fitted.numbers} numbers")
+        caption = "; ".join(words)
+        options = {"points": LINE_POINTS, "width": SMALL_WIDTH_PX}
+        title = f"{symbol(output)} on {judged}, fitted to {run}"
+        charts.append(
+            angle_chart(pulse_times(at), lines, output, title, f"{caption[0].upper()}{caption[1:]}.", **options)
+        )
+    return charts
+
+
+def places_table(found: UnseenOrders) -> Table | None:
+    """Table of the verdicts without and with the rate of the other deflection."""
+    rows = {
+        symbol(output): [
+            [kind, *(VERDICT_CELLS[d.verdict(kind).earns] for d in (full.before, full))] for kind in VERDICT_SUBJECTS
+        ]
+        for output, full in found.deflections.items()
+        if full.before is not None
+    }
+    if not rows:
+        return None
+    return Table.from_groups(
+        "Does the order earn its place?",
+        ("order", "without rate", "with rate"),
+        rows,
+        note="The rate of the other deflection stands in a link's equation as the gain of an observer would. An order "
+        "that earns its place only without the rate compensates for that gain.",
+    )
+
+
+def fits_table(found: UnseenOrders) -> Table:
+    """Table of the fits of every structure on all runs, with its orders."""
+    pairs = [(run.name, other.name) for run in found.runs for other in found.runs]
+    rows: dict[str, list[list[Cell]]] = {}
+    for heading, deflection in _structures(found):
+        rows[heading] = []
+        for kind, each in deflection.fits.items():
+            numbers = next((Exact(f.numbers) for f in each.values()), None)
+            shown = [percent(each[run].fit(other)) if run in each else None for run, other in pairs]
+            cells = [
+                v if v is None or run == other else Markup("<strong>{}</strong>").format(v)
+                for v, (run, other) in zip(shown, pairs, strict=True)
+            ]
+            rows[heading].append([kind, numbers, *cells])
+    heads = [f"{run}, fitted" if run == other else f"{run} → {other}" for run, other in pairs]
+    return Table.from_groups(
+        "Fit of the free run in percent",
+        ("structure", "numbers free", *heads),
+        rows,
+        note="Bold: validation runs. 100 is perfect, 0 is as good as the mean. Initial terms, initial state of the "
+        "filter and gauge offset belong to a run; of a validation run nothing else is estimated.",
+    )
+
+
+def estimates_table(deflection: Deflection, suffix: str = "") -> Table:
+    """Table of the estimates with 95 % intervals of every fit, one line per parameter."""
+    rows: dict[str, list[list[Cell]]] = {
+        f"{kind}, fitted to {run}": [
+            [symbol_html(name), value, *(v if math.isfinite(v) else format_bound(v) for v in ends)]
+            for name, (value, *ends) in fitted.estimates.items()
+        ]
+        for kind, each in deflection.fits.items()
+        for run, fitted in each.items()
+    }
+    title = f"{symbol(deflection.output)}{suffix}: estimates and their 95 % intervals"
+    return Table.from_groups(title, ("number", "estimate", "from", "to"), rows)
+
+
+def _deflection_section(full: Deflection) -> Section:
+    parts = _with_and_without(full)
+    results = {
+        f"{kind}, {run}{suffix}": f.result for suffix, d in parts for kind, e in d.fits.items() for run, f in e.items()
+    }
+    failed = [f"{kind}, {run}{suffix}: {words}" for suffix, d in parts for (kind, run), words in d.failed.items()]
+    whole, free = full.fits[INTEGER_KIND], full.fits[CHARTED_KIND]
+    run, fitted = next(iter({**whole, **free}.items()))
+    models = next(iter(whole.values())).result.model, fitted.result.model
+    return Section(
+        symbol(full.output),
+        [
+            f"With integer orders and with both free, fitted to {run}:",
+            *(equation_html(e) for e in dict.fromkeys(e for m in models for e in m.equations)),
+        ],
+        warnings=[*failed, *grouped_findings(results)],
+        tables=[estimates_table(d, suffix) for suffix, d in parts],
+    )
+
+
+def _method_section(found: UnseenOrders) -> Section:
+    rows: list[list[Cell]] = [[r.name, r.length, Exact(round(r.step, 9)), r.duration] for r in found.runs]
+    filtered = " Both deflections passed the 2 Hz low-pass of the arm's stock model." if found.filtered else ""
+    words = [
+        "A link is the Euler–Lagrange equation (15) with the terms of a real arm: the measured motion of its hub, "
+        "whose coefficient −1 is known; the accelerations of the other stage and the rate of its deflection, if both "
+        f"stages were measured; hub angles in the gauge; an offset of the gauge.{filtered}",
+        "All structures have the same terms. Integer orders: elasticity of order 0, damping of order 1.",
+        "An order earns its place if every estimation run's 95 % interval excludes the integer order, the intervals of "
+        f"the runs have a common value, no validation run loses {MIN_FIT_GAIN:g} points of fit and the median gain is "
+        "as large. It does not if no validation run gains as much, or if no interval excludes the integer order and "
+        "the median gain is smaller. Otherwise the verdict cannot be told, for example for a fit that is worse on its "
+        "own run than the integer orders that its structure contains.",
+        *found.notes,
+    ]
+    return Section("How it is judged", words, tables=[Table("Runs", ("run", "rows", "step [s]", "length [s]"), rows)])
+
+
+def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """Write charts, verdicts and numbers as one HTML page.
+
+    Parameters
+    ----------
+    found
+        From :func:`orders_on_unseen_runs`.
+    path
+        File to write.
+    force
+        Overwrite.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    DataError
+        The file exists and ``force`` is not set, or cannot be written.
+    """
+    check_free(path, force=force)
+    each = {kind: [_verdict(o, d.verdict(kind)) for o, d in found.deflections.items()] for kind in VERDICT_SUBJECTS}
+    first = each.pop(CHARTED_KIND)
+    charts = [chart for d in found.deflections.values() for chart in unseen_charts(found, d)]
+    places = places_table(found)
+    alone = [verdict for pair in zip(*each.values(), strict=True) for verdict in pair]
+    sections = [
+        Section("On runs that were not fitted to", first, figures=charts, small=True),
+        Section("One order at a time", alone, tables=[*([] if places is None else [places]), fits_table(found)]),
+        *(_deflection_section(d) for d in found.deflections.values()),
+        _method_section(found),
+    ]
+    names = ", ".join(run.name or "" for run in found.runs)
+    lead = (
+        f"Deflections of a flexible arm in runs {names}: each model is fitted to one run and simulated on another, "
+        "with integer orders and with fractional ones in the same terms."
+    )
+    return write_page(path, title="Integer against fractional orders", sections=sections, lead=lead, force=force)
+
+
+def unseen_text(found: UnseenOrders) -> str:
+    """Summary of verdicts and fits for a terminal."""
+    lines: list[str] = []
+    for output, full in found.deflections.items():
+        for verdict in full.verdicts:
+            lines += [sentence(output, verdict), f"    {verdict.words}"]
+    for output, full in found.deflections.items():
+        if full.before is not None:
+            lines += ["", f"{symbol(output)}, {WITHOUT_RATE_LABEL}:"]
+            lines += [f"    {sentence(output, verdict)}" for verdict in full.before.verdicts]
+    names = [run.name or "" for run in found.runs]
+    for heading, deflection in _structures(found):
+        lines += ["", f"{heading}: fit of the free run in percent, fitted to the first, judged on the second"]
+        lines.append(" " * 24 + "numbers".rjust(8) + "".join(f"{a} → {b}".rjust(18) for a in names for b in names))
+        lines += [_line(kind, deflection, names) for kind in FREE_ORDERS_BY_KIND]
+    return "\n".join([*lines, *(f"note: {n}" for n in found.notes)])
+
+
+def _line(kind: str, deflection: Deflection, names: Sequence[str]) -> str:
+    each = deflection.fits[kind]
+    numbers = next((str(f.numbers) for f in each.values()), "–")
+    shown = [percent(each[a].fit(b)) if a in each else "no fit" for a in names for b in names]
+    return kind.ljust(24) + numbers.rjust(8) + "".join(text.rjust(18) for text in shown)

@@ -17,25 +17,23 @@ from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
 from ftlm.order_search.result import search_summary
-from ftlm.plot.comparison_charts import comparison_charts
+from ftlm.plot.comparison_charts import compared_bars, comparison_charts
 from ftlm.plot.model_charts import pole_charts
 from ftlm.progress import ShareTracker
 from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
 from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 from ftlm.reproduction.figures import convergence_chart, derivative_chart
-from ftlm.reproduction.published_values import ANGLE_NAMES, INNOVATION_LENGTHS
+from ftlm.reproduction.published_values import INNOVATION_LENGTHS
 from ftlm.reproduction.report import fits_text, joint_equations
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage_models import Preset, StageWork
-from ftlm.reproduction.stage_result import GRID_ALPHA, DroppedDerivative
+from ftlm.reproduction.stage_result import GRID_ALPHA, Candidate, DroppedDerivative
 from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
 from ftlm.structure.order_grid import OrderGrid
-from ftlm.svg.bar_chart import bar_chart
-from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
 from ftlm.utils.formatting import Cell, symbol, wrap_text
-from ftlm.validation.comparison import finite
+from ftlm.validation.comparison import plain
 
 #: Candidates that the result of an order search keeps.
 TOP_CANDIDATES = 20
@@ -64,10 +62,8 @@ class Demo:
     ----------
     square, sine
         The runs.
-    rows
-        Table rows by stage.
-    results
-        Identifications by stage and label.
+    models
+        Models by stage and label.
     traces
         Convergence by output and p.
     derived
@@ -78,11 +74,27 @@ class Demo:
 
     square: Run
     sine: Run
-    rows: dict[int, list[PaperRow]]
-    results: dict[int, dict[str, Identification]]
+    models: dict[int, dict[str, Candidate]]
     traces: dict[str, dict[int, MultiInnovationTrace]]
     derived: dict[int, DroppedDerivative]
     files: list[Path]
+
+    @property
+    def results(self) -> dict[int, dict[str, Identification]]:
+        """Identifications by stage and label."""
+        return {n: {k: c.result for k, c in m.items() if c.result is not None} for n, m in self.models.items()}
+
+    @property
+    def rows(self) -> dict[int, list[PaperRow]]:
+        """Table rows by stage, those of one output together."""
+        return {
+            n: [
+                paper_row(label, c.model, c.estimation, output, c.validation)
+                for output in models["output error"].model.outputs
+                for label, c in models.items()
+            ]
+            for n, models in self.models.items()
+        }
 
     @cached_property
     def validations(self) -> dict[int, Validation]:
@@ -94,41 +106,16 @@ class Demo:
         """Orders and free coefficients of the simulated arm, by stage."""
         return {stage: truth_of(stage) for stage in STAGE_NUMBERS}
 
-    def rows_by_output(self, stage: int) -> list[PaperRow]:
-        """Return the table rows of a stage, those of one output together."""
-        return sorted(self.rows[stage], key=lambda r: r.output)
-
-    def fits(self, stage: int) -> dict[str, list[float]]:
-        """Fit of the free run of every model in percent: for each output on the square run and on the sine run."""
-        found: dict[str, list[float]] = {}
-        for r in self.rows[stage]:
-            fits = [math.nan if f is None else f.fit for f in (r.output_error, r.validation)]
-            found.setdefault(r.label, []).extend(fits)
-        return found
-
     def to_dict(self) -> dict[str, Any]:
         """Return rows and estimates for JSON."""
-
-        def row(r: PaperRow) -> dict[str, Any]:
-            index = 1 + ANGLE_NAMES.index(r.output)
-            numbers = {"orders": r.orders, "coefficients": r.coefficients}
-            errors = {f: getattr(r, f) for f in ("equation_error", "output_error", "validation")}
-            return (
-                {"model": r.label, "output": r.output}
-                | {kind: {f"{n}{index}": v for n, v in part.items()} for kind, part in numbers.items()}
-                | {kind: None if f is None else f.to_dict() for kind, f in errors.items()}
-            )
-
         return {
-            "rows": {str(stage): [row(r) for r in rows] for stage, rows in self.rows.items()},
+            "rows": plain(self.rows),
             "warnings": {
                 f"stage {stage}, {label}": list(result.warnings)
                 for stage, results in self.results.items()
                 for label, result in results.items()
             },
-            "correlation with the current": {
-                d.output: {words: finite(v) for words, v in d.correlations.items()} for d in self.derived.values()
-            },
+            "correlation with the current": {d.output: plain(d.correlations) for d in self.derived.values()},
             "files": [str(f) for f in self.files],
         }
 
@@ -178,7 +165,7 @@ def run_demo(
     check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)
     log("recording both stages on the virtual rig, under a square and a sine current")
     square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
-    demo = Demo(square, sine, {}, {}, {}, {}, [])
+    demo = Demo(square, sine, {}, {}, {}, [])
     for run in (square, sine):
         demo.files.append(folder / f"{run.name}.csv")
         run.to_csv(demo.files[-1], force=force)
@@ -201,13 +188,8 @@ def run_demo(
         models |= work.searches()
         words = "all orders and coefficients together by output error, from the current alone"
         models["output error"] = work.joint("output error", work.coupled, words)
-        demo.rows[stage] = [
-            paper_row(label, c.model, c.estimation, output, c.validation)
-            for label, c in models.items()
-            for output in work.measured.outputs
-        ]
-        demo.results[stage] = {label: c.result for label, c in models.items() if c.result is not None}
-        demo.traces.update(work.traces(models))
+        demo.models[stage] = models
+        demo.traces.update(work.traces({p: models[f"p = {p}"].model for p in INNOVATION_LENGTHS}))
         demo.derived[stage] = work.dropped_derivative(models["output error"].model)
         for stem, label in SAVED_MODELS.items():
             demo.files.append(folder / f"stage{stage}-{stem}.json")
@@ -220,17 +202,17 @@ def demo_text(demo: Demo) -> str:
     lines = [f"A simulated flexible arm: {demo.square.length} rows of a square current, checked on a sine.", ""]
     for stage, results in demo.results.items():
         best = results["output error"]
-        estimates = [p for n, p in best.parameters.items() if n in best.names]
+        estimates = [best.parameters[n] for n in best.names]
         near = sum(abs(p.value - demo.truth[stage][p.name]) <= 2 * p.standard_error for p in estimates)
         lines += wrap_text(f"Stage {stage}, output error: {demo.validations[stage].verdict}")
         lines += [f"  {line}" for line in equation_lines(best.model)]
         lines += [line for line in behavior_lines(best.model) if "mode" in line or "integrates" in line][:3]
         lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
-    outputs = list(dict.fromkeys(r.output for rows in demo.rows.values() for r in rows))
+    outputs = list(demo.traces)
     lines.append(f"{'free run, fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
     lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
     for label in SHOWN_MODELS:
-        fits = [fit for stage in demo.rows for fit in demo.fits(stage)[label]]
+        fits = [fit for models in demo.models.values() for fit in models[label].fits]
         shown = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
         lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(shown)))
     lines += ["", "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well."]
@@ -245,12 +227,12 @@ def demo_details(demo: Demo) -> str:
     lines = []
     for stage in demo.rows:
         lines += [f"Stage {stage}, square current (the shape of the paper's Table {3 + stage})"]
-        lines += [paper_table_text(demo.rows_by_output(stage)), ""]
+        lines += [paper_table_text(demo.rows[stage]), ""]
     lines += ["Fit of the free run in percent: on the square run, and on the sine run that no model has seen"]
-    for stage, rows in demo.rows.items():
-        outputs = dict.fromkeys(r.output for r in rows)
+    for models in demo.models.values():
+        outputs = models["output error"].model.outputs
         lines.append(" " * 24 + "".join(f"{o + ' square':>18}{o + ' sine':>16}" for o in outputs))
-        lines += fits_text(demo.fits(stage), 24, (18, 16) * len(outputs))
+        lines += fits_text(models, 24, (18, 16) * len(outputs))
     lines += ["", TABLE_NOTE, "", "Which way a link bends: correlation of the deflection with its current"]
     heads = ("simulated arm", "(14)–(15) identified", "the same in (22)–(25)")
     lines.append(" " * 24 + "".join(f"{words:>26}" for words in heads))
@@ -259,10 +241,10 @@ def demo_details(demo: Demo) -> str:
     lines.append("")
     for stage, results in demo.results.items():
         best = results["output error"]
-        estimates = {**best.orders, **(best.joint.coefficients if best.joint is not None else {})}
         lines.append(f"Stage {stage}, output error: estimate ± standard error (truth of the simulated arm)")
-        for n, v in estimates.items():
-            lines.append(f"  {n:<8}{v:>12.6g} ± {best.standard_errors[n]:<9.2g} ({demo.truth[stage][n]:.6g})")
+        for n in best.names:
+            p = best.parameters[n]
+            lines.append(f"  {n:<8}{p.value:>12.6g} ± {p.standard_error:<9.2g} ({demo.truth[stage][n]:.6g})")
     lines.append("")
     for stage, results in demo.results.items():
         for label, result in results.items():
@@ -283,11 +265,19 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
         for stage, checked in demo.validations.items()
         if checked.verdict is not None
     )
-    bars = [chart for rows in demo.rows.values() for chart in _bar_charts(rows)]
+    runs = {"square, fitted to": "estimation", "sine, not seen": "validation"}
+    bars = [
+        chart
+        for models in demo.models.values()
+        for chart in compared_bars(
+            [(label, [(run, getattr(c, part)) for run, part in runs.items()]) for label, c in models.items()],
+            title="Fit of the free run",
+        )
+    ]
     validated: list[list[Cell]] = [
         [r.output, r.label, r.output_error.fit, r.validation.fit, r.validation.error, r.validation.nr]
-        for stage in demo.rows
-        for r in demo.rows_by_output(stage)
+        for rows in demo.rows.values()
+        for r in rows
         if r.output_error is not None and r.validation is not None
     ]
     heads = ("output", "model", "fit % on the square", "fit % on the sine", "error (45) on the sine", "NR on the sine")
@@ -330,21 +320,8 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         tables=[
             *behavior_tables(best.model),
             estimates_table(best, demo.truth[stage]),
-            paper_table(demo.rows_by_output(stage), title=f"Stage {stage}, square current"),
+            paper_table(demo.rows[stage], title=f"Stage {stage}, square current"),
             search_summary(searches),
         ],
         figures=[*charts, derivative_chart(demo.derived[stage])],
     )
-
-
-def _bar_charts(rows: list[PaperRow]) -> list[Figure]:
-    """Fits of all models on both runs as bars, one chart per output."""
-    charts = []
-    for output in dict.fromkeys(r.output for r in rows):
-        own = [r for r in rows if r.output == output]
-        runs = {"square, fitted to": "output_error", "sine, not seen": "validation"}
-        groups = [(words, [getattr(r, f).fit for r in own]) for words, f in runs.items()]
-        title = f"Fit of the free run of {symbol(output)}"
-        labels = [r.label for r in own]
-        charts.append(bar_chart(labels, groups, title=title, x_label="fit [%]", high=100.0, width=SMALL_WIDTH_PX))
-    return charts

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
@@ -31,17 +31,12 @@ LINE_POINTS = 500
 MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
 
 
-def angle_chart(time: Floats, lines: Sequence[tuple[str, Floats]], output: str, title: str, caption: str) -> Figure:
-    """Chart of an angle over time by several models."""
-    return line_chart(
-        time,
-        lines,
-        title=title,
-        x_label="time [s]",
-        y_label=f"{symbol(output)} [rad]",
-        points=LINE_POINTS,
-        caption=caption.replace(" -", " −"),
-    )
+def angle_chart(
+    time: Floats, lines: Sequence[tuple[str, Floats]], output: str, title: str, caption: str, **options: Any
+) -> Figure:
+    """Chart of an angle over time by several models; the options are those of a line chart."""
+    options = {"points": LINE_POINTS, "caption": caption.replace(" -", " −"), **options}
+    return line_chart(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
 
 
 def reference_label(*, simulated: bool) -> str:

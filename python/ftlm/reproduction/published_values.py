@@ -1,4 +1,4 @@
-"""Values printed in the paper's Tables 3 to 7, for comparison only, and the tables recomputed at the printed orders.
+"""Values printed in the paper's Tables 3 to 7, for comparison only, the tables recomputed, and the models simulated.
 
 Wang, Li, Li, Liang, Gao, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072. Digits are the paper's.
 """
@@ -7,24 +7,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ftlm import _core
+from ftlm.analysis.poles import Stability, stability
 from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
-from ftlm.errors import InternalError
+from ftlm.errors import FtlmError
 from ftlm.fractional_calculus import haar_transform
-from ftlm.kernels import block_pulse_kernel
+from ftlm.kernels import block_pulse_kernel, pulse_means
+from ftlm.model.model import Model
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
-from ftlm.reproduction.simulated_arm import PAPERS_ARM, demo_run
+from ftlm.plot.comparison_charts import pulse_times
+from ftlm.reproduction.simulated_arm import PAPERS_ARM, StageNumber, demo_run
+from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, around, best_orders
 from ftlm.simulation.discretization import record, sensor_series
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.order import Order
+from ftlm.structure.order_grid import OrderGrid
+from ftlm.structure.structure import Structure
 from ftlm.utils.formatting import Exact
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Metrics, finite, metrics
+from ftlm.validation.comparison import Metrics, attributes, compare_means, finite, metrics
 
 #: The paper's p, its number of block pulses, and its four angles in the order n = 1 … 4.
 INNOVATION_LENGTHS = COMPARED_INNOVATION_LENGTHS
@@ -32,17 +41,19 @@ PULSE_COUNT = 2048
 ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 #: Letters of the orders and of the coefficients, in the order of the tables' columns.
 ORDER_LETTERS, COEFFICIENT_LETTERS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
+#: Order of each coefficient's term in the paper's equations (22)-(25).
+ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """Row of a printed table: parameters by letter, and criteria (45), (46), (47), None if absent."""
+    """Row of a printed table: parameters by letter, and criteria (45), (46), (47), NaN if absent."""
 
     orders: Mapping[str, float]
     coefficients: Mapping[str, float]
-    error: float | None = None
-    rmse: float | None = None
-    nr: float | None = None
+    error: float = math.nan
+    rmse: float = math.nan
+    nr: float = math.nan
 
 
 def _row(orders: tuple[float | None, ...], coefficients: tuple[float | None, ...], *criteria: float) -> PublishedRow:
@@ -123,10 +134,19 @@ TABLE_3: dict[str, tuple[float, str]] = {
 }
 
 
+def parameter_name(letter: str, output: str) -> str:
+    """Return the name of an angle's order or coefficient, such as alpha1."""
+    return f"{letter}{1 + ANGLE_NAMES.index(output)}"
+
+
+def stage_of(output: str) -> StageNumber:
+    """Return the stage of an angle."""
+    return 1 if output[-2] == "1" else 2
+
+
 def last_orders(output: str) -> dict[str, float]:
     """Orders of an angle's row of p = 7 by name, such as alpha1."""
-    index = 1 + ANGLE_NAMES.index(output)
-    return {f"{n}{index}": v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
+    return {parameter_name(n, output): v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
 
 
 def printed_saturation(output: str) -> tuple[float, float, float]:
@@ -246,7 +266,7 @@ class AsPrinted:
         columns = {
             c: [r.coefficients[c] / table[p].coefficients[c] for p, r in self.rows.items()] for c in COEFFICIENT_LETTERS
         }
-        return columns | {"NR": [r.equation.nr / float(table[p].nr or 1.0) for p, r in self.rows.items()]}
+        return columns | {"NR": [r.equation.nr / table[p].nr for p, r in self.rows.items()]}
 
     @property
     def is_close(self) -> bool:
@@ -257,25 +277,8 @@ class AsPrinted:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
-        return {
-            "reading": str(self.reading),
-            "K0": self.reading.prior,
-            "terms": self.reading.terms,
-            "filtered": self.reading.filtered,
-            "sign reversed": self.reading.reversed,
-            "away": finite(self.ratio),
-            "away at K0 = 1": finite(self.ratio_at_unit_prior),
-            "rank of the printed orders": self.rank,
-            "among": self.among,
-            "best orders": self.best,
-            "scale": self.scale,
-            "columns of the printed course": self.matching_trends,
-            "ours / printed": self.ratios,
-            "rows": {
-                str(p): {"coefficients": r.coefficients, "equation_error": r.equation.to_dict()}
-                for p, r in self.rows.items()
-            },
-        }
+        fit = ("reading", "ratio", "ratio_at_unit_prior", "scale", "matching_trends", "ratios", "rows")
+        return {"closest settings": str(self.reading)} | attributes(self, (*fit, "rank", "among", "best"))
 
 
 class _Angle:
@@ -355,18 +358,18 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
     run, scales = papers_record()
     found = {}
     for output in outputs:
-        stage: Literal[1, 2] = 1 if output[-2] == "1" else 2
+        stage = stage_of(output)
         structure = flexible_link(stage=stage, form="published", coupling="measured", laws=(), sensor_filter="stock")
         own = record(run, structure, PULSE_COUNT, filtered=False)
-        plain = {o: own.of(o) for o in structure.outputs}
         hub, deflection = structure.outputs
+        plain_angles = {o: own.of(o) for o in structure.outputs}
+        behind = plain_angles[deflection]
         filter_series = sensor_series(structure, PULSE_COUNT, own.step)
-        behind = plain[deflection]
         if filter_series is not None:
             behind = _core.series_multiply(filter_series, behind, PULSE_COUNT)
         # The implied deviation is that of the angle as it was logged.
-        behind = behind * float(np.std(plain[deflection])) / float(np.std(behind))
-        seen = {False: plain, True: {hub: plain[hub], deflection: behind}}
+        behind = behind * float(np.std(plain_angles[deflection])) / float(np.std(behind))
+        seen = {False: plain_angles, True: {hub: plain_angles[hub], deflection: behind}}
         current = own.of(f"I{stage}")
         angles = {filtered: _Angle(series, current, output, own.step) for filtered, series in seen.items()}
         found[output] = _nearest(output, angles, scales[output])
@@ -374,34 +377,27 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
 
 
 def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
+    """Return the table of the interpretation closest to the printed one; filters are tried on deflections only."""
     table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][1].orders
-    best: tuple[float, Interpretation, dict[int, Row]] | None = None
-    at_one = math.inf
-    deflection = output.endswith("2")
-    for filtered, terms in product((False, True) if deflection else (False,), TERM_INTERPRETATIONS):
+    tried: list[tuple[float, Interpretation, dict[int, Row]]] = []
+    for filtered, terms in product((False, True) if output.endswith("2") else (False,), TERM_INTERPRETATIONS):
         angle = angles[filtered]
         time, haar = angle.regressors(terms, orders)
         priors = (*PRIOR_GRID, 1.0)
         solved = {p: angle.solve_coefficients(haar, priors, p) for p in INNOVATION_LENGTHS}
         for k, prior in enumerate(priors):
-            x = {p: solved[p][k] for p in INNOVATION_LENGTHS}
-            figures = {p: metrics(angle.y, time @ x[p]) for p in INNOVATION_LENGTHS}
+            figures = {p: metrics(angle.y, time @ x[k]) for p, x in solved.items()}
             for flipped in (False, True):
                 signs = np.array([-1.0 if flipped and place == "own" else 1.0 for place in angle.places(terms)])
                 rows = {
-                    p: Row(dict(zip(COEFFICIENT_LETTERS, (signs * x[p]).tolist(), strict=True)), figures[p])
-                    for p in INNOVATION_LENGTHS
+                    p: Row(dict(zip(COEFFICIENT_LETTERS, (signs * x[k]).tolist(), strict=True)), figures[p])
+                    for p, x in solved.items()
                 }
-                away = _log_distance(rows, table)
-                if prior == 1.0:
-                    at_one = min(at_one, away)
-                if best is None or away < best[0]:
-                    best = away, Interpretation(terms, filtered, flipped, prior), rows
-    if best is None:
-        raise InternalError(f"no reading of {output} was tried; please report it")
-    away, reading, rows = best
-    rank, among, first = _rank_orders(angles[reading.filtered], reading, orders)
-    return AsPrinted(output, reading, rows, math.exp(away), math.exp(at_one), rank, among, first, scale)
+                tried.append((_log_distance(rows, table), Interpretation(terms, filtered, flipped, prior), rows))
+    away, reading, rows = min(tried, key=lambda one: one[0])
+    at_one = min(distance for distance, each, _ in tried if each.prior == 1.0)
+    ranks = _rank_orders(angles[reading.filtered], reading, orders)
+    return AsPrinted(output, reading, rows, math.exp(away), math.exp(at_one), *ranks, scale)
 
 
 def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) -> float:
@@ -410,7 +406,7 @@ def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) ->
     for p, row in rows.items():
         ratio = row.coefficients["a"] / table[p].coefficients["a"]
         logs.append(abs(math.log(ratio)) if ratio > 0 else math.log(10.0) + abs(math.log(abs(ratio) or 1e-12)))
-        logs.append(abs(math.log(row.equation.nr / float(table[p].nr or 1.0))))
+        logs.append(abs(math.log(row.equation.nr / table[p].nr)))
     return sum(logs) / len(logs)
 
 
@@ -418,20 +414,146 @@ def _rank_orders(
     angle: _Angle, reading: Interpretation, orders: Mapping[str, float]
 ) -> tuple[int, int, dict[str, float]]:
     """Rank of the printed orders among all neighboring ones at the largest p, their number, and the best orders."""
-    values = [
-        round(MIN_GRID_ORDER + k * GRID_INCREMENT, 9)
-        for k in range(round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1)
-    ]
+    count = round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1
+    values = [round(MIN_GRID_ORDER + k * GRID_INCREMENT, 9) for k in range(count)]
+    varied = ("beta", "gamma", "mu")
     errors: dict[tuple[float, ...], float] = {}
-    for beta, gamma, mu in product(values, values, values):
-        at = {"alpha": float(orders["alpha"]), "beta": beta, "gamma": gamma, "mu": mu}
-        time, haar = angle.regressors(reading.terms, at)
+    for each in product(values, values, values):
+        time, haar = angle.regressors(reading.terms, {**orders, **dict(zip(varied, each, strict=True))})
         (x,) = angle.solve_coefficients(haar, (reading.prior,), INNOVATION_LENGTHS[-1])
-        errors[beta, gamma, mu] = float(np.sum(np.abs(angle.y - time @ x)))
-    own = errors[tuple(round(float(orders[n]), 9) for n in ("beta", "gamma", "mu"))]
-    first = min(errors, key=lambda k: errors[k])
+        errors[each] = float(np.sum(np.abs(angle.y - time @ x)))
+    own = errors[tuple(round(float(orders[n]), 9) for n in varied)]
+    best = min(errors, key=lambda each: errors[each])
+    first = {"alpha": float(orders["alpha"]), **dict(zip(varied, best, strict=True))}
+    return 1 + sum(e < own for e in errors.values()), len(errors), first
+
+
+#: Increment and radius [increments] of the order grid around the printed orders.
+SEARCH_INCREMENT, SEARCH_RADIUS_STEPS = 0.05, 2
+
+
+@dataclass(frozen=True)
+class PrintedModelRun:
+    """Simulation of one printed model of one angle under the paper's current from rest.
+
+    Parameters
+    ----------
+    output, p
+        Row of Tables 4 and 5.
+    stability
+        Stability of the stage's two coupled printed equations.
+    angle_deviation, single_equation_deviation
+        Standard deviation of the angle [rad], by both coupled equations and by (26) with one angle alone.
+    implied_deviation
+        Standard deviation of the measured angle that the paper's RMSE / NR implies [rad].
+    time, response
+        Middle of every block pulse [s], and the angle by both equations [rad].
+    arm
+        Angle of the simulated arm, scaled to the implied standard deviation [rad].
+    returned_coefficients
+        Coefficients that multi-innovation identifies from that response at the printed orders, by K0.
+    orders
+        Orders identified by K0 on a grid around the printed ones; empty unless p is the largest.
+    """
+
+    output: str
+    p: int
+    stability: Stability
+    angle_deviation: float
+    single_equation_deviation: float
+    implied_deviation: float
+    time: Floats
+    response: Floats
+    arm: Floats
+    returned_coefficients: dict[float, dict[str, float]]
+    orders: dict[float, dict[str, float]]
+
+    @property
+    def deviation_ratio(self) -> float:
+        """Ratio of the implied to the simulated standard deviation."""
+        return self.implied_deviation / self.angle_deviation if self.angle_deviation else np.inf
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the simulation for JSON."""
+        own = {"stability": str(self.stability), "unstable_poles": finite(self.stability.unstable_poles)}
+        deviations = ("angle_deviation", "single_equation_deviation", "implied_deviation", "deviation_ratio")
+        return own | attributes(self, ("output", "p", *deviations, "returned_coefficients", "orders"))
+
+
+def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Orders and coefficients of a stage's two printed equations, by the names of (22)-(25)."""
+    rows = {o: FRACTIONAL_ROWS[o][p] for o in ANGLE_NAMES if stage_of(o) == stage}
+    orders = {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.orders.items()}
+    return orders, {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.coefficients.items()}
+
+
+def printed_model(stage: StageNumber, p: int) -> Model:
+    """Model of both printed equations of a stage with the current as input."""
+    orders, coefficients = printed_numbers(stage, p)
+    structure = flexible_link(stage=stage, form="published", coupling="simulated", laws=())
+    known = structure.with_orders(orders).with_coefficients(coefficients)
+    return Model(known, orders=orders, m=PULSE_COUNT)
+
+
+def one_angle(output: str, p: int) -> Model:
+    """Model of the printed row by (26): every term but the current's contains the angle itself."""
+    row = FRACTIONAL_ROWS[output][p]
+    terms = [Term(output, Order(float(row.orders[o])), float(row.coefficients[c])) for c, o in ORDER_OF.items()]
+    terms.append(Term(f"I{stage_of(output)}", Order(), float(row.coefficients["g"])))
+    return Model(Structure((Equation(output, Order(float(row.orders["alpha"])), tuple(terms)),)), m=PULSE_COUNT)
+
+
+def papers_current(stage: StageNumber) -> Run:
+    """Run with the paper's square current of one stage; the simulated angles are not used."""
+    return demo_run("square", noise=0.0).select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
+
+
+def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[PrintedModelRun]:
+    """Simulate every printed fractional model of a stage, and identify each from its own response."""
+    drive, found = papers_current(stage), []
+    scaled, _ = papers_record()
+    structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
+    for p in INNOVATION_LENGTHS:
+        model, orders = printed_model(stage, p), printed_numbers(stage, p)[0]
+        free, own, verdict = compare_means(model, drive), model.simulate(drive), stability(model)
+        for output in model.outputs:
+            response = free.simulated[output][0]
+            single = compare_means(one_angle(output, p), drive.select([f"I{stage}", output]))
+            found.append(
+                PrintedModelRun(
+                    output,
+                    p,
+                    verdict,
+                    float(np.std(response)),
+                    float(np.std(single.simulated[output][0])),
+                    implied_spreads()[output][1],
+                    pulse_times(free),
+                    response,
+                    pulse_means(scaled[output], PULSE_COUNT),
+                    *_reidentify(own, structure.equation(output), orders, p, threads),
+                )
+            )
+    return found
+
+
+def _reidentify(
+    run: Run, single: Structure, orders: dict[str, float], p: int, threads: int | None
+) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
+    """Coefficients at the model's own orders, and for the largest p the best orders around them, by K0."""
+    own = {n: [orders[n]] for n in single.order_names}
+    near = {n: around(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}
+    wide = {n: v if n.startswith("alpha") else [w for w in near[n] if w < 2.0] for n, v in own.items()}
+
+    def best(axes: dict[str, list[float]]) -> dict[float, Model]:
+        found = {}
+        for prior in PRIOR_COVARIANCES:
+            with suppress(FtlmError):  # no candidate has a finite error
+                grid = OrderGrid(increment=SEARCH_INCREMENT, orders=axes)
+                found[prior] = best_orders(run, single, grid, p, prior, m=PULSE_COUNT, threads=threads).model
+        return found
+
+    searched = best(wide) if p == INNOVATION_LENGTHS[-1] else {}
     return (
-        1 + sum(e < own for e in errors.values()),
-        len(errors),
-        {"alpha": float(orders["alpha"])} | dict(zip(("beta", "gamma", "mu"), first, strict=True)),
+        {k: dict(m.coefficients) for k, m in best(own).items()},
+        {k: {n: m.orders[n] for n in own} for k, m in searched.items()},
     )

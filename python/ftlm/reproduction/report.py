@@ -19,7 +19,7 @@ from ftlm.report.typesetting import equation_html
 from ftlm.reproduction import figures, tables
 from ftlm.reproduction.checks import deviation_text
 from ftlm.reproduction.stage_models import COARSE_INCREMENT, REFINED_CANDIDATES
-from ftlm.reproduction.stage_result import TRACE_EVERY, Stage
+from ftlm.reproduction.stage_result import TRACE_EVERY, Candidate, Stage
 from ftlm.structure.equation import format_equation
 from ftlm.svg.heat_map import heat_map
 from ftlm.svg.html_page import Section, Table, write_page
@@ -160,7 +160,7 @@ def _sections(found: Reproduction) -> list[Section]:
                 ],
                 figures=figures.rival_figures(found),
                 fold="Tables 6 and 7, seeds",
-                folded_tables=[tables.genetic_table(found), tables.rivals_table(found), tables.seeds_table(found)],
+                folded_tables=tables.optimizer_tables(found),
             )
         )
     return [
@@ -246,11 +246,11 @@ def reproduction_page(found: Reproduction, path: str | os.PathLike[str], *, forc
     return write_page(path, title="The paper reproduced", sections=_sections(found), lead=lead, force=force)
 
 
-def fits_text(fits: Mapping[str, Sequence[float]], label: int, widths: Sequence[int]) -> list[str]:
-    """Fits in percent as text, one line per model, in columns of these widths."""
+def fits_text(models: Mapping[str, Candidate], label: int, widths: Sequence[int]) -> list[str]:
+    """Fits of the free runs in percent as text, one line per model, in columns of these widths."""
     lines = []
-    for name, values in fits.items():
-        shown = ("–" if math.isnan(fit) else f"{fit:.2f}" for fit in values)
+    for name, candidate in models.items():
+        shown = ("–" if math.isnan(fit) else f"{fit:.2f}" for fit in candidate.fits)
         lines.append(name.ljust(label) + "".join(text.rjust(w) for text, w in zip(shown, widths, strict=True)))
     return lines
 
@@ -263,15 +263,7 @@ def reproduction_text(found: Reproduction) -> str:
     for stage in found.stages.values():
         lines += ["", f"Stage {stage.number}: fit of the free run in percent, driven as identified"]
         lines.append(" " * 26 + "".join(f"{o + run:>16}" for o in stage.outputs for run in (" square", " sine")))
-        fits = {
-            label: [
-                math.nan if part is None else part.output_error[o].fit
-                for o in stage.outputs
-                for part in (c.estimation, c.validation)
-            ]
-            for label, c in stage.candidates.items()
-        }
-        lines += fits_text(fits, 26, [16] * 4)
+        lines += fits_text(stage.candidates, 26, [16] * 4)
         best = stage.candidates["output error"].model
         lines += [f"  {format_equation(e, best.structure.describe_inputs('.6g'))}" for e in best.equations]
     return "\n".join([*lines, *(f"note: {n}" for n in found.notes)])

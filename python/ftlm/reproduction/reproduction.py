@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolution, load_pygad
 from ftlm.progress import format_time_left
 from ftlm.reproduction.checks import Check, checks
-from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, Panel, panel_of, rivals_order_grid, simulated_panel
-from ftlm.reproduction.published_models import PrintedModelRun, run_printed_models
-from ftlm.reproduction.published_values import AsPrinted, as_printed
+from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, run_printed_models
 from ftlm.reproduction.report import reproduction_page
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
 from ftlm.reproduction.stage_models import (
@@ -30,12 +29,24 @@ from ftlm.reproduction.stage_models import (
     seconds_of,
     seconds_of_all,
 )
-from ftlm.reproduction.stage_result import GRID_ALPHA, TRACE_EVERY, Rival, Stage, published_structure
+from ftlm.reproduction.stage_result import (
+    CONTEST_STEP,
+    GRID_ALPHA,
+    TRACE_EVERY,
+    Panel,
+    Rival,
+    Stage,
+    panel_of,
+    published_structure,
+    rivals_order_grid,
+    simulated_panel,
+)
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads, join_names, nearest, real_number, short_repr, whole_number
+from ftlm.validation.comparison import attributes, plain
 
 #: Name of the given runs in verdicts.
 MEASURED_LABEL = "as measured"
@@ -163,14 +174,9 @@ class Reproduction:
         return {
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
-            "lattice": {"step": self.order_grid.increment, "alpha": list(self.order_grid.alpha)},
-            "checks": [c.to_dict() for c in self.checks],
-            "as printed": {o: a.to_dict() for o, a in self.as_printed.items()},
-            "printed models run": [r.to_dict() for r in self.ran],
-            "as it should be": {str(n): s.to_dict() for n, s in self.stages.items()},
-            "verdicts": self.panel.to_dict(),
-            "notes": list(self.notes),
-        }
+            "order_grid": attributes(self.order_grid, ("increment", "alpha")),
+            "as it should be": plain(self.stages),
+        } | attributes(self, ("checks", "as_printed", "ran", "panel", "notes"))
 
 
 def slug(label: str) -> str:
@@ -264,7 +270,6 @@ def reproduce(
     expected = estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))
     log(f"this takes {format_time_left(expected).removesuffix(' left')}")
     preset = Preset(lattice, 1, TRACE_EVERY, common_pulses=True, rivals_increment=compared_increment)
-    own = MAIN_ARM if simulated else MEASURED_LABEL
     seeds = [seed + k for k in range(records)]
     run, other = square, sine
 
@@ -274,13 +279,12 @@ def reproduce(
         work.begin("the paper's printed models under its own current", "printed")
         rows = run_printed_models(number, threads)
         work.begin("verdicts, both ends of K0", "trials")
-        return StageOutcome(
-            stage, rows, as_printed(stage.outputs), panel_of(stage, run, own, seed, threads), work.notes
-        )
+        panel = panel_of(stage, run, MAIN_ARM if simulated else MEASURED_LABEL, seed, threads)
+        return StageOutcome(panel, stage, rows, as_printed(stage.outputs), work.notes)
 
-    def compute_panel(arm: str, number: StageNumber, steps: WorkerProgress) -> Panel:
+    def compute_panel(arm: str, number: StageNumber, steps: WorkerProgress) -> StageOutcome:
         log(f"verdicts: the arm “{arm}”, stage {number}")
-        return simulated_panel(
+        panel = simulated_panel(
             number,
             arm,
             seeds[1:] if arm == MAIN_ARM else seeds,
@@ -292,41 +296,37 @@ def reproduce(
             order_grid=None if arm == MAIN_ARM else rivals_order_grid(increment, rivals_increment),
             has_contests=not omitted,
         )
+        return StageOutcome(panel)
 
-    jobs: list[Job] = [lambda steps, n=n: compute_stage(n, steps) for n in numbers]  # type: ignore[misc]
-    for arm in [MAIN_ARM, *others] if simulated else []:
-        jobs += [lambda steps, a=arm, n=n: compute_panel(a, n, steps) for n in numbers]  # type: ignore[misc]
+    jobs: list[Job] = [partial(compute_stage, n) for n in numbers]
+    jobs += [partial(compute_panel, a, n) for a in ([MAIN_ARM, *others] if simulated else []) for n in numbers]
     ended = run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress)
-    made = [m for m in ended if isinstance(m, StageOutcome)]
-    panel = Panel()
-    for part in (*(m.panel for m in made), *(p for p in ended if isinstance(p, Panel))):
-        panel = panel.merge_with(part)
     return Reproduction(
         square,
         sine,
         simulated,
-        {m.stage.number: m.stage for m in made},
+        {m.stage.number: m.stage for m in ended if m.stage is not None},
         lattice,
-        tuple(dict.fromkeys([*omitted, *(note for m in made for note in m.notes)])),
-        panel,
-        tuple(row for m in made for row in m.rows),
-        {output: part for m in made for output, part in m.printed.items()},
+        tuple(dict.fromkeys([*omitted, *(note for m in ended for note in m.notes)])),
+        Panel.union([m.panel for m in ended]),
+        tuple(row for m in ended for row in m.rows),
+        {output: part for m in ended for output, part in m.printed.items()},
     )
 
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """Results of one stage of the estimation run."""
+    """Cases of one arm and stage, with all results of the stage for the estimation run."""
 
-    stage: Stage
-    rows: list[PrintedModelRun]
-    printed: dict[str, AsPrinted]
     panel: Panel
-    notes: list[str]
+    stage: Stage | None = None
+    rows: Sequence[PrintedModelRun] = ()
+    printed: Mapping[str, AsPrinted] = field(default_factory=dict)
+    notes: Sequence[str] = ()
 
 
 #: Job of a worker, called with its progress.
-Job = Callable[[WorkerProgress], StageOutcome | Panel]
+Job = Callable[[WorkerProgress], StageOutcome]
 
 
 def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
@@ -343,33 +343,32 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
 
 def run_jobs(
     jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
-) -> list[StageOutcome | Panel]:
+) -> list[StageOutcome]:
     """Run all jobs in parallel and return their results; single-core fits overlap with parallel searches."""
     stop, whole = threading.Event(), TotalProgress(seconds, progress)
 
-    def done_by(job: Job) -> StageOutcome | Panel:
+    def done_by(job: Job) -> StageOutcome:
         steps = WorkerProgress(whole, stop)
         result = job(steps)
         steps.begin(0.0)
         return result
 
     if workers == 1:
-        found = [done_by(job) for job in jobs]
-        whole.end()
-        return found
-    with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
-        under_way = [pool.submit(done_by, job) for job in jobs]
-        try:
-            done: set[Future[StageOutcome | Panel]] = set()
-            # A wait without an end would not be interrupted by Ctrl-C everywhere.
-            while len(done) < len(jobs) and not any(f.exception() for f in done):
-                done, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
-        finally:
-            stop.set()
-            for future in under_way:
-                future.cancel()
-        # After a failure the other jobs end in KeyboardInterrupt, which says nothing.
-        ended = [f.result() for f in under_way if f in done]
+        ended = [done_by(job) for job in jobs]
+    else:
+        with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
+            under_way = [pool.submit(done_by, job) for job in jobs]
+            try:
+                done: set[Future[StageOutcome]] = set()
+                # A wait without an end would not be interrupted by Ctrl-C everywhere.
+                while len(done) < len(jobs) and not any(f.exception() for f in done):
+                    done, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
+            finally:
+                stop.set()
+                for future in under_way:
+                    future.cancel()
+            # After a failure the other jobs end in KeyboardInterrupt, which says nothing.
+            ended = [f.result() for f in under_way if f in done]
     whole.end()
     return ended
 

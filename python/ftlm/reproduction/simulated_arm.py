@@ -62,6 +62,11 @@ MAIN_ARM = "fractional"
 PAPERS_ARM = _integer_order_arm(friction=True, coupling=0.0)
 
 
+def letter_of(name: str) -> str:
+    """Strip the index of a name: alpha1 becomes alpha."""
+    return name.rstrip("0123456789")
+
+
 def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
     """Model of one stage of the demonstration's arm: effective coefficients, fractional orders, order law.
 

@@ -7,23 +7,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
-from ftlm.arm.flexible_link import Law, flexible_link, integer_order, link_model, order_law
+from ftlm.arm.flexible_link import Law, flexible_link, link_model, order_law
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.estimators import estimate_output_error
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.genetic import GeneticAlgorithm
+from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun
 from ftlm.estimation.identify import assess_fit, identify
-from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
-from ftlm.estimation.methods import (
-    EstimationMethod,
-    InstrumentalVariables,
-    OutputError,
-    method_with_options,
-)
+from ftlm.estimation.linear import MultiInnovationTrace
+from ftlm.estimation.methods import EstimationMethod, InstrumentalVariables, OutputError, method_with_options
 from ftlm.estimation.result import Identification, Task
 from ftlm.kernels import pulse_means
 from ftlm.model.model import Model
@@ -32,9 +25,10 @@ from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import ShareTracker, Stoppable
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.optimizer_comparison import CONTEST_STEP, compare_optimizers, rivals_order_grid, seeds_for
 from ftlm.reproduction.simulated_arm import StageNumber, decimate_run
 from ftlm.reproduction.stage_result import (
+    CONTEST_STEP,
+    JOINT_METHOD,
     MULTI_INNOVATION_LABELS,
     PRIOR_COVARIANCES,
     SEARCH_OPTIONS,
@@ -43,7 +37,14 @@ from ftlm.reproduction.stage_result import (
     DroppedDerivative,
     Rival,
     Stage,
+    around,
+    compare_optimizers,
+    euler_means,
+    integer_orders,
     published_structure,
+    rivals_order_grid,
+    seeds_for,
+    traces_of,
 )
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.initial_conditions import starts_at_rest
@@ -223,36 +224,40 @@ class StageWork:
         """Compute all results of section 5 for a stage."""
         exact = self.manual("integer, exact")
         candidates = {"integer, Euler": self.euler_candidate("integer, Euler", exact), "integer, exact": exact}
-        whole = self.coupled.with_orders({n: integer_order(n) for n in self.coupled.order_names})
-        candidates["integer, identified"] = self.best("integer, identified", whole, "whole orders", WHOLE_ROWS)
+        whole = integer_orders(self.coupled)
+        candidates["integer, identified"] = self.best("integer, identified", whole, "whole orders", "whole orders")
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
-        joint = candidates["output error"] = self.best("output error", self.coupled)
-        candidates["published, output error"] = self.best("published, output error", self.published, near=joint.model)
+        joint = candidates["output error"] = self.best("output error", self.coupled, "free orders")
+        label = "published, output error"
+        candidates[label] = self.best(label, self.published, "free orders, (22)–(25)", "published", joint.model)
         self.begin("convergence", "traces")
         traces: dict[str, dict[int, MultiInnovationTrace]] = {}
         weak: dict[str, dict[int, MultiInnovationTrace]] = {}
         if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
-            traces = self.traces(candidates)
-            last = candidates[f"p = {printed.INNOVATION_LENGTHS[-1]}"]
-            weak = self.traces(dict.fromkeys(candidates, last), WEAK_PRIOR)
+            models = {p: candidates[f"p = {p}"].model for p in printed.INNOVATION_LENGTHS}
+            traces = self.traces(models)
+            weak = self.traces(dict.fromkeys(models, models[printed.INNOVATION_LENGTHS[-1]]), WEAK_PRIOR)
         else:
             self.notes.append(
                 f"run {self.on.name} does not start at rest: every model is fitted and compared with initial terms; "
                 "explicit Euler, which steps from rest as in the paper, is not, and its errors hold that; convergence "
                 "of the recursion, and with it Figures 4(b) to 8(b), and the weak prior are left out"
             )
-        ends = {
-            o: {p: {n: float(c[-1]) for n, c in trace.coefficients.items()} for p, trace in each.items()}
-            for o, each in weak.items()
-        }
-        rivals, near, by_equation = self.rivals(genetic), self.printed_order_candidate(), self.by_equation()
+        rivals = self.rivals(genetic)
+        axes = {n: [v] for output in self.measured.outputs for n, v in printed.last_orders(output).items()}
+        near = self.search_candidate(
+            "printed orders", replace(self.preset.order_grid, orders=axes), coefficients="least-squares"
+        )
+        self.begin("orders by the equation error", "equation")
+        options = {"coefficients": "least-squares", "criterion": "equation-error", "norm": "l2"}
+        by_equation = self.search_candidate("smallest equation error", self.preset.order_grid, **options)
         derived = self.dropped_derivative(joint.model)
         self.begin("the landscape of its orders", "landscape")
         landscape = None
         if joint.result is not None and joint.result.joint is not None:
             landscape = output_error_landscape(joint.result)
-        return Stage(self.number, candidates, traces, weak, ends, rivals, near, by_equation, derived, landscape)
+        return Stage(self.number, candidates, traces, weak, rivals, near, by_equation, derived, landscape)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
         """Return a model with both errors on both runs, and its simulation from the currents alone."""
@@ -268,10 +273,9 @@ class StageWork:
         return Candidate(label, model, on, off[0] if off else None, alone, result)
 
     def identify_candidate(
-        self, label: str, run: Run, structure: Structure, method: EstimationMethod | None = None
+        self, label: str, run: Run, structure: Structure, method: EstimationMethod = JOINT_METHOD
     ) -> Candidate:
         """Identify a candidate, by default by output error."""
-        method = method or OutputError(loss="squares", intervals="auto", noise="white")
         result = identify(run, structure, method=method, threads=self.threads, progress=self.progress)
         return self.candidate(label, result.model, result)
 
@@ -281,44 +285,32 @@ class StageWork:
 
     def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
         """Return the same model simulated by explicit Euler, as in the paper."""
-        on = self._by_euler(exact.model, self.on, exact.estimation)
-        alone, off = {self.on.name: on.output_error}, None
+
+        def by_euler(run: Run, known: Comparison) -> Comparison:
+            means = euler_means(exact.model, run, known.m)
+            if self.preset.common_pulses:
+                errors = {n: metrics(known.measured[n][0], mean) for n, mean in means.items()}
+            else:
+                errors = {n: metrics(run[n], samples) for n, samples in explicit_euler(exact.model, run).items()}
+            simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, known.equation_error, errors)]
+            return replace(known, simulated=simulated, output_error=errors, per_run=parts, findings=())
+
+        on, off = by_euler(self.on, exact.estimation), None
+        alone = {self.on.name: on.output_error}
         if self.off is not None and exact.validation is not None:
-            off = self._by_euler(exact.model, self.off, exact.validation)
+            off = by_euler(self.off, exact.validation)
             alone[self.off.name] = off.output_error
         return replace(exact, label=label, estimation=on, validation=off, input_driven=alone)
 
-    def _by_euler(self, model: Model, run: Run, exact: Comparison) -> Comparison:
-        """Return the comparison with Euler's response in place of the exact one."""
-        responses = explicit_euler(model, run)
-        means = {}
-        for name, samples in responses.items():
-            with np.errstate(over="ignore", invalid="ignore"):
-                finite = bool(np.all(np.isfinite(samples)))
-            means[name] = pulse_means(samples, exact.m) if finite else np.full(exact.m, np.inf)
-        if self.preset.common_pulses:
-            errors = {n: metrics(exact.measured[n][0], mean) for n, mean in means.items()}
-        else:
-            errors = {n: metrics(run[n], samples) for n, samples in responses.items()}
-        return replace(
-            exact,
-            simulated={n: [mean] for n, mean in means.items()},
-            output_error=errors,
-            per_run=[(run.name, exact.equation_error, errors)],
-            findings=(),
-        )
-
     def searches(self) -> dict[str, Candidate]:
         """Search the whole order grid by multi-innovation with the paper's p, and by least squares."""
-        prior = {"prior_covariance": PRIOR_COVARIANCES[0]}
         kinds: dict[str, tuple[str, dict[str, Any]]] = {
-            f"p = {p}": ("multi-innovation", {"innovation_length": p, **prior}) for p in printed.INNOVATION_LENGTHS
+            f"p = {p}": ("multi-innovation", {"innovation_length": p, "prior_covariance": PRIOR_COVARIANCES[0]})
+            for p in printed.INNOVATION_LENGTHS
         }
-        kinds["least squares"] = "least-squares", {}
-        found = {}
-        for label, (coefficients, options) in kinds.items():
+        found, grid = {}, self.preset.order_grid
+        for label, (coefficients, options) in (kinds | {"least squares": ("least-squares", {})}).items():
             self.begin(f"orders on the lattice, {label}", "search")
-            grid = self.preset.order_grid
             if self.preset.common_pulses:
                 found[label] = self.search_candidate(label, grid, coefficients=coefficients, **options)
             else:
@@ -347,23 +339,18 @@ class StageWork:
         With K0 = 1 a deflection hardly moves. The errors of all candidates are close to those of a zero output, so no
         bound excludes any, and each would have to be simulated completely.
         """
-
-        def run_search(order_grid: OrderGrid, top: int) -> SearchResult:
-            return rank_orders(
-                self.on, single, order_grid, top=top, threads=self.threads, progress=self.progress, **options
-            )
-
+        work: dict[str, Any] = {"threads": self.threads, "progress": self.progress, **options}
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
         heavy = own_terms > 1 and options.get("coefficients") == "multi-innovation"
         if not (heavy and own.increment < COARSE_INCREMENT and not own.orders):
-            return run_search(own, 1)
-        values = own.values(single)
+            return rank_orders(self.on, single, own, top=1, **work)
+        values, coarse = own.values(single), replace(own, increment=COARSE_INCREMENT)
         ends = []
-        for row in run_search(replace(own, increment=COARSE_INCREMENT), REFINED_CANDIDATES).table:
+        for row in rank_orders(self.on, single, coarse, top=REFINED_CANDIDATES, **work).table:
             near = {
                 n: [v for v in values[n] if abs(v - at) < 2 * COARSE_INCREMENT - 1e-9] for n, at in row.orders.items()
             }
-            ends.append(run_search(replace(own, orders=near), 1))
+            ends.append(rank_orders(self.on, single, replace(own, orders=near), top=1, **work))
         return min(ends, key=lambda end: end.score)
 
     def instrumental(self, start: Candidate) -> Candidate:
@@ -373,19 +360,18 @@ class StageWork:
         axes = {}
         for name, value in start.model.orders.items():
             steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
-            near = [round(value + k * grid.increment, 9) for k in range(-steps, steps + 1)]
-            axes[name] = [v for v in near if 0 <= v <= grid.alpha[1]]
+            axes[name] = [v for v in around(value, grid.increment, steps) if 0 <= v <= grid.alpha[1]]
         method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=self.preset.top)
         return self.identify_candidate("instrumental variables", self.on, self.measured, method)
 
     def joint(
-        self, label: str, structure: Structure, words: str, rows: int | None = None, near: Model | None = None
+        self, label: str, structure: Structure, words: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
         """Fit by joint output error, on the whole run or a decimated one."""
-        self.begin(words, "published" if near is not None else "output error" if rows is None else "whole orders")
+        self.begin(words, step)
         run = self.on
-        if rows is not None and run.length >= 2 * rows:
-            run = decimate_run(run, run.length // rows)
+        if step == "whole orders" and run.length >= 2 * WHOLE_ROWS:
+            run = decimate_run(run, run.length // WHOLE_ROWS)
         elif run.length > MOST_ROWS:
             every = -(-run.length // JOINT_ROWS)
             self.notes.append(
@@ -405,86 +391,53 @@ class StageWork:
             except ModelError:
                 # Outside the bounds of (22)-(25).
                 return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic"))
-        task, threads = Task((run,), structure), check_threads(self.threads)
-        options: dict[str, Any] = {"intervals": "quadratic", "begin": begin, "alone": True}
-        result = assess_fit(estimate_output_error(task, None, threads, self.progress, **options))
+        task, options = Task((run,), structure), (None, check_threads(self.threads), self.progress)
+        result = assess_fit(estimate_output_error(task, *options, intervals="quadratic", begin=begin, alone=True))
         return self.candidate(label, result.model, result)
 
     def best(
-        self,
-        label: str,
-        structure: Structure,
-        what: str = "free orders",
-        rows: int | None = None,
-        near: Model | None = None,
+        self, label: str, structure: Structure, what: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
         """Fit by joint output error from the current alone, or with the measured other angle if that fails."""
-        words = f"{what}{', (22)–(25)' if near is not None else ''}, by output error"
+        words = f"{what}, by output error"
         try:
-            return self.joint(label, structure, words, rows, near)
+            return self.joint(label, structure, words, step, near)
         except ConvergenceError as error:
             self.notes.append(
                 f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
                 "other angle instead"
             )
-        return self.joint(label, replace(structure, coupling="measured"), words, rows, near)
+        return self.joint(label, replace(structure, coupling="measured"), words, step, near)
 
     def traces(
-        self, candidates: Mapping[str, Candidate], prior: float = PRIOR_COVARIANCES[0]
+        self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]
     ) -> dict[str, dict[int, MultiInnovationTrace]]:
         """Convergence of every equation with every p, at the orders of the model of that p."""
-
-        def trace(output: str, p: int) -> MultiInnovationTrace:
-            single, orders = self.measured.equation(output), candidates[f"p = {p}"].model.orders
-            single = single.with_orders({n: orders[n] for n in single.order_names})
-            return multi_innovation_trace(
-                self.on,
-                single,
-                innovation_length=p,
-                prior_covariance=prior,
-                row_basis="haar",
-                every=self.preset.trace_every,
-            )
-
-        return {o: {p: trace(o, p) for p in printed.INNOVATION_LENGTHS} for o in self.measured.outputs}
+        parts = {o: self.measured.equation(o) for o in self.measured.outputs}
+        return {o: traces_of(self.on, each, models, prior, self.preset.trace_every) for o, each in parts.items()}
 
     def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
         """Compare multi-innovation with other optimizers on each equation; empty if these are not installed."""
         if self.preset.rivals_increment is None:
             return {}
-        lattice = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
+        grid = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
         found = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
             self.begin(f"the rivals on {output}", "rivals")
             try:
-                made = compare_optimizers(
-                    self.on, single, lattice, genetic, threads=self.threads, progress=self.progress
-                )
+                made = compare_optimizers(self.on, single, grid, genetic, threads=self.threads, progress=self.progress)
             except ModelError as error:
                 self.notes.append(RIVALS_OMITTED.format(error))
                 return {}
-            ends = {"genetic": made.genetic, "differential evolution": made.evolution}
-            ends |= dict(zip(MULTI_INNOVATION_LABELS, made.order_grid.values(), strict=True))  # type: ignore[arg-type]
-            candidates = {}
-            for name, end in ends.items():
-                known = single.with_orders(end.orders).with_coefficients(end.coefficients)
-                candidates[name] = self.candidate(name, Model(known, orders=dict(end.orders)))
-            sizes = made.candidates, lattice.increment, made.settings.population
-            found[output] = Rival(*sizes, made.genetic, made.evolution, candidates)
+            best = dict(zip(MULTI_INNOVATION_LABELS, made.order_grid.values(), strict=True))
+            ends: list[tuple[str, GeneticRun | SearchResult]] = [*made.optimizers.items(), *best.items()]
+            models = {
+                name: Model(single.with_orders(end.orders).with_coefficients(end.coefficients), orders=dict(end.orders))
+                for name, end in ends
+            }
+            found[output] = replace(made, models={n: self.candidate(n, model) for n, model in models.items()})
         return found
-
-    def printed_order_candidate(self) -> Candidate:
-        """Return the model with the printed orders and least-squares coefficients on this run."""
-        axes = {n: [v] for output in self.measured.outputs for n, v in printed.last_orders(output).items()}
-        grid = replace(self.preset.order_grid, orders=axes)
-        return self.search_candidate("printed orders", grid, coefficients="least-squares")
-
-    def by_equation(self) -> Candidate:
-        """Return the least-squares model with the orders of the smallest equation error."""
-        self.begin("orders by the equation error", "equation")
-        options = {"coefficients": "least-squares", "criterion": "equation-error", "norm": "l2"}
-        return self.search_candidate("smallest equation error", self.preset.order_grid, **options)
 
     def in_published_form(self, model: Model) -> Model:
         """Insert the parameters of (14)-(15) into (22)-(25), which drop a derivative of the current."""

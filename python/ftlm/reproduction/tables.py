@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,8 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import table_3_coefficients
-from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, TERM_INTERPRETATIONS, implied_spreads
+from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, parameter_name
+from ftlm.reproduction.simulated_arm import letter_of
 from ftlm.reproduction.stage_result import (
     MULTI_INNOVATION_LABELS,
     PRIOR_COVARIANCES,
@@ -25,7 +26,6 @@ from ftlm.reproduction.stage_result import (
     Stage,
     prior_text,
 )
-from ftlm.structure.equation import Equation
 from ftlm.svg.html_page import NOT_IN_MODEL, Table
 from ftlm.utils.formatting import (
     DIVERGED_TEXT,
@@ -42,13 +42,12 @@ from ftlm.validation.comparison import Comparison, Metrics
 if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
 
-#: Order of each coefficient's term in the paper's equations (22)-(25).
-ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 #: Heads of the columns of parameters and criteria, and groups of the parameter columns.
 NUMBER_HEADS = tuple(map(symbol_html, (*ORDER_LETTERS, *COEFFICIENT_LETTERS)))
 CRITERION_HEADS = ("error (45)", "RMSE", "NR")
 COLUMN_GROUPS = (("", 1), ("orders", 4), ("coefficients", 4))
 PRIOR_HEADS = tuple(Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in PRIOR_COVARIANCES)
+OPTIMIZER_LABELS = {"genetic": "genetic algorithm", "differential evolution": "differential evolution"}
 PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
 
 
@@ -79,20 +78,24 @@ class PaperRow:
     validation: Metrics | None = None
 
 
-def letter_of(name: str) -> str:
-    """Strip the index of a name: alpha1 becomes alpha."""
-    return name.rstrip("0123456789")
+def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Orders and coefficients of the equation of one angle by letter.
 
-
-def letters_of(item: Equation) -> tuple[dict[str, float], dict[str, float]]:
-    """Orders and coefficients of an equation of the arm by letter."""
+    Raises
+    ------
+    ModelError
+        No such output.
+    """
+    item = next((e for e in model.equations if e.output == output), None)
+    if item is None:
+        raise ModelError(f"the model has no output {output!r}; it has {', '.join(model.outputs)}")
     orders, coefficients = {"alpha": item.order.constant}, {}
     for term in item.terms:
         letter = letter_of(term.name or "")
         if letter in COEFFICIENT_LETTERS:
             coefficients[letter] = float(term.coefficient) + 0.0
-        if letter in ORDER_OF:
-            orders[ORDER_OF[letter]] = term.order.constant
+        if letter in printed.ORDER_OF:
+            orders[printed.ORDER_OF[letter]] = term.order.constant
     return orders, coefficients
 
 
@@ -117,25 +120,20 @@ def paper_row(
     ModelError
         No such output.
     """
-    item = next((e for e in model.equations if e.output == output), None)
-    if item is None:
-        raise ModelError(f"the model has no output {output!r}; it has {', '.join(model.outputs)}")
     errors = comparison.equation_error.get(output), comparison.output_error.get(output)
-    return PaperRow(
-        label, output, *letters_of(item), *errors, None if validation is None else validation.output_error[output]
-    )
+    unseen = None if validation is None else validation.output_error[output]
+    return PaperRow(label, output, *letters_of(model, output), *errors, unseen)
 
 
 def table_by_angle(
-    title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **rest: Any
+    title: str,
+    columns: Sequence[str],
+    outputs: Iterable[str],
+    rows: Callable[[str], Iterable[Sequence[Cell]]],
+    **options: Any,
 ) -> Table:
-    """Return a table whose rows are grouped under the symbol of their angle."""
-    flat: list[Sequence[Cell]] = []
-    headings = {}
-    for output, each in rows.items():
-        headings[len(flat)] = symbol_html(output)
-        flat += each
-    return Table(title, columns, flat, headings=headings, **rest)
+    """Return a table with the rows of every angle under its symbol."""
+    return Table.from_groups(title, columns, {symbol_html(o): list(rows(o)) for o in dict.fromkeys(outputs)}, **options)
 
 
 def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -> Table:
@@ -148,13 +146,17 @@ def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -
     title
         Caption.
     """
-    cells: dict[str, list[list[Cell]]] = {}
-    for row in rows:
-        errors = [*criteria_cells(row.equation_error), *criteria_cells(row.output_error)]
-        cells.setdefault(row.output, []).append([row.label, *number_cells(row.orders, row.coefficients), *errors])
+
+    def cells(output: str) -> Iterator[list[Cell]]:
+        for row in rows:
+            if row.output == output:
+                errors = [*criteria_cells(row.equation_error), *criteria_cells(row.output_error)]
+                yield [row.label, *number_cells(row.orders, row.coefficients), *errors]
+
     return table_by_angle(
         title,
         ("model", *NUMBER_HEADS, *CRITERION_HEADS, *CRITERION_HEADS),
+        [row.output for row in rows],
         cells,
         groups=(*COLUMN_GROUPS, ("equation error", 3), ("output error (free run)", 3)),
     )
@@ -202,35 +204,35 @@ def printed_head(words: str) -> Markup:
     return Markup("<em>printed: {}</em>").format(words)
 
 
-def equation_of(candidate: Candidate, output: str) -> Equation:
-    """Return the equation of one angle."""
-    return next(e for e in candidate.model.equations if e.output == output)
+def printed_cells(words: str, row: printed.PublishedRow, *, criteria: bool = True) -> list[Cell]:
+    """Cells of a printed row."""
+    cells = [printed_head(words), *number_cells(row.orders, row.coefficients)]
+    return [*cells, row.error, row.rmse, row.nr] if criteria else cells
 
 
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
     """Orders, and coefficients at least as large as their standard errors, of one equation."""
-    orders, coefficients = letters_of(equation_of(candidate, output))
+    orders, coefficients = letters_of(candidate.model, output)
     errors = {} if candidate.result is None else candidate.result.standard_errors
-    index = printed.ANGLE_NAMES.index(output) + 1
-    return number_cells(orders, {n: v for n, v in coefficients.items() if not errors.get(f"{n}{index}", 0.0) > abs(v)})
+    known = {n: v for n, v in coefficients.items() if not errors.get(parameter_name(n, output), 0.0) > abs(v)}
+    return number_cells(orders, known)
 
 
 def model_table(stage: Stage, title: str) -> Table:
     """Table 4 or 5, with computed and printed rows."""
-    rows: dict[str, list[list[Cell]]] = {}
-    for output in stage.outputs:
+
+    def rows(output: str) -> Iterator[list[Cell]]:
         beside = {"integer, Euler": printed.INTEGER_ROWS[output]}
         beside |= {f"p = {p}": row for p, row in printed.FRACTIONAL_ROWS[output].items()}
-        rows[output] = []
         for label, c in stage.candidates.items():
-            errors = criteria_cells(c.estimation.output_error.get(output))
-            rows[output].append([label, *computed_cells(c, output), *errors])
-            if (row := beside.get(label)) is not None:
-                numbers = number_cells(row.orders, row.coefficients)
-                rows[output].append([printed_head(label.partition(",")[0]), *numbers, row.error, row.rmse, row.nr])
+            yield [label, *computed_cells(c, output), *criteria_cells(c.estimation.output_error.get(output))]
+            if label in beside:
+                yield printed_cells(label.partition(",")[0], beside[label])
+
     return table_by_angle(
         title,
         ("model", *NUMBER_HEADS, *CRITERION_HEADS),
+        stage.outputs,
         rows,
         groups=(*COLUMN_GROUPS, ("output error (free run)", 3)),
         note="Inputs of the free runs: the current and the measured other angle for rows of p, least squares and "
@@ -244,16 +246,18 @@ def model_table(stage: Stage, title: str) -> Table:
 def fits_table(stage: Stage) -> Table:
     """Table of both errors of every model, and its fits on both runs by the method's inputs and by the current."""
 
-    def row(label: str, c: Candidate, output: str) -> list[Cell]:
-        errors = c.estimation.equation_error[output].nr, c.estimation.output_error[output].nr
-        driven = [None if part is None else part.output_error[output].fit for part in (c.estimation, c.validation)]
-        alone = [figures[output].fit for figures in c.input_driven.values()]
-        return [label, *errors, *driven, *alone, *[None] * (2 - len(alone))]
+    def rows(output: str) -> Iterator[list[Cell]]:
+        for label, c in stage.candidates.items():
+            errors = c.estimation.equation_error[output].nr, c.estimation.output_error[output].nr
+            driven = [None if part is None else part.output_error[output].fit for part in (c.estimation, c.validation)]
+            alone = [figures[output].fit for figures in c.input_driven.values()]
+            yield [label, *errors, *driven, *alone, *[None] * (2 - len(alone))]
 
     return table_by_angle(
         f"Stage {stage.number}: both errors, and the fit of the free run on both inputs",
         ("model", "equation error", "free run", "square", "sine", "square", "sine"),
-        {o: [row(label, c, o) for label, c in stage.candidates.items()] for o in stage.outputs},
+        stage.outputs,
+        rows,
         groups=(("", 1), ("NR on the square", 2), ("fit %, driven as identified", 2), ("fit %, current alone", 2)),
         note="Everything was identified from the square run. 100 is perfect, 0 is as good as the mean.",
     )
@@ -338,99 +342,100 @@ def parameter_tables() -> list[Table]:
 
 def saturation_table(found: Reproduction) -> Table:
     """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
-    rows: dict[str, list[list[Cell]]] = {output: [] for _, output in found.angles}
-    for stage, output in found.angles:
-        of_p = {p: stage.candidates[f"p = {p}"] for p in printed.INNOVATION_LENGTHS}
-        orders = {p: letters_of(equation_of(c, output))[0] for p, c in of_p.items()}
+
+    def rows(output: str) -> Iterator[list[Cell]]:
+        stage, name = found.stages[printed.stage_of(output)], parameter_name("a", output)
+        of_p = {p: stage.candidates[f"p = {p}"].model for p in printed.INNOVATION_LENGTHS}
+        last = letters_of(of_p[printed.INNOVATION_LENGTHS[-1]], output)[0]
         x, c, _ = printed.printed_saturation(output)
-        name = f"a{printed.ANGLE_NAMES.index(output) + 1}"
-        for p, candidate in of_p.items():
-            alike = "yes" if orders[p] == orders[printed.INNOVATION_LENGTHS[-1]] else "no"
+        for p, model in of_p.items():
+            alike = "yes" if letters_of(model, output)[0] == last else "no"
             weak = stage.weak[output][p][name] if stage.weak else None
             stated = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
-            rows[output].append([f"p = {p}", candidate.model.coefficients[name], alike, weak, stated, x * p / (p + c)])
+            yield [f"p = {p}", model.coefficients[name], alike, weak, stated, x * p / (p + c)]
+
     curve = Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)")
     return table_by_angle(
         "Coefficient a by innovation length",
         ("innovation length", PRIOR_HEADS[0], "orders of p = 7", PRIOR_HEADS[1], "printed", curve),
+        [output for _, output in found.angles],
         rows,
         note="The last column is the curve of a prior through the printed values of p = 1 and p = 7. With the weak "
         "prior all p have the orders of p = 7.",
     )
 
 
-def genetic_table(found: Reproduction) -> Table:
-    """Table 6."""
-    rows: list[list[Cell]] = []
-    for output, rival in found.rivals.items():
-        angle, row = symbol_html(output), printed.GENETIC_ROWS[output]
-        best = Markup("{}, best of {} seeds").format(angle, len(rival.genetic_run.errors))
-        rows.append([best, *computed_cells(rival.models["genetic"], output)])
-        rows.append([printed_head(angle), *number_cells(row.orders, row.coefficients)])
-    title = "Table 6. Orders and coefficients by the genetic algorithm"
-    return Table(title, ("angle", *NUMBER_HEADS), rows, groups=COLUMN_GROUPS, note=PRINTED_NOTE)
-
-
-def rivals_table(found: Reproduction) -> Table:
-    """Table 7 at equal budgets."""
-    labels = {
+def optimizer_tables(found: Reproduction) -> list[Table]:
+    """Tables 6 and 7 at equal budgets, and the error (45) of each optimizer and seed."""
+    rivals = found.rivals
+    seeds = list(dict.fromkeys(seed for rival in rivals.values() for seed in rival.optimizers["genetic"].errors))
+    best: list[list[Cell]] = []
+    for output, rival in rivals.items():
+        head = Markup("{}, best of {} seeds").format(symbol_html(output), len(rival.optimizers["genetic"].errors))
+        best.append([head, *computed_cells(rival.models["genetic"], output)])
+        best.append(printed_cells(symbol_html(output), printed.GENETIC_ROWS[output], criteria=False))
+    labels = OPTIMIZER_LABELS | {
         n: f"p = 7, K₀ = {prior_text(k)}" for n, k in zip(MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, strict=True)
     }
-    labels["genetic"] = "genetic algorithm"
-    rows: dict[str, list[list[Cell]]] = {}
-    for output, rival in found.rivals.items():
-        rows[output] = []
-        for label, candidate in rival.models.items():
+
+    def errors(output: str) -> Iterator[list[Cell]]:
+        for label, candidate in rivals[output].models.items():
             own, other = candidate.estimation, candidate.validation
             unseen = criteria_cells(None if other is None else other.output_error[output])
             spread = float(np.std(own.measured[output][0]))
-            errors = criteria_cells(own.output_error[output])
-            rows[output].append([labels.get(label, label), *errors, *unseen, spread])
+            yield [labels.get(label, label), *criteria_cells(own.output_error[output]), *unseen, spread]
         for k, label in enumerate(("genetic algorithm", "multi-innovation")):
-            criteria, implied = map(Exact, printed.TABLE_7_CRITERIA[output][k]), implied_spreads()[output][k]
-            rows[output].append([printed_head(label), *criteria, None, None, None, implied])
-    return table_by_angle(
-        "Table 7. Multi-innovation and its rivals: the same record, the same number of candidates",
-        ("algorithm", *CRITERION_HEADS, *CRITERION_HEADS, "σ of the angle"),
-        rows,
-        groups=(("", 1), ("square, identified from", 3), ("sine, never seen", 3), ("", 1)),
-        note="Free runs, driven by the current and the measured other angle. All have α from "
-        f"{RIVAL_ALPHA[0]:g} to {RIVAL_ALPHA[1]:g}; p = 7 on the whole grid stands in Tables 4 and 5. "
-        "Printed σ is RMSE / NR. " + PRINTED_NOTE,
-    )
+            criteria, implied = map(Exact, printed.TABLE_7_CRITERIA[output][k]), printed.implied_spreads()[output][k]
+            yield [printed_head(label), *criteria, None, None, None, implied]
 
-
-def seeds_table(found: Reproduction) -> Table:
-    """Error (45) of each optimizer and seed, with the number of evaluations."""
-    seeds = list(dict.fromkeys(seed for rival in found.rivals.values() for seed in rival.genetic_run.errors))
-    rows: dict[str, list[list[Cell]]] = {}
-    for output, rival in found.rivals.items():
-        for name, run in (("genetic algorithm", rival.genetic_run), ("differential evolution", rival.evolution_run)):
+    def errors_by_seed(output: str) -> Iterator[list[Cell]]:
+        for name, run in rivals[output].optimizers.items():
             each = max(run.evaluations.values())
-            rows.setdefault(output, []).append([name, rival.candidates, each, *map(run.errors.get, seeds)])
-    heads = ("algorithm", "candidates", "evaluations a seed", *(f"seed {s}" for s in seeds))
-    return table_by_angle("Error (45) by seed", heads, rows)
+            yield [OPTIMIZER_LABELS[name], rivals[output].candidates, each, *map(run.errors.get, seeds)]
+
+    title = "Table 6. Orders and coefficients by the genetic algorithm"
+    return [
+        Table(title, ("angle", *NUMBER_HEADS), best, groups=COLUMN_GROUPS, note=PRINTED_NOTE),
+        table_by_angle(
+            "Table 7. Multi-innovation and its rivals: the same record, the same number of candidates",
+            ("algorithm", *CRITERION_HEADS, *CRITERION_HEADS, "σ of the angle"),
+            rivals,
+            errors,
+            groups=(("", 1), ("square, identified from", 3), ("sine, never seen", 3), ("", 1)),
+            note="Free runs, driven by the current and the measured other angle. All have α from "
+            f"{RIVAL_ALPHA[0]:g} to {RIVAL_ALPHA[1]:g}; p = 7 on the whole grid stands in Tables 4 and 5. "
+            "Printed σ is RMSE / NR. " + PRINTED_NOTE,
+        ),
+        table_by_angle(
+            "Error (45) by seed",
+            ("algorithm", "candidates", "evaluations a seed", *(f"seed {s}" for s in seeds)),
+            rivals,
+            errors_by_seed,
+        ),
+    ]
 
 
 def printed_reading_table(found: Reproduction, stage: Stage) -> Table:
     """Table 4 or 5 as the paper computed it: recomputed, printed, and their ratio."""
-    rows: dict[str, list[list[Cell]]] = {}
-    for output in stage.outputs:
-        rows[output] = []
+
+    def rows(output: str) -> Iterator[list[Cell]]:
         for p, row in found.as_printed[output].rows.items():
             stated = printed.FRACTIONAL_ROWS[output][p]
             ours = [*map(row.coefficients.get, COEFFICIENT_LETTERS), *criteria_cells(row.equation)]
             theirs = [*map(stated.coefficients.get, COEFFICIENT_LETTERS), stated.error, stated.rmse, stated.nr]
-            ratios = [
-                number(float(a) / b, 3) if a is not None and b else None for a, b in zip(ours, theirs, strict=True)
-            ]
-            rows[output] += [[f"p = {p}", *ours], [printed_head(f"p = {p}"), *theirs], ["ours / printed", *ratios]]
+            pairs = zip(ours, theirs, strict=True)
+            ratios = [number(float(a) / b, 3) if a is not None and b else None for a, b in pairs]
+            yield [f"p = {p}", *ours]
+            yield [printed_head(f"p = {p}"), *theirs]
+            yield ["ours / printed", *ratios]
+
     made = {symbol(o): found.as_printed[o] for o in stage.outputs}
-    settings = "; ".join(f"{o}: {t.reading} ({TERM_INTERPRETATIONS[t.reading.terms]})" for o, t in made.items())
+    settings = "; ".join(f"{o}: {t.reading} ({printed.TERM_INTERPRETATIONS[t.reading.terms]})" for o, t in made.items())
     scales = ", ".join(f"{o} by {t.scale:.3g}" for o, t in made.items())
     return table_by_angle(
         f"Table {3 + stage.number} as printed: multi-innovation at the printed orders, equation errors",
         ("row", *map(symbol_html, COEFFICIENT_LETTERS), *CRITERION_HEADS),
+        stage.outputs,
         rows,
         note=f"Closest settings: {settings}. The simulated arm has integer orders and Coulomb friction; its angles are "
         f"scaled to the deviations that the printed RMSE / NR imply ({scales}). " + PRINTED_NOTE,
@@ -439,19 +444,20 @@ def printed_reading_table(found: Reproduction, stage: Stage) -> Table:
 
 def printed_runs_table(found: Reproduction) -> Table:
     """Table of the printed models under the paper's own current."""
-    rows: dict[str, list[list[Cell]]] = {}
-    for r in found.ran:
-        a = f"a{printed.ANGLE_NAMES.index(r.output) + 1}"
-        back = [r.returned_coefficients.get(prior, {}).get(a) for prior in PRIOR_COVARIANCES]
-        deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
-        stated = printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"]
-        rows.setdefault(r.output, []).append(
-            [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, stated, *back]
-        )
+
+    def rows(output: str) -> Iterator[list[Cell]]:
+        for r in found.ran:
+            if r.output == output:
+                back = [r.returned_coefficients.get(k, {}).get(parameter_name("a", output)) for k in PRIOR_COVARIANCES]
+                deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
+                stated = printed.FRACTIONAL_ROWS[output][r.p].coefficients["a"]
+                yield [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, stated, *back]
+
     heads = ("σ, both equations [rad]", "σ, (26) alone [rad]", "σ of the paper's angle [rad]", "times too small")
     return table_by_angle(
         "The printed models of Tables 4 and 5 under the paper's current",
         ("model", "unstable poles", *heads, "a printed", *PRIOR_HEADS),
+        [r.output for r in found.ran],
         rows,
         groups=(("", 7), ("a, identified from its own response", 2)),
         note="Square current of 0.3 A, 10 s, from rest. σ of the paper's angle is RMSE / NR of Table 7. Poles are "
@@ -469,8 +475,8 @@ def case_tables(found: Reproduction) -> list[Table]:
     orders: list[list[Cell]] = []
     for f in found.panel.order_comparisons:
         for output in f.free_nr:
-            away = ", ".join(f"{symbol(n)} {f.orders[n][0]:.3g}" for n in f.fractional_orders) or "none"
-            orders.append([f"{f.arm}, {symbol(output)}", f.integer_nr[output], f.free_nr[output], away])
+            head = f"{f.arm}, {symbol(output)}"
+            orders.append([head, f.integer_nr[output], f.free_nr[output], f.fractional_text])
     p = [f"p = {p}" for p in printed.INNOVATION_LENGTHS]
     return [
         Table(

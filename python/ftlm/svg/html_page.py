@@ -10,7 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
+from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup, escape
@@ -68,6 +70,15 @@ class Table:
     note: str = ""
     wrap: bool = False
     stacked: bool = False
+
+    @classmethod
+    def from_groups(
+        cls, title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **options: Any
+    ) -> Table:
+        """Return a table whose rows are given by the heading above them; the options are those of a table."""
+        starts = accumulate((len(each) for each in rows.values()), initial=0)
+        flat = [row for each in rows.values() for row in each]
+        return cls(title, columns, flat, headings=dict(zip(starts, rows, strict=False)), **options)
 
     @property
     def is_numeric(self) -> list[bool]:
