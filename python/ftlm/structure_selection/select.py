@@ -254,7 +254,7 @@ def _run_selection(
 
 @dataclass(frozen=True)
 class Choice:
-    """Ranked trials, the chosen one, the reason, and the choices of single outputs that it combines."""
+    """Choice among ranked trials, its reason, and the choices of single outputs that it combines."""
 
     ranked: tuple[Trial, ...]
     winner: Trial

@@ -14,6 +14,7 @@ use super::prefilter::power_share_frequency;
 use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
 use crate::estimation::joint_fit::format::format_general;
+use crate::estimation::joint_fit::multistart::MAX_COARSE_SAMPLES;
 use crate::estimation::joint_fit::objective::Objective;
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::{Candidate, Iterate};
@@ -23,13 +24,13 @@ use crate::estimation::output_error::evaluation::{self, solve_linear_steps, Line
 use crate::estimation::output_error::integer_orders::{
     source_input, Companion, ExactSimulation, IntegerOrders, SourceInput,
 };
-use crate::estimation::output_error::{Experiment, FreeModel, InputLaw, Monomial, ParameterPoint};
+use crate::estimation::output_error::{Experiment, FreeEquation, FreeModel, InputLaw, Monomial, ParameterPoint};
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 use crate::linalg::small::{polynomial_roots, EquilibratedLu};
 use crate::parallel::Stop;
 use crate::signal::block_pulse::Intersample;
 use crate::signal::nonuniform::interpolate_gaps;
-use crate::signal::statistics::{inner, median};
+use crate::signal::statistics::{inner, mean, median};
 
 /// Poles λ of the state-variable filters relative to the frequency that halves the power of the output.
 const FILTER_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
@@ -52,6 +53,8 @@ const MAX_FREQUENCY_STEP: f64 = PI;
 const MIN_POLE_DURATION: f64 = 1e-4;
 /// Smallest damping of an initial guess.
 const MIN_DAMPING: f64 = 1e-4;
+/// Least number of runs on which guesses are compared.
+const MIN_RUNS: usize = 2;
 /// Delays that continue.
 const CONTINUED_DELAYS: usize = 3;
 
@@ -108,7 +111,8 @@ pub fn integer_order_optima(
     }
     let mut found: Vec<Candidate> = Vec::new();
     for i in 0..model.equations.len() {
-        let experiments: Vec<Experiment> = grid.experiments().iter().map(|e| single_output(e, i)).collect();
+        let representative = representative_runs(&model.equations[i], grid.experiments());
+        let experiments: Vec<Experiment> = representative.into_iter().map(|e| single_output(e, i)).collect();
         let Some(equation) = Equation::new(model, i, &experiments, grid.stop()) else { return Ok(None) };
         let guesses = equation.optima(&start, delays)?;
         if guesses.is_empty() {
@@ -128,6 +132,46 @@ pub fn integer_order_optima(
         }
     }
     Ok(Some(found))
+}
+
+/// Runs on which the guesses of an equation are compared, of many runs those with the most excitation.
+///
+/// In turn each input contributes the run in which it varies most, until there are two runs and the samples of a coarse
+/// fit. The optima start from these guesses on all runs.
+fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment]) -> Vec<&'a Experiment> {
+    let mut inputs: Vec<usize> = equation.terms.iter().map(|(signal, ..)| *signal).collect();
+    inputs.retain(|signal| *signal != equation.output);
+    inputs.sort_unstable();
+    inputs.dedup();
+    let variation = |experiment: &Experiment, signal: usize| {
+        let means = experiment.record.signal(signal);
+        let middle = mean(means);
+        means.iter().map(|v| (v - middle) * (v - middle)).sum::<f64>()
+    };
+    let ranked: Vec<Vec<usize>> = inputs
+        .iter()
+        .map(|&signal| {
+            let sizes: Vec<f64> = experiments.iter().map(|e| variation(e, signal)).collect();
+            let mut order: Vec<usize> = (0..experiments.len()).collect();
+            order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
+            order
+        })
+        .collect();
+    let (mut chosen, mut samples) = (Vec::new(), 0);
+    for run in (0..experiments.len()).flat_map(|place| ranked.iter().map(move |order| order[place])) {
+        if chosen.len() >= MIN_RUNS.max(inputs.len()) && samples >= MAX_COARSE_SAMPLES {
+            break;
+        }
+        if !chosen.contains(&run) {
+            chosen.push(run);
+            samples += experiments[run].compared_count();
+        }
+    }
+    if chosen.is_empty() {
+        return experiments.iter().collect();
+    }
+    chosen.sort_unstable();
+    chosen.into_iter().map(|run| &experiments[run]).collect()
 }
 
 /// Experiment of one output.

@@ -7,7 +7,7 @@ use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::mean;
 
 /// Samples of the coarse fits over all runs; each run has at least [`MIN_RUN_SAMPLES`].
-const MAX_COARSE_SAMPLES: usize = 1200;
+pub const MAX_COARSE_SAMPLES: usize = 1200;
 const MIN_RUN_SAMPLES: usize = 400;
 /// Largest decimation without a check of the bandwidth. Above it, half a period of the frequency that contains 90 % of
 /// the power needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]: with fewer, the grid is refined to the samples again. The

@@ -15,7 +15,7 @@ mod nonlinear;
 mod search;
 mod sliding_body;
 
-pub use coarse_grid::{coarse_sampling, leading_part};
+pub use coarse_grid::{coarse_sampling, leading_part, MAX_COARSE_SAMPLES};
 pub use friction::run_friction_multistart;
 pub use halving::{competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors};
 pub use nested_models::{
