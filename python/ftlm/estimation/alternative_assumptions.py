@@ -118,9 +118,9 @@ def drift_findings(fit: Fit) -> list[Finding]:
         )
     except FtlmError:
         return []
-    least = min(fit_score(joint, joint), fit_score(constant, joint))
-    numbers = _largest_change(joint, line)
-    if numbers is None or not fit_score(line, joint) + START_SETTINGS.history_margin < least:
+    numbers, score = _largest_change(joint, line), fit_score(line, joint)
+    preferred = score < fit_score(constant, joint)
+    if numbers is None or not (preferred and score + START_SETTINGS.history_margin < fit_score(joint, joint)):
         return []
     about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
     return [make_finding("drift_fits", **about, **numbers)]
