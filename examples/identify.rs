@@ -4,7 +4,7 @@
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Result;
 use ftlm::estimation::output_error::{
-    fit, Coordinate, Experiment, FreeEquation, FreeModel, Monomial, Point, Settings, Status,
+    fit, Coordinate, Experiment, FreeEquation, FreeModel, MinimizationSettings, Monomial, ParameterPoint, Status,
 };
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
@@ -104,12 +104,12 @@ fn main() -> Result<()> {
     };
     let samples = point_samples(&measured);
     let experiment = Experiment::new(record, 1, vec![samples], vec![100.0 / size])?;
-    let start = Point {
+    let start = ParameterPoint {
         orders: vec![structure.order, structure.terms[1].order],
         coefficients: best.coefficients.clone(),
         inputs: Vec::new(),
     };
-    let found = fit(&model, &[experiment], &start, Settings::default())?;
+    let found = fit(&model, &[experiment], &start, MinimizationSettings::default())?;
     println!("joint output error: orders {:.3?}, coefficients {:.3?}", found.point.orders, found.point.coefficients);
     println!("the truth:          orders [1.850, 0.650], coefficients [-12.000, -1.500, 9.000]");
     if found.status != Status::Converged {

@@ -30,6 +30,8 @@ OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
     ("caputo", "none"),
     ("caputo", "level"),
 )
+#: Offsets of the equations without a drift and with one.
+DRIFT_OFFSETS: tuple[Offset, Offset] = ("constant", "ramp")
 #: Largest ratio of the sums of squares of another start and of the one that was taken at which both explain a run.
 MAX_SQUARES_RATIO = 1.05
 #: Difference of two gains, in joint standard errors and relative to the larger one, from which on they contradict.
@@ -109,13 +111,16 @@ def drift_findings(fit: Fit) -> list[Finding]:
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
         return []
+    asked = replace(structure, initial=joint.initial)
     try:
-        asked = replace(structure, initial=joint.initial, offset="ramp")
-        refit = fit_output_error(runs, asked, near=joint, refine=False)
+        constant, line = (
+            fit_output_error(runs, replace(asked, offset=offset), near=joint, refine=False) for offset in DRIFT_OFFSETS
+        )
     except FtlmError:
         return []
-    numbers = _largest_change(joint, refit)
-    if numbers is None or not fit_score(refit, joint) + START_SETTINGS.history_margin < fit_score(joint, joint):
+    numbers, score = _largest_change(joint, line), fit_score(line, joint)
+    preferred = score < fit_score(constant, joint)
+    if numbers is None or not (preferred and score + START_SETTINGS.history_margin < fit_score(joint, joint)):
         return []
     about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
     return [make_finding("drift_fits", **about, **numbers)]
