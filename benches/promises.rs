@@ -13,7 +13,7 @@ use ftlm::estimation::joint_fit::fit;
 use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
 use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::structure::{
-    Coefficient, Equation as FreeEquation, Order, Structure as FreeStructure, Term as FreeTerm,
+    Coefficient, Order, ParametricEquation, ParametricStructure, ParametricTerm,
 };
 use ftlm::estimation::joint_fit::{FitProblem, Initialization, Loss, OutputScale, Settings};
 use ftlm::estimation::least_squares;
@@ -302,17 +302,20 @@ fn joint_fit(m: usize) -> Option<f64> {
     let sizes = [OutputScale::from_runs(&[y.clone()])];
     let run = vec![Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold))];
     let runs = Recordings::new(vec![Recording::new("run", h, None, run, vec![0]).ok()?]).ok()?;
-    let free = |(signal, order, _): (usize, f64, f64), name: &str| FreeTerm {
+    let free = |(signal, order, _): (usize, f64, f64), name: &str| ParametricTerm {
         signal,
         order: Order::number(order),
         coefficient: Coefficient::Free(name.into()),
         factor: 1.0,
     };
     let terms = terms.into_iter().zip(["d", "a", "b"]).map(|(term, name)| free(term, name)).collect();
-    let sought = FreeEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
-    let free =
-        ParameterSet::from_structure(FreeStructure::new(vec!["y".into(), "u".into()], vec![sought], Initial::Rest))
-            .ok()?;
+    let sought = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
+    let free = ParameterSet::from_structure(ParametricStructure::new(
+        vec!["y".into(), "u".into()],
+        vec![sought],
+        Initial::Rest,
+    ))
+    .ok()?;
     let stop = Stop::default();
     let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
     let asked = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };

@@ -5,7 +5,9 @@ use ftlm::equation::Initial;
 use ftlm::error::Result;
 use ftlm::estimation::joint_fit::initial_guesses::OrderGrids;
 use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
-use ftlm::estimation::joint_fit::structure::{Coefficient, Equation, Order, Structure, Term};
+use ftlm::estimation::joint_fit::structure::{
+    Coefficient, Order, ParametricEquation, ParametricStructure, ParametricTerm,
+};
 use ftlm::estimation::joint_fit::{fit, FitProblem, Initialization, Loss, OutputScale, Settings};
 use ftlm::output_samples::{InitialTerms, OutputSimulation};
 use ftlm::parallel::Stop;
@@ -41,12 +43,12 @@ fn main() -> Result<()> {
     // D^alpha y = a y + b u.
     let term = |signal, name: &str| {
         let coefficient = Coefficient::Free(name.into());
-        Term { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
+        ParametricTerm { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
     };
     let terms = vec![term(0, "a"), term(1, "b")];
-    let sought = Equation { output: 0, order: Order::free("alpha"), terms, friction: None };
+    let sought = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
     let signals = vec!["y".into(), "u".into()];
-    let free = ParameterSet::from_structure(Structure::new(signals, vec![sought], Initial::Rest))?;
+    let free = ParameterSet::from_structure(ParametricStructure::new(signals, vec![sought], Initial::Rest))?;
     let stop = Stop::default();
     let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
     let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
