@@ -57,6 +57,7 @@ from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_find
 from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
+from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import check_linear, default_m
 from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
 from ftlm.structure.structure import History, Offset, Structure, check_offset
@@ -77,6 +78,8 @@ from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
 
+#: Share of the work of an identification that decides about the start of its runs.
+HYPOTHESES_SHARE = 0.7
 #: Initial terms of fits with a level.
 LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
 #: Offsets of fits in motion of runs that looked like rest.
@@ -367,15 +370,24 @@ def identify(
     if structure.offset == "auto":
         _check_offset_test(structure, chosen)
 
-    def estimate(asked: Structure, method: EstimationMethod = chosen, **more: JointFit | None) -> Fit:
-        fit = method.fit(several, asked, m=m, threads=threads, progress=progress, **more)
+    def estimate(
+        asked: Structure,
+        method: EstimationMethod = chosen,
+        report: Callable[[int, int], None] | None = progress,
+        **more: JointFit | None,
+    ) -> Fit:
+        fit = method.fit(several, asked, m=m, threads=threads, progress=report, **more)
         if not isinstance(fit, Fit):
             raise ModelError(f"the method {chosen.name!r} fitted a {type(fit).__name__}, not a Fit")
         return fit
 
     light, hypotheses = getattr(chosen, "hypothesis", None), Hypotheses(estimate)
     if light is not None:
-        hypotheses = Hypotheses(partial(estimate, method=light), lambda asked, joint: estimate(asked, fitted=joint))
+        course = ShareTracker(progress)
+        hypotheses = Hypotheses(
+            partial(estimate, method=light, report=course.subtask(HYPOTHESES_SHARE, 0.9)),
+            lambda asked, joint: estimate(asked, report=course.subtask(1.0, 1.0), fitted=joint),
+        )
     PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
     result = assess_fit(fit_with_offset_decision(several, structure, estimate, hypotheses))
     PACKAGE_LOGGER.info("identified: %s", result.verdict)

@@ -6,7 +6,7 @@ use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::mean;
 
-/// Samples of the coarse fits over all runs; each run has at least [`MIN_RUN_SAMPLES`].
+/// Samples of the coarse fits over all runs; each run has at least `MIN_RUN_SAMPLES`.
 pub const MAX_COARSE_SAMPLES: usize = 1200;
 const MIN_RUN_SAMPLES: usize = 400;
 /// Largest decimation without a check of the bandwidth. Above it, half a period of the frequency that contains 90 % of
