@@ -343,6 +343,9 @@ class FrequencyIdentification:
             squares.setdefault(error.output, []).append(error.rms**2)
         return {output: 100.0 - math.sqrt(sum(own) / len(own)) for output, own in squares.items()}
 
+    #: The same, by the name that has the unit.
+    fit_percent = fit
+
     def to_frame(self) -> Any:
         """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""
         return parameter_frame(

@@ -196,6 +196,9 @@ class Identification:
         """Fit of the simulation in percent, by output."""
         return self.comparison.fit
 
+    #: The same, by the name that has the unit.
+    fit_percent = fit
+
     def physical(self, **known: float) -> dict[str, PhysicalParameter]:
         """Return the physical parameters of a flexible link; see :func:`ftlm.physical_parameters`.
 

@@ -93,6 +93,9 @@ class Selection(ReportMixin):
         """Fit of the simulation on the estimation runs in percent, by output."""
         return self.best.fit
 
+    #: The same, by the name that has the unit.
+    fit_percent = fit
+
     def validate(self, runs: Run | Sequence[Run]) -> Validation:
         """Compare the model with runs that took no part in the selection; see :meth:`ftlm.Identification.validate`."""
         return self.best.validate(runs)

@@ -209,6 +209,9 @@ class Comparison:
         """Fit of the simulation in percent, by output."""
         return {name: figures.fit for name, figures in self.output_error.items()}
 
+    #: The same, by the name that has the unit.
+    fit_percent = fit
+
     def to_frame(self) -> Any:
         """Return both errors of every run as a pandas frame, by run, output and kind of error."""
         rows = [
