@@ -31,7 +31,7 @@ from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, join_names
-from ftlm.validation.comparison import Comparison, finite, plain
+from ftlm.validation.comparison import Comparison, finite, json_value
 
 #: Free orders of each structure; the other orders are integer.
 INTEGER_KIND = "whole orders"
@@ -109,7 +109,7 @@ class RunFit:
             "numbers": self.numbers,
             "fit": {run: finite(self.fit(run)) for run in self.comparisons},
             "estimates": {n: float(v) for n, (v, *_) in self.estimates.items()},
-            "intervals": {n: plain(ends) for n, (_, *ends) in self.estimates.items()},
+            "intervals": {n: json_value(ends) for n, (_, *ends) in self.estimates.items()},
             "warnings": list(self.result.warnings),
         }
 
@@ -221,7 +221,7 @@ class Deflection:
         return {
             "equation": str(self.structure),
             "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in self.verdicts},
-            "fits": plain(self.fits),
+            "fits": json_value(self.fits),
             "failed": {f"{kind}, {run}": words for (kind, run), words in self.failed.items()},
         }
 

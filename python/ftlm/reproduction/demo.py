@@ -33,7 +33,7 @@ from ftlm.structure.order_grid import OrderGrid
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
 from ftlm.utils.formatting import Cell, symbol, wrap_text
-from ftlm.validation.comparison import plain
+from ftlm.validation.comparison import json_value
 
 #: Candidates that the result of an order search keeps.
 TOP_CANDIDATES = 20
@@ -109,13 +109,13 @@ class Demo:
     def to_dict(self) -> dict[str, Any]:
         """Return rows and estimates for JSON."""
         return {
-            "rows": plain(self.rows),
+            "rows": json_value(self.rows),
             "warnings": {
                 f"stage {stage}, {label}": list(result.warnings)
                 for stage, results in self.results.items()
                 for label, result in results.items()
             },
-            "correlation with the current": {d.output: plain(d.correlations) for d in self.derived.values()},
+            "correlation with the current": {d.output: json_value(d.correlations) for d in self.derived.values()},
             "files": [str(f) for f in self.files],
         }
 

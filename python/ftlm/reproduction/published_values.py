@@ -25,7 +25,7 @@ from ftlm.model.model import Model
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.plot.comparison_charts import pulse_times
 from ftlm.reproduction.simulated_arm import PAPERS_ARM, StageNumber, demo_run
-from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, around, best_orders
+from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, best_orders, neighboring_values
 from ftlm.simulation.discretization import record, sensor_series
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import Order
@@ -541,7 +541,7 @@ def _reidentify(
 ) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
     """Coefficients at the model's own orders, and for the largest p the best orders around them, by K0."""
     own = {n: [orders[n]] for n in single.order_names}
-    near = {n: around(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}
+    near = {n: neighboring_values(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}
     wide = {n: v if n.startswith("alpha") else [w for w in near[n] if w < 2.0] for n, v in own.items()}
 
     def best(axes: dict[str, list[float]]) -> dict[float, Model]:

@@ -46,7 +46,7 @@ from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads, join_names, nearest, real_number, short_repr, whole_number
-from ftlm.validation.comparison import attributes, plain
+from ftlm.validation.comparison import attributes, json_value
 
 #: Name of the given runs in verdicts.
 MEASURED_LABEL = "as measured"
@@ -175,7 +175,7 @@ class Reproduction:
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
             "order_grid": attributes(self.order_grid, ("increment", "alpha")),
-            "as it should be": plain(self.stages),
+            "as it should be": json_value(self.stages),
         } | attributes(self, ("checks", "as_printed", "ran", "panel", "notes"))
 
 

@@ -37,10 +37,10 @@ from ftlm.reproduction.stage_result import (
     DroppedDerivative,
     Rival,
     Stage,
-    around,
     compare_optimizers,
     euler_means,
     integer_orders,
+    neighboring_values,
     published_structure,
     rivals_order_grid,
     seeds_for,
@@ -360,7 +360,7 @@ class StageWork:
         axes = {}
         for name, value in start.model.orders.items():
             steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
-            axes[name] = [v for v in around(value, grid.increment, steps) if 0 <= v <= grid.alpha[1]]
+            axes[name] = [v for v in neighboring_values(value, grid.increment, steps) if 0 <= v <= grid.alpha[1]]
         method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=self.preset.top)
         return self.identify_candidate("instrumental variables", self.on, self.measured, method)
 

@@ -30,7 +30,7 @@ from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
 from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, symbol
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Comparison, Metrics, attributes, compare_means, metrics, plain
+from ftlm.validation.comparison import Comparison, Metrics, attributes, compare_means, json_value, metrics
 
 #: Steps between two points of a convergence curve; the effect of p is limited to the first steps.
 TRACE_EVERY = 2
@@ -73,7 +73,7 @@ def integer_orders(structure: Structure) -> Structure:
     return structure.with_orders({n: integer_order(n) for n in structure.order_names})
 
 
-def around(value: float, increment: float, steps: int) -> list[float]:
+def neighboring_values(value: float, increment: float, steps: int) -> list[float]:
     """Return the values of an order grid around one of them."""
     return [round(value + k * increment, 9) for k in range(-steps, steps + 1)]
 
@@ -236,7 +236,7 @@ class Stage:
     def to_dict(self) -> dict[str, Any]:
         """Return the stage results for JSON."""
         return {
-            "models": plain(self.candidates),
+            "models": json_value(self.candidates),
             "derived input order": attributes(self.derived, ("output", "order", "correlations")),
         } | attributes(self, ("printed_orders", "by_equation", "weak", "rivals"))
 

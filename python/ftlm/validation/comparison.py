@@ -50,15 +50,15 @@ def finite(value: float) -> float | None:
 
 def attributes(value: object, names: Iterable[str]) -> dict[str, Any]:
     """Return some attributes of an object for JSON."""
-    return {name: plain(getattr(value, name)) for name in names}
+    return {name: json_value(getattr(value, name)) for name in names}
 
 
-def plain(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Return a value for JSON: mappings, sequences, and dataclasses by their fields. Infinity is None."""
     if isinstance(value, Mapping):
-        return {f"{k:g}" if isinstance(k, float) else str(k): plain(v) for k, v in value.items()}
+        return {f"{k:g}" if isinstance(k, float) else str(k): json_value(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(each) for each in value]
+        return [json_value(each) for each in value]
     if hasattr(value, "to_dict"):
         return value.to_dict()
     if is_dataclass(value):
