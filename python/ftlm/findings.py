@@ -173,7 +173,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_FACT,
         "the model is unstable, and so is the plant: simulations restarted every {seconds:.2g} s explain "
         "{fit:.3g} % of the outputs, and the outputs stay bounded as under a controller",
-        remedy="record the reference signal of the controller, and validate on short pieces",
+        remedy="record the reference signal of the controller",
+    ),
+    "runs_split": FindingKind(
+        "other",
+        LEVEL_FACT,
+        "no simulation of a whole run follows this unstable plant, which a controller stabilizes: the runs were split "
+        "into {pieces} pieces of {seconds:.2g} s, each with its own initial values; {ask[initial]} overrules it",
     ),
     "plant_unstable_in_pieces": FindingKind(
         "loop",
@@ -182,7 +188,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "every {seconds:.2g} s explain {fit:.3g} % of the outputs, while that of a whole run grows; noise in "
         "the feedback biases this method",
         "the plant is unstable, as the model is: simulations restarted every {seconds:.2g} s explain {fit:.3g} %",
-        "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, which "
+        "identify the pieces of run.split({seconds:.2g}) together by output error with {ask[initial is caputo]}, which "
         "noise does not bias",
     ),
     "plant_needs_pieces": FindingKind(
@@ -192,7 +198,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "least squares at these orders gives an unstable model whose simulations, restarted every "
         "{seconds:.2g} s, explain {fit:.3g} %",
         "the plant is unstable and stabilized by a controller, and no simulation of a whole run follows it",
-        "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, or use "
+        "identify the pieces of run.split({seconds:.2g}) together with {ask[initial is caputo]}, or use "
         "{ask[method is least-squares]}, which noise in the loop biases",
     ),
     "growth_not_told": FindingKind(

@@ -725,8 +725,8 @@ HOSTILE = {
         lambda d: d.update(estimate={"method": "x", "runs": [], "values": {}, "covariance": [[1.0]]})
     ),
     "NaN": altered(lambda d: d["equations"][0].update(order=math.nan)),
-    "later schema": altered(lambda d: d.update(schema=12)),
-    "later schema with what is in it": altered(lambda d: d.update(schema=12, moons={"of": "a later version"})),
+    "later schema": altered(lambda d: d.update(schema=13)),
+    "later schema with what is in it": altered(lambda d: d.update(schema=13, moons={"of": "a later version"})),
     "later schema, and who wrote it": altered(lambda d: d.update(schema=10**30, written_by="ftlm 7.1", equations=4)),
     "schema of more than it holds": altered(lambda d: d.update(schema=3)),
     "schema 0": altered(lambda d: d.update(schema=0)),
@@ -766,7 +766,7 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
         ftlm.load_model(path)
     message = str(refused.value)
     assert message.startswith(str(path))
-    later = f"has schema 12, and this version, {ftlm.__version__}, reads up to 11; upgrade ftlm"
+    later = f"has schema 13, and this version, {ftlm.__version__}, reads up to 12; upgrade ftlm"
     expected = {
         "too large": "1048577 bytes",
         "later schema": later,

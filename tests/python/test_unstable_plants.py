@@ -35,26 +35,73 @@ def codes(found):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("noise", [1e-3, 1e-2])
-def test_the_way_that_is_named_leads_to_the_truth(seed, noise):
+def test_default_splits_the_run_and_finds_the_plant(seed, noise, tmp_path):
     run = held(4.0, 2.0, 5.0, seed=seed, noise=noise)
-    default = ftlm.identify(run, ftlm.equation(EQUATION))
+    found = ftlm.identify(run, ftlm.equation(EQUATION))
+    for name, truth in (("a", 4.0), ("b", 2.0)):
+        assert abs(found.coefficients[name] - truth) < 4 * found.standard_errors[name] + 0.01 * truth
+    (split,) = (f for f in found.findings if f.code == "runs_split")
+    assert split.numbers["pieces"] == len(run.split(split.numbers["seconds"]))
+    assert found.verdict.level == "with care"
+    other = held(4.0, 2.0, 5.0, seed=seed + 10, noise=noise)
+    validation = found.validate(other)
+    assert validation.verdict.level in ("trust", "with care")
+    assert validation.output_error["y"].nr < 0.3
+    # A saved model is compared in the same pieces.
+    again = ftlm.load_model(found.model.save(tmp_path / "model.json"))
+    assert again.compare(other).fit == validation.fit
+    # The call that does the same by hand.
+    by_hand = ftlm.identify(run.split(split.numbers["seconds"]), ftlm.equation(EQUATION), initial="caputo")
+    assert by_hand.coefficients == found.coefficients
+
+
+@pytest.mark.parametrize("initial", ["rest", "caputo"])
+def test_a_start_that_is_given_is_kept_and_the_way_is_named(initial):
+    run = held(4.0, 2.0, 5.0, seed=1, noise=1e-2)
+    default = ftlm.identify(run, ftlm.equation(EQUATION), initial=initial)
     assert default.verdict.level == "do not use"
     (said,) = (f for f in default.findings if f.code == "plant_needs_pieces")
     assert default.verdict.reason == said.reason
+    assert f"run.split({said.numbers['seconds']:.2g})" in said.remedy
     assert "initial='caputo'" in said.remedy
     assert "method='least-squares'" in said.remedy
     assert "output-error" not in default.verdict.remedy
-    # The call that the remedy names.
-    seconds = round(said.numbers["seconds"], 2)
-    pieces = [run.window(k * seconds, (k + 1) * seconds) for k in range(int(run.length * STEP / seconds))]
-    found = ftlm.identify(pieces, ftlm.equation(EQUATION, initial="caputo"))
-    for name, truth in (("a", 4.0), ("b", 2.0)):
-        assert abs(found.coefficients[name] - truth) < 4 * found.standard_errors[name] + 0.01 * truth
-    assert "plant_unstable" in codes(found)
-    assert found.verdict.level == "with care"
-    assert found.validate(pieces[:3]).verdict.level == "with care"
-    # What the file keeps is judged alike.
-    assert ftlm.compare(found.model, pieces).output_error["y"].nr < 0.5
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_structure_of_an_unstable_plant_is_found(seed):
+    """Inverted pendulum D^2 y = w^2 (y + u) under proportional-derivative control, noise in the measurement."""
+    g, rate, step = np.random.default_rng(seed), 0.4, 0.12
+    move = expm(np.array([[0.0, 1.0, 0.0], [rate**2, 0.0, rate**2], [0.0, 0.0, 0.0]]) * step)
+    state, inputs, outputs = np.zeros(2), [], []
+    for r in np.repeat(g.choice([-0.2, 0.2], 80), 10):
+        y = state[0] + 0.004 * g.standard_normal()
+        u = -3.0 * y - 2.0 / rate * state[1] + 2.0 * r
+        state = move[:2, :2] @ state + move[:2, 2] * u
+        inputs.append(u)
+        outputs.append(y)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": np.array(inputs)}, outputs={"y": np.array(outputs)})
+    found = ftlm.select(run, "auto")
+    (order,) = (e.order.constant for e in found.model.structure.equations)
+    assert order == 2
+    assert abs(found.parameters["a0"].value / rate**2 - 1) < 0.06
+    assert abs(found.parameters["b0"].value / rate**2 - 1) < 0.06
+    assert "runs_split" in codes(found.best)
+
+
+def test_split():
+    time = np.arange(1003) * 0.1
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.sin(time)}, outputs={"y": np.cos(time)}, name="test")
+    pieces = run.split(10.0)
+    assert len(pieces) == 10
+    assert np.array_equal(np.concatenate([p["y"] for p in pieces]), run["y"])
+    assert min(p.length for p in pieces) == 100
+    assert max(p.length for p in pieces) == 101
+    assert pieces[3].start == pytest.approx(30.0)
+    assert pieces[3].name == "test piece 4 of 10"
+    assert run.split(60.0) == [run]
+    with pytest.raises(ftlm.DataError, match="duration = 0, which must be above 0"):
+        run.split(0.0)
 
 
 @pytest.mark.parametrize("method", ["least-squares", "instrumental-variables"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import html
+import itertools
 import os
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -387,6 +388,31 @@ class Run:
         if readings is not None:
             readings = readings.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
         return self._with(_data=data, start=begin, sample_times=readings)
+
+    @check_arguments
+    def split(self, duration: float) -> list[Run]:
+        """Return consecutive runs of equal length that together hold all rows.
+
+        Parameters
+        ----------
+        duration : float
+            Shortest length of a piece [s], > 0; the whole run is one piece where it is shorter than two.
+
+        Returns
+        -------
+        list of Run
+            Each with the number of its piece in its name.
+        """
+        if not duration > 0.0:
+            raise DataError(f"duration = {duration:g}, which must be above 0; give the length of a piece in seconds")
+        count = max(1, int(self.length * self.step / max(duration, MIN_RUN_SAMPLES * self.step) + 1e-9))
+        ends = np.linspace(0, self.length, count + 1).astype(int) * self.step
+        pieces = [self.window(float(a), float(b)) for a, b in itertools.pairwise(ends)]
+        return (
+            [p._with(name=f"{self.name} piece {k} of {count}") for k, p in enumerate(pieces, 1)]
+            if count > 1
+            else [self]
+        )
 
     @check_arguments
     def resample(self, step: float) -> Run:

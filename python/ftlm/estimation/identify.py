@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +15,7 @@ import numpy as np
 from msgspec import UNSET
 
 from ftlm.arm.flexible_link import FLEXIBLE_LINK
-from ftlm.data.run import Run, as_runs
+from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.alternative_assumptions import (
@@ -27,7 +28,7 @@ from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.methods import EstimationMethod, method_with_options, resolve_method
+from ftlm.estimation.methods import EstimationMethod, OutputError, method_with_options, resolve_method
 from ftlm.estimation.model_checks import (
     dead_channel_findings,
     discretization_findings,
@@ -52,7 +53,7 @@ from ftlm.estimation.nuisance_parameters import (
 )
 from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
 from ftlm.estimation.result import Identification
-from ftlm.estimation.unstable_plants import WHOLE_RUN_CODES, unstable_plant_findings
+from ftlm.estimation.unstable_plants import SPLIT_CODES, WHOLE_RUN_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
 from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
@@ -60,7 +61,7 @@ from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import check_linear, default_m
 from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
-from ftlm.structure.structure import History, Offset, Structure, check_offset
+from ftlm.structure.structure import History, Offset, Structure, check_initial, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
@@ -300,6 +301,7 @@ def identify(
     structure: Structure,
     *,
     method: str | EstimationMethod = "output-error",
+    initial: str | Iterable[float] | None = None,
     offset: Offset | None = None,
     bounds: Bounds | None = None,
     m: int | None = None,
@@ -323,6 +325,10 @@ def identify(
         :class:`ftlm.MultiInnovation`, :class:`ftlm.LeastSquares` or :class:`ftlm.GeneticAlgorithm`. A name stands for
         the defaults: ``"output-error"``, ``"instrumental-variables"``, ``"multi-innovation"``, ``"least-squares"`` or
         ``"genetic"``.
+    initial
+        Start of every run: ``"auto"``, ``"rest"``, ``"caputo"``, ``"history"`` or exponents of t, as in
+        :func:`ftlm.equation`. Default that of the structure. With ``"auto"``, runs of an unstable plant under control,
+        which no simulation of a whole run follows, are split into pieces with their own initial values.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
         friction that the model lacks; ``"level"``: a constant that is added to each output; ``"ramp"``: a constant and
@@ -365,10 +371,36 @@ def identify(
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
     check_threads(threads)
+    if initial is not None:
+        structure = replace(structure, initial=check_initial(initial))
     if offset is not None:
         structure = replace(structure, offset=check_offset(offset))
     if structure.offset == "auto":
         _check_offset_test(structure, chosen)
+
+    PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
+    result = assess_fit(_fit_runs(several, structure, chosen, m=m, threads=threads, progress=progress))
+    duration = next((f.numbers["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
+    if duration is not None and structure.initial == "auto" and getattr(chosen, "reference", UNSET) is None:
+        with contextlib.suppress(FtlmError):
+            split = identify_pieces(several, structure, float(duration), method=chosen, m=m, threads=threads)
+            result = split if any(f.code == "plant_unstable" for f in split.findings) else result
+    PACKAGE_LOGGER.info("identified: %s", result.verdict)
+    for item in result.findings:
+        PACKAGE_LOGGER.warning("%s", item)
+    return result
+
+
+def _fit_runs(
+    runs: Runs,
+    structure: Structure,
+    chosen: EstimationMethod,
+    *,
+    m: int | None,
+    threads: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> Fit:
+    """Fit a structure by a method, with decisions about the start of the runs and about offsets."""
 
     def estimate(
         asked: Structure,
@@ -376,7 +408,7 @@ def identify(
         report: Callable[[int, int], None] | None = progress,
         **more: JointFit | None,
     ) -> Fit:
-        fit = method.fit(several, asked, m=m, threads=threads, progress=report, **more)
+        fit = method.fit(runs, asked, m=m, threads=threads, progress=report, **more)
         if not isinstance(fit, Fit):
             raise ModelError(f"the method {chosen.name!r} fitted a {type(fit).__name__}, not a Fit")
         return fit
@@ -388,12 +420,48 @@ def identify(
             partial(estimate, method=light, report=course.subtask(HYPOTHESES_SHARE, 0.9)),
             lambda asked, joint: estimate(asked, report=course.subtask(1.0, 1.0), fitted=joint),
         )
-    PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
-    result = assess_fit(fit_with_offset_decision(several, structure, estimate, hypotheses))
-    PACKAGE_LOGGER.info("identified: %s", result.verdict)
-    for item in result.findings:
-        PACKAGE_LOGGER.warning("%s", item)
-    return result
+    return fit_with_offset_decision(runs, structure, estimate, hypotheses)
+
+
+def identify_pieces(
+    runs: Sequence[Run],
+    structure: Structure,
+    duration: float,
+    *,
+    method: EstimationMethod | None = None,
+    m: int | None = None,
+    threads: int | None = None,
+) -> Identification:
+    """Identify an unstable plant under control from pieces of its runs, each with initial values of its own.
+
+    Errors of a simulation grow over one piece only, and noise in the feedback does not bias output error.
+
+    Parameters
+    ----------
+    runs
+        Whole runs.
+    structure
+        What to identify; its start is not used.
+    duration
+        Shortest duration of a piece [s].
+    method
+        Method of estimation, by default output error.
+    m, threads
+        See :func:`identify`.
+
+    Returns
+    -------
+    Identification
+        Its model is compared with other runs in such pieces, too.
+    """
+    pieces = as_runs([piece for run in runs for piece in run.split(duration)])
+    asked = replace(structure, initial="caputo")
+    result = assess_fit(_fit_runs(pieces, asked, method or OutputError(), m=m, threads=threads, progress=None))
+    findings = (*result.findings, make_finding("runs_split", pieces=len(pieces), seconds=duration))
+    known = result.model.estimate
+    assert known is not None
+    about = msgspec.structs.replace(known, findings=tuple(f.to_file() for f in findings), piece_duration=duration)
+    return replace(result, model=replace(result.model, estimate=about), findings=findings)
 
 
 def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:

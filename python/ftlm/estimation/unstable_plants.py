@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
 from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.output_samples import measured_samples
+from ftlm.structure.structure import Structure
 from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, Comparison, simulate_runs
 
 #: Length of a piece in time constants of the fastest growing mode, that of shorter runs, and fewest samples. By
@@ -29,6 +30,8 @@ MAX_GROWTH_EXPONENT = 15.0
 MIN_PIECES, MAX_PIECES = 5, 40
 #: Largest residual of the pieces, relative to the deviations of their outputs, of a model of the plant.
 MAX_PIECE_RESIDUAL = 0.3
+#: Findings on plants that no simulation of a whole run follows.
+SPLIT_CODES = ("plant_needs_pieces", "plant_unstable_in_pieces")
 #: Findings on the simulation of a whole run, which an unstable plant does not allow.
 WHOLE_RUN_CODES = (
     "free_run_grows",
@@ -117,21 +120,24 @@ def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], compari
     if not model.structure.is_linear:
         return []
     explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
-    if any(f.code == "free_run_grows" for f in stability_findings(model)):
+    grows = any(f.code == "free_run_grows" for f in stability_findings(model))
+    if grows:
         test = piece_test(model, runs)
         if test is not None and test.passed:
             code = "plant_unstable" if explained and fit.joint is not None else "plant_unstable_in_pieces"
             return [make_finding(code, fit=test.fit, seconds=test.seconds)]
-    if explained or fit.joint is None:
+    if (explained and not grows) or fit.joint is None:
         return []
-    at_orders = fit.task.structure.with_orders(model.orders)
-    settings = SearchSettings(coefficients="least-squares")
+    test = equation_test(runs, fit.task.structure.with_orders(model.orders), model.units)
+    return [] if test is None else [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]
+
+
+def equation_test(runs: Sequence[Run], structure: Structure, units: Mapping[str, str]) -> PieceTest | None:
+    """Return the test of the least-squares model of a structure if it is unstable and passes, else None."""
     try:
-        linear = estimate_coefficients(runs, at_orders, settings, None)
-        other = Model(at_orders.with_coefficients(linear.values), orders=model.orders, units=model.units, m=linear.m)
-        test = piece_test(other, runs) if stability_findings(other) else None
+        linear = estimate_coefficients(runs, structure, SearchSettings(coefficients="least-squares"), None)
+        model = Model(structure.with_coefficients(linear.values), units=units, m=linear.m)
+        test = piece_test(model, runs) if stability_findings(model) else None
     except FtlmError:
-        return []
-    if test is None or not test.passed:
-        return []
-    return [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]
+        return None
+    return test if test is not None and test.passed else None

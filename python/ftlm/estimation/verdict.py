@@ -137,7 +137,8 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
 
     Findings of weight that no rule covers count in the order of :data:`ftlm.findings.FINDING_TOPICS`.
     """
-    unstable = any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
+    whole = not any(f.code == "runs_split" for f in result.findings)
+    unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
     runs = () if validation is None or unstable else (validation,)
     tried = bool(runs) and validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
     against = _combined_verdict([*result_findings(result)], result.fit, runs, tried)

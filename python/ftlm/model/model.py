@@ -84,6 +84,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Findings about data, fit and model. Unset if there are none.
     against
         Findings against the model at identification, used by its verdict. Unset if there are none.
+    piece_duration
+        Shortest duration [s] of the pieces into which the runs of an unstable plant were split, each with its own
+        initial values; comparisons split other runs likewise. Unset if whole runs were simulated.
     """
 
     method: str
@@ -98,6 +101,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     free: FitParameters | UnsetType = UNSET
     findings: tuple[Finding, ...] | UnsetType = UNSET
     against: tuple[Finding, ...] | UnsetType = UNSET
+    piece_duration: float | UnsetType = UNSET
 
     @property
     def known_findings(self) -> tuple[Finding, ...]:

@@ -26,7 +26,7 @@ from ftlm.utils.validation import error_text
 #: friction, input nonlinearities, Stribeck friction, free parameters of the fit, findings as records, levels,
 #: non-linear terms.
 BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
-STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA, NONLINEAR_SCHEMA = 7, 8, 9, 10, 11
+STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA, NONLINEAR_SCHEMA, PIECES_SCHEMA = 7, 8, 9, 10, 11, 12
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -248,7 +248,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 #: Model files have a few kilobytes; the default size limit suffices.
-MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, NONLINEAR_SCHEMA)
+MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, PIECES_SCHEMA)
 
 
 def schema_of(
@@ -263,6 +263,7 @@ def schema_of(
     doubted = estimate is not None and not (estimate.findings is UNSET and estimate.against is UNSET)
     named = sensor is not None and not isinstance(sensor.signals, UnsetType)
     known = estimate is not None and estimate.free is not UNSET
+    in_pieces = estimate is not None and estimate.piece_duration is not UNSET
     return max(
         BASE_SCHEMA if isinstance(offset, UnsetType) else LEVEL_SCHEMA if offset == "level" else OFFSET_SCHEMA,
         PROFILE_SCHEMA if profiled or named else BASE_SCHEMA,
@@ -270,6 +271,7 @@ def schema_of(
         *(e.schema for e in equations),
         FIT_SCHEMA if known else BASE_SCHEMA,
         FINDING_SCHEMA if doubted else BASE_SCHEMA,
+        PIECES_SCHEMA if in_pieces else BASE_SCHEMA,
     )
 
 

@@ -173,7 +173,7 @@ def _starts(result: Identification) -> list[str]:
         for (name, _, _), terms in zip(comparison.per_run, comparison.initial, strict=True)
         if sum(map(len, terms.values())) and not comparison.offsets
     ]
-    if moving:
+    if moving and not any(f.code == "runs_split" for f in result.findings):
         lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {', '.join(moving)}")
     return lines
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from ftlm.data.run import Run
 from ftlm.estimation.output_error import JointFit
@@ -80,7 +80,8 @@ class IntegerOrderForm:
             for k in range(self.zeros, -1, -1)
         ]
         text = f"{_derivative(self.order, output)} = {' + '.join([*own, *driving])}"
-        return equation(text, delay=problem.input_delays(delayed=self.delayed), offset=self.offset)
+        delay = problem.input_delays(delayed=self.delayed)
+        return equation(text, delay=delay, offset=self.offset, initial=problem.initial)
 
 
 def _derivative(order: int, name: str) -> str:
@@ -103,6 +104,8 @@ class OutputProblem:
         Given delays.
     suffix
         End of all names of coefficients and orders, which tells several outputs apart.
+    initial
+        Start of the runs.
     """
 
     runs: Sequence[Run]
@@ -110,6 +113,7 @@ class OutputProblem:
     drivers: tuple[str, ...]
     delays: Delays = field(default_factory=dict)
     suffix: str = ""
+    initial: Literal["auto", "caputo"] = "auto"
 
     @property
     def numbered_drivers(self) -> list[tuple[str, str]]:
@@ -331,7 +335,8 @@ class AutomaticSelection:
             texts[f"D^2 {y} = {damping} + {own} + {driving}"] = (2.0,)
 
         def structure(text: str, *, delayed: bool = False) -> Structure:
-            return equation(text, delay=self.problem.input_delays(delayed=delayed), offset=form.offset)
+            delay = self.problem.input_delays(delayed=delayed)
+            return equation(text, delay=delay, offset=form.offset, initial=self.problem.initial)
 
         late = {} if best is None else {n: v for n, v in values_of(best.joint).items() if n.startswith("delay_")}
 

@@ -60,10 +60,14 @@ class Fold:
         Initial terms are those of the estimation data of the same run.
 
         For a run with nonzero initial conditions the first block has initial terms of its own, as a whole run has.
+        Those of a whole run are estimated from its validation data: the residual is raised by their degrees of freedom.
         """
         outputs = model.outputs
         if self.rows is None:
-            return dict(compare(model, self.validation_run).fit)
+            there = compare(model, self.validation_run)
+            samples = {o: int(np.isfinite(y[0]).sum()) for o, y in there.measured.items()}
+            left = {o: 1.0 - len(there.initial[0].get(o, ())) / max(n, 1) for o, n in samples.items()}
+            return {o: 100.0 - (100.0 - f) / math.sqrt(max(left[o], 1e-3)) for o, f in there.fit.items()}
         # Later rows tell nothing of motion from before the start that has died away by then.
         moving = self.rows[0] == 0 and model.structure.initial != "rest"
         before = compare(
@@ -96,6 +100,10 @@ def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run
     )
 
 
+#: Most pieces of the runs of an unstable plant that are folds.
+MAX_SPLIT_FOLDS = 16
+
+
 @dataclass(frozen=True)
 class Folds:
     """Estimation and validation data of all candidates.
@@ -108,11 +116,19 @@ class Folds:
         Folds; the validation data of a fold are excluded from its fit.
     description
         Description of the validation.
+    split
+        Whole runs of an unstable plant, and the duration [s] of the pieces that `runs` are; None for whole runs.
     """
 
     runs: Runs
     parts: tuple[Fold, ...]
     description: str
+    split: tuple[Runs, float] | None = None
+
+    @property
+    def unseen_runs(self) -> list[Run]:
+        """Validation runs that are not estimation runs."""
+        return [f.validation_run for f in self.parts if not any(f.validation_run is r for r in self.runs)]
 
     @classmethod
     def of(cls, runs: Run | Sequence[Run], validation: str | Run | Sequence[Run]) -> Folds:
@@ -154,6 +170,15 @@ class Folds:
             raise ModelError(f"{setting('validation')} {validation!r} is not known; use 'runs', 'blocks', or a run")
         parts = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
         return cls(every, tuple(parts), f"each of {len(parts)} blocks, its outputs unread, by the rest")
+
+    @classmethod
+    def of_pieces(cls, runs: Runs, duration: float) -> Folds:
+        """Build folds of pieces of the runs of an unstable plant, at most :data:`MAX_SPLIT_FOLDS`, spread evenly."""
+        every = [piece for run in runs for piece in run.split(duration)]
+        chosen = np.unique(np.linspace(0, len(every) - 1, MAX_SPLIT_FOLDS).astype(int))
+        folds = cls.of([every[k] for k in chosen], "runs")
+        words = f"each of {len(chosen)} pieces of {duration:.2g} s by the others"
+        return replace(folds, description=words, split=(runs, duration))
 
 
 def _same(one: Run, other: Run) -> bool:
@@ -319,7 +344,9 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
     """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
     model = model_of(structure, joint, joint.initial)
     estimation = compare(model, folds.runs).fit
-    grows = structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
+    grows = (
+        folds.split is None and structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
+    )
     start = joint.values_by_name
     # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
     near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.step_converged else joint

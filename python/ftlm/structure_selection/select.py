@@ -13,13 +13,15 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.identify import identify
+from ftlm.estimation.identify import identify, identify_pieces
 from ftlm.estimation.result import Identification
+from ftlm.estimation.unstable_plants import equation_test
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degenerate
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.automatic import (
+    MAX_ORDER,
     AutomaticSelection,
     Delays,
     IntegerOrderForm,
@@ -225,8 +227,7 @@ def select(
         )
     if store is None:
         return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, sought)
-    judges = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
-    asked = Request.of(folds.runs, [searched, every, *automatic], judges, folds.description)
+    asked = Request.of(folds.runs, [searched, every, *automatic], folds.unseen_runs, folds.description)
     with Store(store, asked) as kept:
         return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every, sought)
 
@@ -239,17 +240,38 @@ def _run_selection(
 ) -> Selection:
     """Evaluate nested and listed structures, or automatic ones of outputs, and choose."""
     if sought:
-        choices = []
-        for problem in sought:
-            work.trials = []
-            AutomaticSelection(problem, work).run()
-            choices.append(_choose(work, prefers_integer_orders=True))
-        return _identify_choice(work, choices[0] if len(choices) == 1 else _combine_choices(work, choices))
+        found = _select_automatically(work, sought)
+        winner = found.trials[found.chosen]
+        poor = winner.unstable or winner.validation_fit < MIN_VALIDATION_FIT
+        duration = _piece_duration(sought) if poor and not work.folds.unseen_runs else None
+        if duration is None:
+            return found
+        folds = Folds.of_pieces(work.folds.runs, duration)
+        problems = [replace(p, runs=folds.runs, initial="caputo") for p in sought]
+        split = _select_automatically(replace(work, folds=folds, trials=[]), problems)
+        return split if split.trials[split.chosen].validation_fit > winner.validation_fit else found
     for structure in searched:
         select_stepwise(NestedStructures(structure), work)
     if every:
         evaluate_list(every, work)
     return _identify_choice(work, _choose(work, prefers_integer_orders=False))
+
+
+def _select_automatically(work: CandidateEvaluator, sought: Sequence[OutputProblem]) -> Selection:
+    """Choose an automatic structure of each output and identify them together."""
+    choices = []
+    for problem in sought:
+        work.trials = []
+        AutomaticSelection(problem, work).run()
+        choices.append(_choose(work, prefers_integer_orders=True))
+    return _identify_choice(work, choices[0] if len(choices) == 1 else _combine_choices(work, choices))
+
+
+def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
+    """Return the duration [s] of pieces of the runs of an unstable plant, by linear fits; None for other plants."""
+    forms = [IntegerOrderForm(n, n - 1) for n in range(1, MAX_ORDER + 1)]
+    tests = [equation_test(p.runs, form.structure(p), p.runs[0].units) for p in sought for form in forms]
+    return min((t for t in tests if t is not None), key=lambda t: t.residual).seconds if any(tests) else None
 
 
 @dataclass(frozen=True)
@@ -351,7 +373,12 @@ def _without_free_delays(choice: Choice) -> Choice:
 def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
     """Identify the chosen structure on all runs, and add what is to be said about the choice."""
     folds, winner = work.folds, choice.winner
-    found = identify(list(folds.runs), _with_validated_initial_conditions(winner, folds), threads=work.threads)
+    structure = _with_validated_initial_conditions(winner, folds)
+    if folds.split is None:
+        found = identify(list(folds.runs), structure, threads=work.threads)
+    else:
+        runs, duration = folds.split
+        found = identify_pieces(runs, structure, duration, threads=work.threads)
     findings: list[Finding] = []
     if winner.joint is not None and found.joint is not None and found.joint.noise:
         lower = [o for o, v in found.joint.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
@@ -364,7 +391,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
     for part in choice.parts or (choice,):
         findings += _fractional_order_findings(part.winner, part.ranked, found)
-    unseen = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
+    unseen = folds.unseen_runs
     return Selection(
         choice.ranked,
         choice.ranked.index(winner),

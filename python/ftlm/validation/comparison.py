@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from msgspec import UNSET
 from numpy.typing import ArrayLike
 
 from ftlm import _core
@@ -284,7 +285,8 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
     The output error compares each sample y[k] with the simulation (free run: only inputs and initial conditions are
     used) at the same time, on a grid refined until converged as in :func:`ftlm.simulate`. Initial values are fitted to
     the samples of the run, none from rest. A history explains no more than inputs before the run could: its size has a
-    prior in units of the response to the inputs of the run. The fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
+    prior in units of the response to the inputs of the run. A run of an unstable plant is simulated in pieces as
+    in the identification, each with its own initial values. The fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
 
     Parameters
     ----------
@@ -313,11 +315,26 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
 
 
 def simulate_runs(model: Model, runs: Sequence[Run]) -> list[OutputSamples]:
-    """Simulate each run, with initial terms fitted to it, on a grid refined until converged."""
-    return [
+    """Simulate each run, with initial terms fitted to it, on a grid refined until converged.
+
+    A model that was identified from pieces of runs is simulated in such pieces, each with initial terms of its own.
+    """
+    duration = UNSET if model.estimate is None else model.estimate.piece_duration
+    return [_simulate_pieces(model, [run] if duration is UNSET else run.split(duration)) for run in runs]
+
+
+def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:
+    """Return the simulation of consecutive pieces of a run as one; its initial terms are those of the first piece."""
+    free = [
         simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, max_m=max(MAX_PULSES, 4 * run.length))
-        for run in runs
+        for run in pieces
     ]
+    return replace(
+        free[0],
+        outputs=np.concatenate([piece.outputs for piece in free], axis=1),
+        refinement=max(piece.refinement for piece in free),
+        change=np.max([piece.change for piece in free], axis=0),
+    )
 
 
 def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, m: int) -> Comparison:
