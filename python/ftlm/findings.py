@@ -539,6 +539,33 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{limit:.2g}): part of the effect of {input} is not modeled",
         "residuals are correlated with inputs ({shown}): the model is incomplete",
     ),
+    "delay_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output} follows {input} with a delay of {value:.4g} ± {error:.2g} s that the model lacks|: with it the "
+        "residuals are independent of the inputs",
+        "{output} follows {input} with a delay of {value:.4g} s that the model lacks",
+        "estimate it with the model: write {input}(t - 0:{longest:.2g}) in the equation",
+        prefix="{run}: ",
+    ),
+    "lag_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output} answers {input} with a further lag that the model lacks|: with it the residuals are independent of "
+        "the inputs",
+        "{output} answers {input} with a further lag that the model lacks",
+        "raise the order of the equation by 1",
+        prefix="{run}: ",
+    ),
+    "lead_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output} answers {input} {value:.4g} ± {error:.2g} s before it is logged, or {rows:.2g} of its rows|: with "
+        "{input} so much earlier the residuals are independent of the inputs",
+        "{output} moves before its input {input}, by about {rows:.2g} rows",
+        "log the input before it acts, shift its rows, or allow a {ask[delay]} down to minus one sampling interval",
+        prefix="{run}: ",
+    ),
     "residuals_follow_direction": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,

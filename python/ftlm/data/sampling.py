@@ -504,3 +504,13 @@ def describe_missing(thing: str, gone: NDArray[np.bool_], what: str) -> str:
     first, count = int(np.flatnonzero(gone)[0]), int(gone.sum())
     rows = "row holds" if count == 1 else "rows hold"
     return f"{thing}: {count} of {gone.size} {rows} no value, the first is row {first}; {what}"
+
+
+#: Largest delay that is searched by default, in samples and as a share of a run.
+MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
+
+
+def longest_delay(length: int, step: float) -> float:
+    """Return the largest delay [s] that is searched by default in a run: 60 samples or a twelfth of its length."""
+    # Three digits, since the range is a part of a structure's name.
+    return float(f"{min(MAX_DELAY_SAMPLES, length * MAX_DELAY_SHARE) * step:.3g}")

@@ -21,6 +21,7 @@ from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, M
 from ftlm.estimation.alternative_assumptions import (
     drift_findings,
     intersample_findings,
+    missing_dynamics_findings,
     undetermined_start_findings,
 )
 from ftlm.estimation.closed_loop import run_with_inputs
@@ -525,6 +526,9 @@ def assess_fit(fit: Fit) -> Identification:
         findings += arm_findings(fit.task.structure, findings)
         if any(f.code in (*LEFT_OUT_CODES, "noise_coloured") for f in findings):
             findings += intersample_findings(fit)
+            followed = dict.fromkeys(f.input for f in findings if f.code == "residuals_follow_input")
+            missing = missing_dynamics_findings(fit, list(followed))
+            findings = [f for f in findings if not missing or f.code != "residuals_not_white"] + missing
             drift = drift_findings(fit)
             # A constant is a part of the line.
             findings = [*(f for f in findings if not drift or f.code != "offset_missing"), *drift]

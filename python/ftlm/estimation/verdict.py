@@ -37,6 +37,8 @@ MAX_BURIED_RESIDUAL = 0.99
 #: Findings that explain a poor fit by the data.
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
 UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
+#: Findings that name what a model lacks, and are reported before the residuals that show it.
+MISSING_PART_CODES = ("delay_fits", "lead_fits", "lag_fits", "drift_fits", "offset_missing")
 #: Findings on an unstable plant: simulations of whole runs do not judge its model.
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 #: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by
@@ -181,7 +183,8 @@ def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Return the verdict on a saved model, from its file and from comparisons with runs."""
     known = model.estimate
-    unstable = known is not None and any(f.code in UNSTABLE_PLANT_CODES for f in known.findings or ())
+    plant = known is not None and any(f.code in UNSTABLE_PLANT_CODES for f in known.findings or ())
+    unstable = plant and known is not None and known.piece_duration is UNSET
     own = [] if unstable else [*_unstable_poles(model)]
     validation = () if unstable else validation
     if known is None:
@@ -224,7 +227,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     if unseen and "run_forgets" not in codes:
         yield make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen))
     yield from (f for f in result.findings if f.code == "equation_says_identity")
-    yield from (f for f in result.findings if f.code in ("drift_fits", "offset_missing"))
+    yield from (f for f in result.findings if f.code in MISSING_PART_CODES)
     yield from _residuals(result)
     if joint is not None and not joint.converged and "not_converged" not in codes:
         yield make_finding("not_converged")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 from ftlm.data.run import Run
+from ftlm.data.sampling import longest_delay
 from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.parser import equation
@@ -19,8 +20,6 @@ from ftlm.validation.feedback import feedback_test
 
 #: Highest integer order.
 MAX_ORDER = 4
-#: Largest delay in samples, and as a share of the shortest run.
-MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
 #: Number of best candidates whose neighbors are fitted first, and number of candidates that are validated, of integer
 #: and of fractional orders.
 EXTENDED_CANDIDATES, VALIDATED_CANDIDATES, VALIDATED_FRACTIONAL = 3, 6, 2
@@ -130,10 +129,7 @@ class OutputProblem:
         given = {n: d for n, d in self.delays.items() if n in inputs}
         if not delayed:
             return {n: d for n, d in given.items() if (d[0] if isinstance(d, tuple) else d) > 0.0}
-        limit = min(min(MAX_DELAY_SAMPLES, run.length * MAX_DELAY_SHARE) * run.step for run in self.runs)
-        # Three digits, since the range is a part of the structure's name.
-        longest = float(f"{limit:.3g}")
-        return {**dict.fromkeys(inputs, (0.0, longest)), **given}
+        return {**dict.fromkeys(inputs, (0.0, min(longest_delay(r.length, r.step) for r in self.runs))), **given}
 
 
 @dataclass(frozen=True)
