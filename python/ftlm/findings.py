@@ -557,6 +557,31 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "raise the order of the equation by 1",
         prefix="{run}: ",
     ),
+    "dynamics_missing": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "residuals of {output} contain a response to {input}|: a structure with more dynamics predicts {output} "
+        "better, one sample ahead, than a model of the noise does",
+        "residuals of {output} contain a response to {input} that the model lacks",
+        prefix="{run}: ",
+    ),
+    "zero_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output} answers a derivative of {input} that the model lacks|: with it the residuals are independent of the "
+        "inputs",
+        "{output} answers a derivative of {input} that the model lacks",
+        "add to the equation {term}",
+        prefix="{run}: ",
+    ),
+    "mode_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output} has a further mode that the model lacks|: with it the residuals are independent of the inputs",
+        "{output} has a further mode that the model lacks",
+        "raise the order of the equation by 1 and add {term}",
+        prefix="{run}: ",
+    ),
     "lead_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,

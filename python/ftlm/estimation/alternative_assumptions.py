@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ftlm.analysis.poles import steady_states
-from ftlm.data.run import Run, Runs, as_runs
-from ftlm.data.sampling import ZERO_ORDER_HOLD, Intersample, drop_missing, longest_delay
+from ftlm.data.run import Run
+from ftlm.data.sampling import ZERO_ORDER_HOLD, Intersample, drop_missing
 from ftlm.errors import FtlmError
-from ftlm.estimation.estimators import number_covariance
+from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
-from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.nuisance_parameters import fit_score, output_sensitivities
+from ftlm.estimation.nuisance_parameters import fit_score
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
-from ftlm.model.model import Estimate, Model
 from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
-from ftlm.structure.equation import Term
-from ftlm.structure.input_nonlinearity import input_name
-from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Offset, Structure
-from ftlm.utils.validation import join_names
-from ftlm.validation.comparison import simulate_runs
-from ftlm.validation.residual_tests import DEFAULT_LAGS, run_residual_tests
 
 #: Other starts that a fit is compared with.
 OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
@@ -42,8 +34,6 @@ DRIFT_OFFSETS: tuple[Offset, Offset] = ("constant", "ramp")
 MAX_SQUARES_RATIO = 1.05
 #: Difference of two gains, in joint standard errors and relative to the larger one, from which on they contradict.
 GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
-#: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
-DELAY_SIGMAS = 3.0
 #: Least share of rows in which an input changes, so that its behavior between samples is in doubt.
 MIN_CHANGING_SHARE = 0.5
 _BETWEEN_SAMPLES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
@@ -114,68 +104,6 @@ def intersample_findings(fit: Fit) -> list[Finding]:
     return findings
 
 
-def missing_dynamics_findings(fit: Fit, inputs: Sequence[str]) -> list[Finding]:
-    """Return findings on delays of inputs, or a further lag, that alone explain residuals that follow these inputs.
-
-    Any missing dynamics look like a delay: only what leaves residuals independent of all inputs is reported, and a delay
-    only if a further lag does not explain as much. A negative delay, of one sampling interval at most, is an input that
-    was logged after it acted.
-    """
-    joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
-    names = [n for n in inputs if n in runs[0].inputs and n in structure.signals]
-    if joint is None or not names or not structure.is_linear or structure.has_friction or structure.free_inputs:
-        return []
-    longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
-    given = {n: structure.delay.get(n, 0.0) for n in names}
-    late = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in given.items()})
-    begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in given.items()}}
-    delayed = _sufficient_fit(runs, replace(late, initial=joint.initial), [begin])
-    lagged = _sufficient_fit(runs, replace(_with_further_lag(structure), initial=joint.initial), [])
-    about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
-    if delayed is None or (lagged is not None and fit_score(lagged, delayed) < fit_score(delayed, delayed)):
-        return [] if lagged is None else [make_finding("lag_fits", input=join_names(names), **about)]
-    findings = []
-    for name in names:
-        key = input_name("delay", name)
-        value, error = delayed.values_by_name[key], delayed.standard_errors[key]
-        if abs(value - given[name]) > DELAY_SIGMAS * error:
-            numbers = {"value": abs(value), "error": error, "rows": abs(value) / step, "longest": 2.0 * abs(value)}
-            code = "delay_fits" if value > 0.0 else "lead_fits"
-            findings.append(make_finding(code, input=name, **about, **numbers))
-    return findings
-
-
-def _sufficient_fit(runs: Runs, structure: Structure, known: Sequence[Mapping[str, float]]) -> JointFit | None:
-    """Return the fit of a structure from automatic and known initial guesses, if no residual follows an input."""
-    try:
-        fits = [fit_output_error(runs, structure), *([fit_output_error(runs, structure, known=known)] if known else [])]
-        best = min(fits, key=lambda f: f.cost)
-        model = fitted_model(best, structure)
-        tests = run_residual_tests(
-            model,
-            runs,
-            simulate_runs(model, runs),
-            lags=DEFAULT_LAGS,
-            sensitivities=lambda: output_sensitivities(runs, structure, best.values_by_name, max(best.refinement, 1)),
-        )
-    except FtlmError:
-        return None
-    return best if all(test.passed for o in tests.outputs.values() for test in o.inputs.values()) else None
-
-
-def _with_further_lag(structure: Structure) -> Structure:
-    """Return a structure with one more lag: the highest order of each equation raised by 1, its former one a term."""
-    raised = [
-        replace(
-            item,
-            order=Order(item.order.constant + 1.0, item.order.weights),
-            terms=(Term(item.output, item.order, f"lag_{item.output}"), *item.terms),
-        )
-        for item in structure.equations
-    ]
-    return replace(structure, equations=tuple(raised), coefficient_law=())
-
-
 def drift_findings(fit: Fit) -> list[Finding]:
     """Return a finding if the runs clearly prefer levels that drift: a line in time beside the model."""
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
@@ -217,19 +145,6 @@ def _changes_often(runs: Sequence[Run], name: str) -> bool:
 def _name_start(initial: Initial, offset: Offset) -> str:
     """Describe initial conditions."""
     return ("at rest" if initial == "rest" else "in motion") + (" at a level of its own" if offset == "level" else "")
-
-
-def fitted_model(joint: JointFit, structure: Structure) -> Model:
-    """Return a fit as a model, with the covariance of its parameters."""
-    problem = FreeProblem.of(replace(structure, initial=joint.initial))
-    orders, coefficients, inputs = problem.split(joint.values.tolist())
-    known = (
-        problem.structure.with_orders(dict(zip(problem.orders, orders, strict=True)))
-        .with_coefficients(problem.coefficients_by_name(coefficients))
-        .with_inputs(dict(zip(problem.names[len(orders) + len(coefficients) :], inputs, strict=True)))
-    )
-    estimate = Estimate("output-error", (), joint.values_by_name, covariance=number_covariance(joint, problem))
-    return Model(known, estimate=estimate)
 
 
 def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple[float, float]]:

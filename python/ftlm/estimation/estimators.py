@@ -30,7 +30,7 @@ from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, Loss
 from ftlm.estimation.result import Task
 from ftlm.findings import Finding, make_finding
-from ftlm.model.model import Model
+from ftlm.model.model import Estimate, Model
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult
@@ -39,6 +39,7 @@ from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.initial_conditions import resolve_start
 from ftlm.structure.order_grid import OrderGrid
+from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import orthonormal, projections, vector_norm
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
@@ -392,3 +393,16 @@ def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: Se
         if cost < best:
             best, rank = cost, row.rank
     return rank
+
+
+def fitted_model(joint: JointFit, structure: Structure) -> Model:
+    """Return a fit as a model, with the covariance of its parameters."""
+    problem = FreeProblem.of(replace(structure, initial=joint.initial))
+    orders, coefficients, inputs = problem.split(joint.values.tolist())
+    known = (
+        problem.structure.with_orders(dict(zip(problem.orders, orders, strict=True)))
+        .with_coefficients(problem.coefficients_by_name(coefficients))
+        .with_inputs(dict(zip(problem.names[len(orders) + len(coefficients) :], inputs, strict=True)))
+    )
+    estimate = Estimate("output-error", (), joint.values_by_name, covariance=number_covariance(joint, problem))
+    return Model(known, estimate=estimate)

@@ -21,12 +21,12 @@ from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, M
 from ftlm.estimation.alternative_assumptions import (
     drift_findings,
     intersample_findings,
-    missing_dynamics_findings,
     undetermined_start_findings,
 )
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
+from ftlm.estimation.extensions import extension_findings
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.methods import EstimationMethod, OutputError, method_with_options, resolve_method
@@ -80,6 +80,8 @@ from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
 
+#: Findings on residuals that missing dynamics explain.
+SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
 #: Share of the work of an identification that decides about the start of its runs.
 HYPOTHESES_SHARE = 0.7
 #: Initial terms of fits with a level.
@@ -521,14 +523,20 @@ def assess_fit(fit: Fit) -> Identification:
     if tests is not None:
         directed = [o for o, r in tests.outputs.items() if r.follows_direction]
         findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in directed]
-        findings = [_noise_finding(f, tests) for f in findings] + _residual_findings(fit, tests)
+        missing = extension_findings(fit, tests)
+        if directed and any(f.code == "dynamics_missing" for f in missing):
+            # No linear structure explains them: what the direction of motion shows is more specific.
+            missing = []
+        if not missing:
+            findings = [_noise_finding(f, tests) for f in findings]
+        findings += _residual_findings(fit, tests)
+        if missing:
+            # What is missing precedes the residuals that show it.
+            findings = [*(f for f in findings if f.code not in SHOWN_BY_RESIDUALS), *missing]
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)
         if any(f.code in (*LEFT_OUT_CODES, "noise_coloured") for f in findings):
             findings += intersample_findings(fit)
-            followed = dict.fromkeys(f.input for f in findings if f.code == "residuals_follow_input")
-            missing = missing_dynamics_findings(fit, list(followed))
-            findings = [f for f in findings if not missing or f.code != "residuals_not_white"] + missing
             drift = drift_findings(fit)
             # A constant is a part of the line.
             findings = [*(f for f in findings if not drift or f.code != "offset_missing"), *drift]

@@ -38,7 +38,16 @@ MAX_BURIED_RESIDUAL = 0.99
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
 UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
 #: Findings that name what a model lacks, and are reported before the residuals that show it.
-MISSING_PART_CODES = ("delay_fits", "lead_fits", "lag_fits", "drift_fits", "offset_missing")
+MISSING_PART_CODES = (
+    "dynamics_missing",
+    "delay_fits",
+    "lead_fits",
+    "lag_fits",
+    "zero_fits",
+    "mode_fits",
+    "drift_fits",
+    "offset_missing",
+)
 #: Findings on an unstable plant: simulations of whole runs do not judge its model.
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 #: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by

@@ -1,0 +1,171 @@
+"""Extensions of a structure that explain its colored residuals: a delay, a further lag, a zero, a further mode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.data.run import Runs, as_runs
+from ftlm.data.sampling import longest_delay
+from ftlm.errors import FtlmError
+from ftlm.estimation.estimators import fitted_model
+from ftlm.estimation.fit import Fit
+from ftlm.estimation.nuisance_parameters import output_sensitivities
+from ftlm.estimation.output_error import JointFit, fit_output_error
+from ftlm.findings import Finding, make_finding
+from ftlm.structure.equation import Equation, Term
+from ftlm.structure.input_nonlinearity import input_name
+from ftlm.structure.order import Order
+from ftlm.structure.structure import Structure
+from ftlm.utils.validation import join_names
+from ftlm.validation.comparison import simulate_runs
+from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, run_residual_tests
+
+#: Decrease of the Schwarz criterion of one-step predictions from which on an extension is reported. The choice among
+#: several extensions lowers it as well, so it is three times what is called very strong evidence.
+MIN_CRITERION_DECREASE = 30.0
+#: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
+DELAY_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Extension:
+    """Structure with more dynamics than the fitted one.
+
+    Parameters
+    ----------
+    code
+        Code of the finding that reports it.
+    structure
+        The extended structure.
+    parameters
+        Number of additional parameters.
+    known
+        Initial guesses besides the automatic ones.
+    terms
+        Additional terms, as text.
+    """
+
+    code: str
+    structure: Structure
+    parameters: int
+    known: Sequence[Mapping[str, float]] = ()
+    terms: str = ""
+
+
+def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
+    """Return a finding on the extension whose residuals are best predicted from their own past, if clearly better.
+
+    Colored noise and a response that the structure lacks look alike in the residuals, but noise has the same one-step
+    prediction error beside every structure: the innovations of an autoregression of the residuals. An extension lowers
+    it if the residuals contain a response to the inputs.
+    """
+    joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
+    colored = any(not o.whiteness.passed for o in tests.outputs.values())
+    single = len(structure.equations) == 1 and structure.is_linear and not structure.has_friction
+    if joint is None or not colored or not single or structure.coefficient_law or structure.free_inputs:
+        return []
+    (equation,) = structure.equations
+    names = tuple(n for n in runs[0].inputs if n in equation.signals)
+    if not names:
+        return []
+    own = _prediction_criterion(joint, 0)
+    best: tuple[float, Extension, JointFit] | None = None
+    for extension in _extensions(structure, joint, runs, names):
+        extended = replace(extension.structure, initial=joint.initial)
+        try:
+            fits = [fit_output_error(runs, extended)]
+            if extension.known:
+                fits.append(fit_output_error(runs, extended, known=extension.known))
+        except FtlmError:
+            continue
+        refit = min(fits, key=lambda f: f.cost)
+        criterion = _prediction_criterion(refit, extension.parameters)
+        if refit.unstable_optimum is None and criterion < (own if best is None else best[0]):
+            best = criterion, replace(extension, structure=extended), refit
+    if best is None or best[0] > own - MIN_CRITERION_DECREASE:
+        return []
+    _, extension, refit = best
+    about = {"run": ", ".join(r.name for r in runs), "output": equation.output}
+    if not _is_sufficient(refit, extension.structure, runs):
+        return [make_finding("dynamics_missing", input=join_names(names), **about)]
+    if extension.code != "delay_fits":
+        return [make_finding(extension.code, input=join_names(names), term=extension.terms, **about)]
+    step, findings = min(r.step for r in runs), []
+    for name in names:
+        key = input_name("delay", name)
+        value, error = refit.values_by_name[key], refit.standard_errors[key]
+        if abs(value - structure.delay.get(name, 0.0)) > DELAY_SIGMAS * error:
+            numbers = {"value": abs(value), "error": error, "rows": abs(value) / step, "longest": 2.0 * abs(value)}
+            code = "delay_fits" if value > 0.0 else "lead_fits"
+            findings.append(make_finding(code, input=name, **about, **numbers))
+    return findings
+
+
+def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
+    """Return the extensions of a structure of one equation."""
+    (equation,) = structure.equations
+    longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
+    given = {n: structure.delay.get(n, 0.0) for n in names}
+    late = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in given.items()})
+    begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in given.items()}}
+    found = [Extension("delay_fits", late, len(names), [begin])]
+    lagged = _with_lag(equation)
+    found.append(Extension("lag_fits", replace(structure, equations=(lagged,)), 1))
+    more = [_next_derivative(equation, name, k) for k, name in enumerate(names)]
+    shown = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
+    for code, item, limit in (("zero_fits", equation, equation.order), ("mode_fits", lagged, lagged.order)):
+        if all(t.order.weights == () and limit.weights == () and t.order.constant <= limit.constant for t in more):
+            wider = replace(structure, equations=(replace(item, terms=(*item.terms, *more)),))
+            found.append(Extension(code, wider, len(more) + (item is lagged), terms=shown))
+    return found
+
+
+def _with_lag(item: Equation) -> Equation:
+    """Return an equation with a further lag: its order raised by 1, and a term of its former order."""
+    raised = Order(item.order.constant + 1.0, item.order.weights)
+    return replace(item, order=raised, terms=(Term(item.output, item.order, "lag"), *item.terms))
+
+
+def _next_derivative(item: Equation, name: str, number: int) -> Term:
+    """Return a term of an input whose order is 1 above the highest one of this input."""
+    highest = max((t.order for t in item.terms if t.signal == name), key=lambda order: order.constant)
+    return Term(name, Order(highest.constant + 1.0, highest.weights), f"zero{number or ''}")
+
+
+def _prediction_criterion(joint: JointFit, more: int) -> float:
+    """Return the Schwarz criterion of one-step predictions of the residuals from their own past."""
+    total = 0.0
+    for name in joint.noise:
+        series = [joint.noise[name] * part[name] for part in joint.residuals]
+        _, _, innovations, parameters = _core.arx_model(series, [], DEFAULT_LAGS)
+        left = np.concatenate(innovations)
+        rows = int(np.isfinite(left).sum())
+        power = float(np.nanmean(left**2)) if rows else math.nan
+        if not power > 0.0:
+            return math.inf
+        total += rows * math.log(power) + (parameters + more) * math.log(rows)
+    return total
+
+
+def _is_sufficient(joint: JointFit, structure: Structure, runs: Runs) -> bool:
+    """Whether the residuals of a fit follow neither an input nor the direction of motion."""
+    model = fitted_model(joint, structure)
+    try:
+        tests = run_residual_tests(
+            model,
+            runs,
+            simulate_runs(model, runs),
+            lags=DEFAULT_LAGS,
+            sensitivities=lambda: output_sensitivities(runs, structure, joint.values_by_name, max(joint.refinement, 1)),
+        )
+    except FtlmError:
+        return False
+    outputs = tests.outputs.values()
+    return not any(t.failed for o in outputs for t in o.inputs.values()) and not any(
+        o.follows_direction for o in outputs
+    )
