@@ -14,6 +14,7 @@ from ftlm.data.sampling import longest_delay
 from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
+from ftlm.estimation.model_checks import join_names
 from ftlm.estimation.nuisance_parameters import output_sensitivities
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
@@ -21,13 +22,15 @@ from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Structure
-from ftlm.utils.validation import join_names
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, run_residual_tests
 
 #: Decrease of the Schwarz criterion of one-step predictions from which on an extension is reported. The choice among
 #: several extensions lowers it as well, so it is three times what is called very strong evidence.
 MIN_CRITERION_DECREASE = 30.0
+#: Decrease of the criterion from which on a later extension is preferred to an earlier one. An input that was logged
+#: one row late and feedthrough of a first-order plant, for example, give the same samples.
+STRONG_EVIDENCE = 10.0
 #: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
 DELAY_SIGMAS = 3.0
 
@@ -85,7 +88,7 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
             continue
         refit = min(fits, key=lambda f: f.cost)
         criterion = _prediction_criterion(refit, extension.parameters)
-        if refit.unstable_optimum is None and criterion < (own if best is None else best[0]):
+        if refit.unstable_optimum is None and criterion < (own if best is None else best[0] - STRONG_EVIDENCE):
             best = criterion, replace(extension, structure=extended), refit
     if best is None or best[0] > own - MIN_CRITERION_DECREASE:
         return []
@@ -107,15 +110,17 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
 
 
 def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
-    """Return the extensions of a structure of one equation."""
+    """Return the extensions of a structure of one equation, those that are preferred first."""
     (equation,) = structure.equations
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
     given = {n: structure.delay.get(n, 0.0) for n in names}
     late = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in given.items()})
     begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in given.items()}}
-    found = [Extension("delay_fits", late, len(names), [begin])]
     lagged = _with_lag(equation)
-    found.append(Extension("lag_fits", replace(structure, equations=(lagged,)), 1))
+    found = [
+        Extension("lag_fits", replace(structure, equations=(lagged,)), 1),
+        Extension("delay_fits", late, len(names), [begin]),
+    ]
     more = [_next_derivative(equation, name, k) for k, name in enumerate(names)]
     shown = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
     for code, item, limit in (("zero_fits", equation, equation.order), ("mode_fits", lagged, lagged.order)):

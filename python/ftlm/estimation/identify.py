@@ -80,7 +80,7 @@ from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
 
-#: Findings on residuals that missing dynamics explain.
+#: Findings on residuals that known missing dynamics explain.
 SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
 #: Share of the work of an identification that decides about the start of its runs.
 HYPOTHESES_SHARE = 0.7
@@ -524,15 +524,16 @@ def assess_fit(fit: Fit) -> Identification:
         directed = [o for o, r in tests.outputs.items() if r.follows_direction]
         findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in directed]
         missing = extension_findings(fit, tests)
-        if directed and any(f.code == "dynamics_missing" for f in missing):
+        explained = bool(missing) and all(f.code != "dynamics_missing" for f in missing)
+        if directed and not explained:
             # No linear structure explains them: what the direction of motion shows is more specific.
             missing = []
         if not missing:
             findings = [_noise_finding(f, tests) for f in findings]
         findings += _residual_findings(fit, tests)
-        if missing:
-            # What is missing precedes the residuals that show it.
-            findings = [*(f for f in findings if f.code not in SHOWN_BY_RESIDUALS), *missing]
+        if explained:
+            findings = [f for f in findings if f.code not in SHOWN_BY_RESIDUALS]
+        findings += missing
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)
         if any(f.code in (*LEFT_OUT_CODES, "noise_coloured") for f in findings):
