@@ -582,6 +582,33 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "raise the order of the equation by 1 and add {term}",
         prefix="{run}: ",
     ),
+    "saturation_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{input} saturates at {value:.3g} ± {error:.2g}, which the model lacks|: with it the residuals of {output} are "
+        "independent of the inputs",
+        "{input} saturates at {value:.3g}, which the model lacks",
+        "estimate the limit with the model: {ask[saturation]}",
+        prefix="{run}: ",
+    ),
+    "dead_zone_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{input} has a dead zone of {value:.3g} ± {error:.2g}, which the model lacks|: with it the residuals of "
+        "{output} are independent of the inputs",
+        "{input} has a dead zone of {value:.3g}, which the model lacks",
+        "estimate the dead zone with the model: {ask[dead_zone]}",
+        prefix="{run}: ",
+    ),
+    "gain_varies": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "the gain of {output} from {input} varies with {input}|: with a term in its square the residuals are "
+        "independent of the inputs",
+        "the gain of {output} from {input} varies with {input}",
+        "add the term {term} to the equation",
+        prefix="{run}: ",
+    ),
     "lead_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -211,3 +212,19 @@ def test_a_sensor_that_drifts_changes_neither_order_nor_gain(seed: int) -> None:
     assert (found.winner.structure.offset, [*found.best.parameters]) == ("ramp", ["a0", "b0"])
     for name, true in (("a0", -0.5), ("b0", 1.5)):
         assert abs(found.best.parameters[name].value - true) < 3 * found.best.parameters[name].standard_error
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_free_decay_without_an_input(seed):
+    g = np.random.default_rng(seed)
+    rate, damping = g.uniform(0.5, 3.0), g.uniform(0.02, 0.1)
+    time = np.arange(400) * 0.1 / rate
+    decay = np.exp(-damping * rate * time) * np.cos(rate * math.sqrt(1 - damping**2) * time + 0.4)
+    run = ftlm.Run.from_arrays(step=time[1], inputs={}, outputs={"y": decay + 0.01 * g.standard_normal(400)})
+    found = ftlm.select(run, "auto")
+    (equation,) = found.model.structure.equations
+    assert equation.order.constant == 2
+    (mode,) = found.model.modes()
+    assert abs(mode.frequency / rate - 1) < 0.003
+    assert abs(mode.damping / damping - 1) < 0.1
+    assert "excitation_short" not in {f.code for f in found.best.findings}

@@ -17,16 +17,22 @@ MISSING = {
     "delay": ([1.0], [1 / RATE, 1.0], 5, "delay_fits"),
     "late log": ([1.0], [1 / RATE, 1.0], -1, "lead_fits"),
 }
-CODES = {"dynamics_missing", *(code for *_, code in MISSING.values())}
+#: Inputs as they act on a first-order plant, and the finding.
+ACTING = {
+    "saturation": (lambda u: np.clip(u, -0.5, 0.5), "saturation_fits", 0.5),
+    "dead zone": (lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.3, 0.0), "dead_zone_fits", 0.3),
+    "curve": (lambda u: u + 0.5 * u**2, "gain_varies", None),
+}
+CODES = {"dynamics_missing", *(code for _, code, _ in ACTING.values()), *(code for *_, code in MISSING.values())}
 STEP = 0.05 / RATE
 
 
-def record(numerator, denominator, delay, seed, noise, rows=500):
+def record(numerator, denominator, delay, seed, noise, rows=500, acting=np.asarray):
     """Steps of random length through the plant, with noise of 2 % of the output, colored by a filter."""
     g = np.random.default_rng(seed)
     u = np.repeat(g.uniform(-1, 1, rows), g.integers(4, 60, rows))[:rows]
     b, a, _ = signal.cont2discrete((numerator, denominator), STEP)
-    y = signal.lfilter(b.ravel(), a, np.r_[np.zeros(max(delay, 0)), u][:rows])
+    y = signal.lfilter(b.ravel(), a, np.r_[np.zeros(max(delay, 0)), acting(u)][:rows])
     e = signal.lfilter([1.0], noise, g.standard_normal(rows))
     y += 0.02 * y.std() / e.std() * e
     logged = np.r_[np.zeros(max(-delay, 0)), u][:rows]
@@ -69,3 +75,16 @@ def test_the_estimated_delay_and_the_term_to_write():
 def test_colored_noise_is_no_missing_dynamics(noise):
     right = [codes_of(record([1.0], [1 / RATE, 1.0], 0, seed, noise)) & CODES for seed in range(30)]
     assert sum(map(bool, right)) == 0, right
+
+
+@pytest.mark.parametrize("kind", ACTING)
+def test_how_an_input_acts_is_named(kind):
+    acting, expected, limit = ACTING[kind]
+    for seed in range(4):
+        run = record([1.0], [1 / RATE, 1.0], 0, seed, [1.0], acting=acting)
+        found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
+        (said,) = (f for f in found.findings if f.code in CODES)
+        assert said.code == expected
+        assert found.verdict.reason == said.reason
+        if limit is not None:
+            assert abs(said.numbers["value"] / limit - 1) < 0.03

@@ -1,4 +1,4 @@
-"""Extensions of a structure that explain its colored residuals: a delay, a further lag, a zero, a further mode."""
+"""Extensions of a structure that explain its colored residuals: a lag, a delay, a zero, a mode, a limit of an input."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from ftlm.estimation.nuisance_parameters import output_sensitivities
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.structure.equation import Equation, Term
+from ftlm.structure.expression import channel, power
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Structure
@@ -31,6 +32,8 @@ MIN_CRITERION_DECREASE = 30.0
 #: Decrease of the criterion from which on a later extension is preferred to an earlier one. An input that was logged
 #: one row late and feedthrough of a first-order plant, for example, give the same samples.
 STRONG_EVIDENCE = 10.0
+#: Smallest saturation limit and largest dead zone that are tried, as shares of the largest value of an input.
+MIN_SATURATION_SHARE, MAX_DEAD_SHARE = 0.05, 0.9
 #: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
 DELAY_SIGMAS = 3.0
 
@@ -47,6 +50,8 @@ class Extension:
         The extended structure.
     parameters
         Number of additional parameters.
+    inputs
+        Inputs of what is added.
     known
         Initial guesses besides the automatic ones.
     terms
@@ -56,6 +61,7 @@ class Extension:
     code: str
     structure: Structure
     parameters: int
+    inputs: Sequence[str]
     known: Sequence[Mapping[str, float]] = ()
     terms: str = ""
 
@@ -96,10 +102,24 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     about = {"run": ", ".join(r.name for r in runs), "output": equation.output}
     if not _is_sufficient(refit, extension.structure, runs):
         return [make_finding("dynamics_missing", input=join_names(names), **about)]
-    if extension.code != "delay_fits":
-        return [make_finding(extension.code, input=join_names(names), term=extension.terms, **about)]
-    step, findings = min(r.step for r in runs), []
-    for name in names:
+    if extension.code == "delay_fits":
+        return _delay_findings(extension, refit, structure, min(r.step for r in runs), about)
+    numbers: dict[str, float] = {}
+    limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
+    if limits:
+        ((name, value),) = limits.items()
+        numbers = {"value": value, "error": refit.standard_errors[name]}
+        about["parameter"] = name
+    shown = join_names(extension.inputs)
+    return [make_finding(extension.code, input=shown, term=extension.terms, **about, **numbers)]
+
+
+def _delay_findings(
+    extension: Extension, refit: JointFit, structure: Structure, step: float, about: Mapping[str, str]
+) -> list[Finding]:
+    """Return a finding on each significant delay or lead of an input."""
+    findings = []
+    for name in extension.inputs:
         key = input_name("delay", name)
         value, error = refit.values_by_name[key], refit.standard_errors[key]
         if abs(value - structure.delay.get(name, 0.0)) > DELAY_SIGMAS * error:
@@ -118,15 +138,24 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in given.items()}}
     lagged = _with_lag(equation)
     found = [
-        Extension("lag_fits", replace(structure, equations=(lagged,)), 1),
-        Extension("delay_fits", late, len(names), [begin]),
+        Extension("lag_fits", replace(structure, equations=(lagged,)), 1, names),
+        Extension("delay_fits", late, len(names), names, [begin]),
     ]
     more = [_next_derivative(equation, name, k) for k, name in enumerate(names)]
     shown = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
     for code, item, limit in (("zero_fits", equation, equation.order), ("mode_fits", lagged, lagged.order)):
         if all(t.order.weights == () and limit.weights == () and t.order.constant <= limit.constant for t in more):
             wider = replace(structure, equations=(replace(item, terms=(*item.terms, *more)),))
-            found.append(Extension(code, wider, len(more) + (item is lagged), terms=shown))
+            found.append(Extension(code, wider, len(more) + (item is lagged), names, terms=shown))
+    for name in names if not structure.limits and not structure.delay else ():
+        largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
+        limited = structure.with_limits(saturation={name: (MIN_SATURATION_SHARE * largest, largest)})
+        found.append(Extension("saturation_fits", limited, 1, [name]))
+        dead = structure.with_limits(dead_zone={name: (0.0, MAX_DEAD_SHARE * largest)})
+        found.append(Extension("dead_zone_fits", dead, 1, [name]))
+        square = Term(name, Order(0.0), "square", expression=power(channel(name), 2.0))
+        curved = replace(structure, equations=(replace(equation, terms=(*equation.terms, square)),))
+        found.append(Extension("gain_varies", curved, 1, [name], terms=f"k {name}^2"))
     return found
 
 

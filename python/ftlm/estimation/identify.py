@@ -533,6 +533,9 @@ def assess_fit(fit: Fit) -> Identification:
         findings += _residual_findings(fit, tests)
         if explained:
             findings = [f for f in findings if f.code not in SHOWN_BY_RESIDUALS]
+        if any(f.code == "gain_varies" for f in missing):
+            # The square of an input has a mean.
+            findings = [f for f in findings if f.code != "offset_missing"]
         findings += missing
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)

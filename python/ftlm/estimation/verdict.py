@@ -45,6 +45,9 @@ MISSING_PART_CODES = (
     "lag_fits",
     "zero_fits",
     "mode_fits",
+    "saturation_fits",
+    "dead_zone_fits",
+    "gain_varies",
     "drift_fits",
     "offset_missing",
 )

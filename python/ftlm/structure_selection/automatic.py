@@ -31,6 +31,8 @@ MAX_BIC_GAP, MAX_FRACTIONAL_BIC_GAP = 60.0, 10.0
 MIN_BIC_DECREASE = 6.0
 #: Order of the best form of integer orders for which D^2 y = a1 D^mu y + a0 y + … is tried.
 FRACTIONAL_DAMPING_ORDER = 2
+#: Offsets of free responses.
+FREE_OFFSETS = ("none", "level")
 #: Orders at which fractional forms start.
 INITIAL_FRACTIONAL_ORDERS = (0.5, 0.8, 1.2, 1.7)
 
@@ -203,6 +205,9 @@ class AutomaticSelection:
 
     def _fit_integer_orders(self) -> list[FittedForm]:
         """Fit integer orders, and variants of the best; best first."""
+        if not self.problem.drivers:
+            # Free responses have neither zeros nor delays.
+            return self._fit([IntegerOrderForm(n, 0, offset=o) for n in range(1, MAX_ORDER + 1) for o in FREE_OFFSETS])
         probe = IntegerOrderForm(2, 1)
         probes = self._fit([probe, replace(probe, offset="level")])
         offset = "level" if _gain(probes, lambda f: f.offset == "level") > MIN_BIC_DECREASE else "none"
@@ -318,17 +323,19 @@ class AutomaticSelection:
         drivers = self.problem.numbered_drivers
         highest, own = f"D^alpha{end} {y}", f"a0{end} {y}"
         damping = f"a1{end} D^mu{end} {y}"
-        driving = " + ".join(f"b{number}0{end} {name}" for number, name in drivers)
-        direct = " + ".join(f"b{number}1{end} D^alpha{end} {name}" for number, name in drivers)
-        texts = {
-            f"{highest} = {own} + {driving}": INITIAL_FRACTIONAL_ORDERS,
-            f"{highest} = {damping} + {own} + {driving}": INITIAL_FRACTIONAL_ORDERS[1:],
-            f"{highest} = {driving}": INITIAL_FRACTIONAL_ORDERS[:2],
+        driving = [f"b{number}0{end} {name}" for number, name in drivers]
+        direct = [f"b{number}1{end} D^alpha{end} {name}" for number, name in drivers]
+        sides = {
+            (highest, own, *driving): INITIAL_FRACTIONAL_ORDERS,
+            (highest, damping, own, *driving): INITIAL_FRACTIONAL_ORDERS[1:],
         }
-        if not self.feedback:
-            texts[f"{highest} = {direct} + {driving}"] = INITIAL_FRACTIONAL_ORDERS[:2]
+        if driving:
+            sides[highest, *driving] = INITIAL_FRACTIONAL_ORDERS[:2]
+        if driving and not self.feedback:
+            sides[highest, *direct, *driving] = INITIAL_FRACTIONAL_ORDERS[:2]
         if form.order == FRACTIONAL_DAMPING_ORDER:
-            texts[f"D^2 {y} = {damping} + {own} + {driving}"] = (2.0,)
+            sides[f"D^2 {y}", damping, own, *driving] = (2.0,)
+        texts = {f"{left} = {' + '.join(right)}": orders for (left, *right), orders in sides.items()}
 
         def structure(text: str, *, delayed: bool = False) -> Structure:
             delay = self.problem.input_delays(delayed=delayed)

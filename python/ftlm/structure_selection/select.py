@@ -58,7 +58,7 @@ def automatic_problems(
     Raises
     ------
     ModelError
-        An output that nothing drives, or a signal that is none of the runs or drives itself.
+        A signal that is none of the runs, or drives itself.
     """
     first, asked = runs[0], dict(driven_by or {})
     for output, drivers in asked.items():
@@ -76,11 +76,6 @@ def automatic_problems(
     found = []
     for output in first.outputs:
         drivers = tuple(dict.fromkeys(asked.get(output, first.inputs)))
-        if not drivers:
-            raise ModelError(
-                f"nothing drives {output}, and {parameter('structure', 'auto')} needs an input; name inputs when "
-                "loading"
-            )
         suffix = f"_{output}" if len(first.outputs) > 1 else ""
         found.append(OutputProblem(runs, output, drivers, dict(delays or {}), suffix))
     return found

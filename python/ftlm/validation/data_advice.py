@@ -363,12 +363,15 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
             inputs += [s for s in item.signals if s != item.output and s in run.outputs]
         else:
             inputs = [s for s in structure.signals if s in run.inputs]
+        if not inputs:
+            # A free response: its transient is all there is.
+            continue
         moving = [n for n in inputs if np.ptp(run[n]) > 0]
         known = sum(2 * spectral_lines(run[n])[0] for n in moving)
         known += sum(abs(float(np.mean(run[n]))) > LEVEL_SHARE * float(np.std(run[n])) for n in inputs)
         free = len(item.order_names) + len(item.coefficient_names)
         if free > known:
-            listed = ", ".join(inputs) or "no input"
+            listed = ", ".join(inputs)
             yield make_finding(
                 "excitation_short", run=run.name, output=item.output, free=free, listed=listed, known=int(known)
             )
