@@ -609,6 +609,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "add the term {term} to the equation",
         prefix="{run}: ",
     ),
+    "load_steps": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "a constant load acts on {output} from {time:.4g} s on|: with {value:.3g} ± {error:.2g} more on the right-hand "
+        "side from there on the residuals are independent of the inputs",
+        "a constant load acts on {output} from {time:.4g} s on",
+        "record the load as an input, or identify the rows before it with {ask[window]}",
+        prefix="{run}: ",
+    ),
     "lead_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,

@@ -23,7 +23,12 @@ ACTING = {
     "dead zone": (lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.3, 0.0), "dead_zone_fits", 0.3),
     "curve": (lambda u: u + 0.5 * u**2, "gain_varies", None),
 }
-CODES = {"dynamics_missing", *(code for _, code, _ in ACTING.values()), *(code for *_, code in MISSING.values())}
+CODES = {
+    "dynamics_missing",
+    "load_steps",
+    *(code for _, code, _ in ACTING.values()),
+    *(code for *_, code in MISSING.values()),
+}
 STEP = 0.05 / RATE
 
 
@@ -88,3 +93,16 @@ def test_how_an_input_acts_is_named(kind):
         assert said.reason in found.verdict.reasons
         if limit is not None:
             assert abs(said.numbers["value"] / limit - 1) < 0.03
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_load_that_steps_in_the_record_is_named(seed):
+    def acting(u):
+        return u + np.where(np.arange(u.size) >= 280, 0.6, 0.0)
+
+    run = record([1.0], [1 / RATE, 1.0], 0, seed, [1.0], acting=acting)
+    found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
+    (said,) = (f for f in found.findings if f.code in CODES)
+    assert said.code == "load_steps"
+    assert abs(said.numbers["time"] / STEP - 280) <= 3
+    assert abs(said.numbers["value"] / (0.6 * RATE) - 1) < 0.05

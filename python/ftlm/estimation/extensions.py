@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ftlm import _core
-from ftlm.data.run import Runs, as_runs
+from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import longest_delay
 from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import fitted_model
@@ -18,11 +18,14 @@ from ftlm.estimation.model_checks import join_names
 from ftlm.estimation.nuisance_parameters import output_sensitivities
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
+from ftlm.model.model import Model
+from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.expression import channel, power
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Structure
+from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, run_residual_tests
 
@@ -32,6 +35,11 @@ MIN_CRITERION_DECREASE = 30.0
 #: Decrease of the criterion from which on a later extension is preferred to an earlier one. An input that was logged
 #: one row late and feedthrough of a first-order plant, for example, give the same samples.
 STRONG_EVIDENCE = 10.0
+#: Name of an additional input, a load that is constant from some row on, and smallest share of the run before and
+#: after its step.
+LOAD, MIN_LOAD_SHARE = "load", 0.05
+#: Number of rows at which a load is fitted first, and most searches from the best of them.
+FIRST_LOAD_ROWS, MAX_LOAD_SEARCHES = 7, 4
 #: Smallest saturation limit and largest dead zone that are tried, as shares of the largest value of an input.
 MIN_SATURATION_SHARE, MAX_DEAD_SHARE = 0.05, 0.9
 #: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
@@ -56,6 +64,10 @@ class Extension:
         Initial guesses besides the automatic ones.
     terms
         Additional terms, as text.
+    runs
+        Runs with an additional input; None for the given ones.
+    time
+        Time from which on the additional input acts [s].
     """
 
     code: str
@@ -64,6 +76,8 @@ class Extension:
     inputs: Sequence[str]
     known: Sequence[Mapping[str, float]] = ()
     terms: str = ""
+    runs: Runs | None = None
+    time: float = 0.0
 
 
 def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
@@ -87,12 +101,12 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     for extension in _extensions(structure, joint, runs, names):
         extended = replace(extension.structure, initial=joint.initial)
         try:
-            fits = [fit_output_error(runs, extended)]
+            fits = [fit_output_error(extension.runs or runs, extended)]
             if extension.known:
                 fits.append(fit_output_error(runs, extended, known=extension.known))
         except FtlmError:
             continue
-        refit = min(fits, key=lambda f: f.cost)
+        refit = min(fits, key=lambda f: f.noise[equation.output])
         criterion = _prediction_criterion(refit, extension.parameters)
         if refit.unstable_optimum is None and criterion < (own if best is None else best[0] - STRONG_EVIDENCE):
             best = criterion, replace(extension, structure=extended), refit
@@ -100,11 +114,13 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
         return []
     _, extension, refit = best
     about = {"run": ", ".join(r.name for r in runs), "output": equation.output}
-    if not _is_sufficient(refit, extension.structure, runs):
+    if not _is_sufficient(refit, extension.structure, extension.runs or runs):
         return [make_finding("dynamics_missing", input=join_names(names), **about)]
     if extension.code == "delay_fits":
         return _delay_findings(extension, refit, structure, min(r.step for r in runs), about)
     numbers: dict[str, float] = {}
+    if extension.runs is not None:
+        numbers = {"time": extension.time, "value": refit.coefficients[LOAD], "error": refit.standard_errors[LOAD]}
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
         ((name, value),) = limits.items()
@@ -156,7 +172,86 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
         square = Term(name, Order(0.0), "square", expression=power(channel(name), 2.0))
         curved = replace(structure, equations=(replace(equation, terms=(*equation.terms, square)),))
         found.append(Extension("gain_varies", curved, 1, [name], terms=f"k {name}^2"))
-    return found
+    load = _load_step(equation, structure, joint, runs)
+    return found if load is None else [*found, load]
+
+
+def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs) -> Extension | None:
+    """Return the structure with a constant load from some row on; None if the runs cannot have one.
+
+    Fits with loads from few rows on give a model near the plant. The row is that at which its response to a load
+    explains most of the residuals, searched again with the model that is fitted then.
+    """
+    (run, *others) = runs
+    if others or run.sample_times is not None or LOAD in run or LOAD in structure.coefficient_names:
+        return None
+    wider = replace(structure, equations=(replace(item, terms=(*item.terms, Term(LOAD, Order(0.0), LOAD))),))
+    size = run.length
+
+    def fit_at(row: int) -> JointFit:
+        loaded = _with_input(run, LOAD, np.where(np.arange(size) >= row, 1.0, 0.0))
+        return fit_output_error([loaded], replace(wider, initial=joint.initial), refine=False)
+
+    def search(fitted: JointFit, row: int) -> tuple[float, int]:
+        for _ in range(MAX_LOAD_SEARCHES):
+            response = _load_response(item, structure, fitted, run)
+            residuals = fitted.noise[item.output] * fitted.residuals[0][item.output]
+            if row:
+                residuals[row - 1 :] += fitted.coefficients[LOAD] * response[: size - 1 - row]
+            found = _load_row(residuals, response)
+            if found is None or found == row:
+                break
+            fitted, row = fit_at(found), found
+        return (fitted.noise[item.output] if row else math.inf), row
+
+    try:
+        rows = np.linspace(0, size, FIRST_LOAD_ROWS + 2).astype(int)[1:-1]
+        best = min(((fit_at(int(k)), int(k)) for k in rows), key=lambda pair: pair[0].noise[item.output])
+        noise, row = min(search(joint, 0), search(*best))
+    except FtlmError:
+        return None
+    if not math.isfinite(noise):
+        return None
+    loaded = _with_input(run, LOAD, np.where(np.arange(size) >= row, 1.0, 0.0))
+    return Extension("load_steps", wider, 2, [LOAD], runs=as_runs(loaded), time=run.start + row * run.step)
+
+
+def _with_input(run: Run, name: str, values: Floats) -> Run:
+    """Return a run with an additional held input."""
+    return Run.from_arrays(
+        step=run.step,
+        inputs={**{n: run[n] for n in run.inputs}, name: values},
+        outputs={n: run[n] for n in run.outputs},
+        intersample={**run.intersample, name: "zoh"},
+        name=run.name,
+        missing="weight",
+    )
+
+
+def _load_response(item: Equation, structure: Structure, joint: JointFit, run: Run) -> Floats:
+    """Return the response of a fitted model to a constant load from row 0 on, at rows 1 to N - 1."""
+    own = (t for t in item.terms if t.signal == item.output)
+    alone = replace(item, terms=(*own, Term(LOAD, Order(0.0), 1.0)))
+    known = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
+    values = joint.values_by_name
+    known = known.with_orders({n: values[n] for n in known.order_names})
+    model = Model(known.with_coefficients({n: values[n] for n in known.coefficient_names}))
+    ones, zeros = np.ones(run.length), np.zeros(run.length)
+    return simulate(model, Run.from_arrays(step=run.step, inputs={LOAD: ones}, outputs={item.output: zeros}))[
+        item.output
+    ][1:]
+
+
+def _load_row(residuals: Floats, response: Floats) -> int | None:
+    """Return the row from which on a load explains most of the residuals of the inner rows of a run."""
+    series = np.nan_to_num(residuals)
+    here = response[: series.size]
+    power, edge = np.cumsum(here**2)[::-1], max(int(MIN_LOAD_SHARE * series.size), 1)
+    if not np.all(np.isfinite(here)) or not power[-edge] > 0.0:
+        return None
+    explained = np.correlate(series, here, "full")[series.size - 1 :] ** 2 / np.maximum(power, 1e-300)
+    # A load of row k acts on row k + 1 first, which is number k of the inner rows.
+    return edge + int(np.argmax(explained[edge:-edge]))
 
 
 def _with_lag(item: Equation) -> Equation:

@@ -48,6 +48,7 @@ MISSING_PART_CODES = (
     "saturation_fits",
     "dead_zone_fits",
     "gain_varies",
+    "load_steps",
     "drift_fits",
     "offset_missing",
 )

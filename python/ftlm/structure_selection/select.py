@@ -130,10 +130,10 @@ def select(
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
         ``"auto"``: every input (none for a free decay), integer orders 1 to 4 with zeros, delays, direct feedthrough,
-        an integrator, an output level and a drift, then fractional orders. These are chosen if they predict better, or as well with a Schwarz
-        criterion lower by 10. Feedthrough is not tried where an input answers the output (a closed loop): the answer of
-        a controller within a row would be taken for it. Each output has its own selection, and the chosen equations are
-        identified together.
+        an integrator, an output level and a drift, then fractional orders. These are chosen if they predict better, or
+        as well with a Schwarz criterion lower by 10. Feedthrough is not tried where an input answers the output (a
+        closed loop): the answer of a controller within a row would be taken for it. Each output has its own selection,
+        and the chosen equations are identified together.
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
         quarter of every run by a fit on the rest, the default for one run. Or separate validation runs.
