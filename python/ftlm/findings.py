@@ -1,4 +1,4 @@
-"""Findings: records of what is said about data, fits and models, and the catalogue that renders their sentences."""
+"""Findings about data, fits and models: their records, and the catalogue of their sentences."""
 
 from __future__ import annotations
 
@@ -131,14 +131,14 @@ class FindingKind:
     level
         ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``.
     template
-        Template of the sentence behind the prefix. A bar ends its first clause. ``{remedy}`` stands for
-        the remedy.
+        Template of the sentence after the prefix. A bar marks the end of its first clause. ``{remedy}`` is replaced
+        by the remedy.
     reason
         Template of the reason in a verdict; empty for the topic and the first clause of the text.
     remedy
         Template of the remedy; empty for that of the topic.
     prefix
-        Template of what the sentence begins with outside of a page of that run.
+        Template of the beginning that names the run; a page about that run omits it.
     """
 
     topic: str
@@ -179,29 +179,30 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "loop",
         LEVEL_WITH_CARE,
         "the model is unstable, and so is the plant, which a controller stabilizes: simulations restarted "
-        "every {seconds:.2g} s explain {fit:.3g} % of the outputs, while that of a whole run grows; noise in "
-        "the feedback biases this method",
-        "the plant is unstable, as the model is: simulations restarted every {seconds:.2g} s explain {fit:.3g} %",
+        "every {seconds:.2g} s explain {fit:.3g} % of the outputs, while a simulation of the whole run grows; noise "
+        "in the feedback biases this method",
+        "the plant is unstable, as the model is: simulations restarted every {seconds:.2g} s explain {fit:.3g} % of "
+        "the outputs",
         "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, which "
         "noise does not bias",
     ),
     "plant_needs_pieces": FindingKind(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "no simulation of a whole run follows this plant, which is unstable and stabilized by a controller: "
+        "the plant is unstable and stabilized by a controller, so no simulation of a whole run fits the outputs: "
         "least squares at these orders gives an unstable model whose simulations, restarted every "
         "{seconds:.2g} s, explain {fit:.3g} %",
-        "the plant is unstable and stabilized by a controller, and no simulation of a whole run follows it",
+        "the plant is unstable and stabilized by a controller, so no simulation of a whole run fits the outputs",
         "cut the runs into pieces of {seconds:.2g} s and identify them together with {ask[initial is caputo]}, or use "
         "{ask[method is least-squares]}, which noise in the loop biases",
     ),
     "growth_not_told": FindingKind(
         "unstable",
         LEVEL_FACT,
-        "the model is {stability}, but not significantly: stability is within its standard errors",
+        "the model is {stability}, but not significantly: within its standard errors it may be stable",
         remedy="leave the unstable term out, or record a longer run",
     ),
-    "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether the simulation grows is unknown"),
+    "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether the model is stable is unknown"),
     "unstable_optimum_kept": FindingKind(
         "unstable",
         LEVEL_WITH_CARE,
@@ -217,14 +218,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "other",
         LEVEL_FACT,
         "an optimum that is not stable has residuals {smaller:.2g} % smaller, which is not significant: the "
-        "free initial conditions cancel its growing mode until the end of the run; the stable one was kept",
+        "free initial conditions cancel its growing mode until the end of the run; the stable optimum was kept",
     ),
     "damping_not_told": FindingKind(
         "untold",
         LEVEL_WITH_CARE,
         "an optimum that is not stable has residuals {smaller:.2g} % smaller, which is not significant: the "
-        "free initial conditions cancel its growing mode until the end of the run|; the stable one was kept, "
-        "which is on the limit of stability: its damping is not identifiable from the runs",
+        "free initial conditions cancel its growing mode until the end of the run|; the stable optimum was kept, "
+        "which is at the stability limit: its damping is not identifiable from the runs",
     ),
     "instruments_unstable": FindingKind(
         "unstable",
@@ -264,7 +265,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "useless",
         LEVEL_WITH_CARE,
         "{output}: the noise exceeds the response to the input (NR {nr:.3g}), and the residuals are not "
-        "correlated with the input: this run shows nothing that the model lacks",
+        "correlated with the input: this run gives no evidence that the model is incomplete",
         "{output} is buried in noise (NR {nr:.3g}), and its residuals are not correlated with the input",
         "excite the input more, record longer, or average repeated runs",
     ),
@@ -296,16 +297,16 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "step",
         LEVEL_FACT,
         "a mode of {frequency:.4g} rad/s has {samples:.2g} samples per period|: its parameters depend on the "
-        "inputs between samples; zero- and first-order hold differ there by half a sample, {phase:.0f} "
-        "degrees, and by {loss:.1g} % of gain",
+        "inputs between samples; zero- and first-order hold differ there by half a sample ({phase:.0f} "
+        "degrees) and by {loss:.1g} % in gain",
         remedy="take at least eight samples per period, or state the behavior between samples with {ask[intersample]}",
     ),
     "other_intersample_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{input} was taken as {taken} between samples, but {other} fits better|: the sum of squared residuals is "
+        "{input} was assumed {taken} between samples, but {other} fits better|: the sum of squared residuals is "
         "{ratio:.3g} times as large, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
-        "{input} fits better as {other} between samples than as {taken}: {parameter} is {other_value:.4g}, not "
+        "{input} was assumed {taken} between samples, but {other} fits better: {parameter} is {other_value:.4g}, not "
         "{value:.4g}",
         "state {input}={kind} in {ask[intersample]} if that is true",
         prefix="{run}: ",
@@ -330,7 +331,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "the standard errors of {parameter} are not defined: the covariance of the fit is not finite",
     ),
     "numbers_correlated": FindingKind(
-        "vague", LEVEL_FACT, "hardly separately identifiable from these runs: {parameter}| ({why})"
+        "vague", LEVEL_FACT, "barely separately identifiable from these runs: {parameter}| ({why})"
     ),
     "order_not_told": FindingKind(
         "untold",
@@ -361,21 +362,21 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "run_forgets": FindingKind(
         "chaos",
         LEVEL_DO_NOT_USE,
-        "a small change of a parameter moves the free run {growth:.2g} times as much in its second half as in its "
-        "first|: the motion is chaotic or nearly so. After {seconds:.3g} s the run depends on its parameters too "
-        "strongly for a fit, and a fit to all of it has no intervals; {remedy}",
+        "a small change of a parameter changes the second half of the simulation {growth:.2g} times as much as its "
+        "first half|: the motion is chaotic or nearly so. After {seconds:.3g} s the simulation depends on the "
+        "parameters too strongly for a fit, and a fit to the whole run has no intervals; {remedy}",
     ),
     "free_runs_of_some": FindingKind(
         "search",
         LEVEL_FACT,
-        "the best {count} of {candidates} candidates by equation error were ranked by free runs: with non-linear terms "
-        "no bound says that none of the others is better|; narrow the intervals of the orders, or identify by output "
-        "error from here",
+        "the best {count} of {candidates} candidates by equation error were ranked by simulation: with non-linear "
+        "terms no bound excludes the other candidates, so one of them may be better|; narrow the intervals of the "
+        "orders, or identify by output error from here",
     ),
     "rows_repeat": FindingKind(
         "search",
         LEVEL_FACT,
-        "{rows} rows hold {models} distinct model{plural}: adding a constant to all free orders does not "
+        "{rows} rows contain {models} distinct model{plural}: adding a constant to all free orders does not "
         "change an equation from rest; give one order as a number, such as the lowest as 0",
         remedy="give one order as a number, such as the lowest as 0",
     ),
@@ -441,14 +442,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "prior",
         LEVEL_WITH_CARE,
         "{output}: the prior| (K0 = {prior:g}, coefficients near 0) shifts a coefficient by {share:.0f} % "
-        "from the estimate without it; p = {length} only weighs the data against it. Raise prior_covariance "
-        "or use {ask[method is least-squares]}",
+        "from the estimate without it; p = {length} only sets the weight of the data relative to the prior. Raise "
+        "{ask[prior_covariance]}, or use {ask[method is least-squares]}",
     ),
     "prior_ranks": FindingKind(
         "prior",
         LEVEL_WITH_CARE,
         "{output}: the prior dominates the ranking of orders|: with K0 = {prior:g} the error of the best candidate is "
-        "{share:.2g} of that of a zero output. Raise prior_covariance, or leave it out",
+        "{share:.2g} of that of a zero output. Raise {ask[prior_covariance]}, or leave it out",
     ),
     "no_standard_errors": _rule(
         "errors",
@@ -458,8 +459,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "intervals_rough": FindingKind(
         "rough",
         LEVEL_FACT,
-        "the cost is not quadratic along {parameter}, and its profile would take long: these intervals are "
-        "approximate|; {remedy}",
+        "the cost is not quadratic along {parameter}, and a profile likelihood would take long: these intervals "
+        "are approximate|; {remedy}",
     ),
     # Fit
     "not_converged": FindingKind(
@@ -471,8 +472,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "instruments_not_converged": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "{output}: instrumental variables did not converge in {iterations} steps|; the coefficients are "
-        "those of the smallest output error found. Too much noise for these terms: {remedy}",
+        "{output}: instrumental variables did not converge in {iterations} iterations|; the coefficients are "
+        "those of the smallest output error found. The noise is too large for these terms: {remedy}",
         remedy="use {ask[method is output-error]}",
     ),
     "lower_optimum_found": FindingKind(
@@ -491,20 +492,21 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "seeds_disagree": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "{output}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}|; not every "
-        "seed has found the optimum",
+        "{output}: the genetic algorithm ends at errors from {low:.4g} to {high:.4g}, depending on its seed|; not "
+        "every seed has found the optimum",
     ),
     "step_moves_estimate": FindingKind(
         "step",
         LEVEL_WITH_CARE,
-        "at {pulses} pulses per sample the step still changes estimates by over a tenth of their standard "
-        "errors: the model is too stiff for the sampling|; sample faster or trust its fast poles less",
+        "at {pulses} pulses per sample the discretization still changes estimates by over a tenth of their "
+        "standard errors: the model is too stiff for this sampling interval|; sample faster, or trust its fast poles "
+        "less",
     ),
     "step_bias": FindingKind(
         "step",
         LEVEL_WITH_CARE,
-        "with {m} pulses the step alone changes coefficient {parameter} by {amount} standard errors, which "
-        "do not include it|; {finer}use {ask[method is output-error]}, which refines the step",
+        "with {m} pulses the discretization alone changes coefficient {parameter} by {amount} standard errors, "
+        "which do not include it|; {finer}use {ask[method is output-error]}, which refines the discretization",
     ),
     # Residuals
     "residuals_not_white": FindingKind(
@@ -573,17 +575,17 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "loop_found": FindingKind(
         "loop",
         LEVEL_WITH_CARE,
-        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or "
-        "was measured with noise: a closed loop, whose noise in {input} biases estimates{effect} beyond "
-        "their intervals; record the reference signal and name it with {ask[reference]}, or open the loop",
+        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
+        "loop, or was measured with noise: the noise in {input} biases estimates{effect}, which their intervals do "
+        "not include; record the reference signal and name it with {ask[reference]}, or open the loop",
         "{input} depends on past values of {output}: a closed loop, which biases the estimates",
     ),
     "loop_harmless": FindingKind(
         "loop",
         LEVEL_FACT,
-        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or "
-        "was measured with noise: a closed loop, which changes output-error estimates{effect} only; "
-        "equation-error estimates are biased",
+        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
+        "loop, or was measured with noise: output-error estimates are biased{effect}, and equation-error estimates "
+        "may be biased more",
     ),
     "moves_within_row": FindingKind(
         "loop",
@@ -597,7 +599,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "reference_weak": FindingKind(
         "instrument",
         LEVEL_WITH_CARE,
-        "{reference} explains little of {input} beside the noise in it| (F = {f:.2g}, {needed:g} are "
+        "{reference} explains little of {input} compared with the noise in it| (F = {f:.2g}, at least {needed:g} is "
         "needed): a weak instrument, with which estimates are biased and their intervals too narrow; excite "
         "the reference more, or longer",
     ),
@@ -606,23 +608,23 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "offset",
         LEVEL_WITH_CARE,
         "an unknown constant in the equation of {output} explains {share:.2g} % of the residuals| ({test}): "
-        "a sensor's zero, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
+        "a sensor offset, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
     ),
     "drift_fits": FindingKind(
         "offset",
         LEVEL_WITH_CARE,
-        "the level of {output} drifts: with a line in time the sum of squared residuals is {ratio:.3g} times as "
+        "the level of {output} drifts: with a linear trend the sum of squared residuals is {ratio:.3g} times as "
         "large, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
-        "the level of {output} drifts: with a line in time {parameter} is {other_value:.4g}, not {value:.4g}",
-        "let the sensor settle, or estimate the line with the model: {ask[offset is ramp]}",
+        "the level of {output} drifts: with a linear trend {parameter} is {other_value:.4g}, not {value:.4g}",
+        "let the sensor settle, or estimate the trend with the model: {ask[offset is ramp]}",
         prefix="{run}: ",
     ),
     "constant_instead_of_past": FindingKind(
         "offset",
         LEVEL_FACT,
         "the initial conditions of {output} are estimated with {terms} powers of time|; an unknown constant "
-        "in the equation explains as much with {fewer} parameters fewer: if a sensor's zero, a load or a "
-        "mean may be there, {ask[offset is auto]} estimates it",
+        "in the equation explains as much with {fewer} parameters fewer: if there may be a sensor offset, a load or "
+        "a mean, {ask[offset is auto]} estimates it",
     ),
     "offset_hidden": _rule(
         "history",
@@ -632,16 +634,16 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "rests_at_level": FindingKind(
         "other",
         LEVEL_FACT,
-        "{shown} ({rows} quiet rows before an input moves)|; the run starts from rest there, and the level is "
-        "estimated with the model: {ask[initial]} overrules it",
+        "{shown} ({rows} quiet rows before an input moves)|; the simulation starts from rest there, and the level is "
+        "estimated with the model: {ask[initial]} overrides this",
         prefix="{run}: ",
     ),
     "level_estimated": FindingKind(
         "other",
         LEVEL_FACT,
         "{output} does not start at zero, and a level of the output explains the runs better than initial "
-        "terms alone|: the plant {was} about a level of its own before the start; {ask[offset]} and "
-        "{ask[initial]} overrule it",
+        "terms alone|: the plant {was} about a level other than zero before the start; {ask[offset]} and "
+        "{ask[initial]} override this",
         prefix="{run}: ",
     ),
     "rest_assumed": FindingKind(
@@ -668,7 +670,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "residuals",
         LEVEL_WITH_CARE,
         "{output} moves before its input: in row {row}, in which {input} first changes, it is already {size:.3g} "
-        "standard deviations from where it rested, about {rows:.2g} rows early|; the input was logged after it acted, "
+        "standard deviations from its value at rest, about {rows:.2g} rows early|; the input was logged after it "
+        "acted, "
         "or one of the two signals is late",
         "{output} moves before its input {input}, by about {rows:.2g} rows",
         "log the input before it acts, shift its rows, or allow a {ask[delay]} down to minus one sampling interval",
@@ -683,23 +686,23 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "simulated_from_rest": FindingKind(
         "history",
         LEVEL_WITH_CARE,
-        "{run} starts at zero and is simulated from rest, but the residuals decay like motion from before "
-        "the start|; give the model's structure {ask[initial is history]} to estimate it",
+        "{run} starts at zero and is simulated from rest, but the residuals decay like the response to inputs before "
+        "the start|; give the structure of the model {ask[initial is history]} to estimate it",
     ),
     # Data
     "outliers": FindingKind(
         "samples",
         LEVEL_FACT,
-        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one, {first}: "
-        "{noun}, or events that are not modeled|; least squares lose precision by them: {ask[loss is huber]} "
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual deviation, {first}: "
+        "{noun}, or events that are not modeled|; they make least squares less precise: {ask[loss is huber]} "
         "reduces their weight",
     ),
     "outliers_dominate": FindingKind(
         "samples",
         LEVEL_WITH_CARE,
-        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one and "
-        "{holds} {power:.0f} % of their squares, {first}: {noun}, or events that are not modeled|; least "
-        "squares lose precision by them: {ask[loss is huber]} reduces their weight",
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual deviation and "
+        "{holds} {power:.0f} % of the sum of squares, {first}: {noun}, or events that are not modeled|; they make "
+        "least squares less precise: {ask[loss is huber]} reduces their weight",
     ),
     "quantised": FindingKind(
         "samples",
@@ -782,7 +785,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "samples",
         LEVEL_WITH_CARE,
         "output {output} has {count} spike{plural}, first at row {first} ({time:.4g} s), the largest of {height} at "
-        "row {worst}: single wrong samples; replace them by their neighbours' mean",
+        "row {worst}: single wrong samples; replace them by the mean of their neighbors",
     ),
     "wrap": FindingKind(
         "samples",
@@ -818,15 +821,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "short": FindingKind(
         "vague",
         LEVEL_WITH_CARE,
-        "output {output} passes its mean {times} in {duration:.4g} s and is still moving at the end: the run "
+        "output {output} crosses its mean {times} in {duration:.4g} s and is still moving at the end: the run "
         "is shorter than the dominant period; record several times its slowest period",
     ),
     "loop_in_data": FindingKind(
         "loop",
         LEVEL_FACT,
-        "input {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or was "
-        "measured with noise: a closed loop, in which equation-error estimates are biased; use the output "
-        "error, and if possible a reference that excites the machine well",
+        "input {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
+        "loop, or was measured with noise: equation-error estimates are biased; use the output error, and if "
+        "possible a reference that excites the machine well",
     ),
     "loop_not_told": FindingKind(
         "loop",
@@ -838,15 +841,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "samples",
         LEVEL_WITH_CARE,
         "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation), which the "
-        "inputs do not explain; let the sensor settle, or estimate the line with the model: {ask[offset is "
+        "inputs do not explain; let the sensor settle, or estimate the trend with the model: {ask[offset is "
         "ramp]}",
         remedy="{ask[offset is ramp]} estimates a linear trend with the model",
     ),
     "starts_off_zero": FindingKind(
         "history",
         LEVEL_FACT,
-        "output {output} starts at {level}, not at rest: initial terms will be estimated; if this is only the sensor's "
-        "zero, subtract it, and start the run before the input moves",
+        "output {output} starts at {level}, not at rest: initial terms will be estimated; if this is only a sensor "
+        "offset, subtract it, and start the run before the input moves",
     ),
     "signal_constant": FindingKind(
         "samples", LEVEL_FACT, "{signal} is constant ({level:g}): a dead channel, or nothing happened"
@@ -854,13 +857,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "signal_in_motion": FindingKind(
         "history",
         LEVEL_FACT,
-        "{output} does not start at rest (first value {level:.4g}): initial terms will be used",
+        "{output} does not start at rest (first value {level:.4g}): initial terms will be estimated",
     ),
     # Validation
     "validates_itself": FindingKind(
         "same",
         LEVEL_FACT,
-        "its outputs are those of {other}, which the model was identified from, so it is no validation",
+        "its outputs are those of {other}, from which the model was identified, so it does not validate the model",
         prefix="{run}: ",
     ),
     "run_of_its_own": FindingKind(
@@ -884,7 +887,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "sentences_alone": _rule(
         "validation",
         LEVEL_WITH_CARE,
-        "the model file is of an earlier version, whose warnings have no levels",
+        "the model file was written by an earlier version, whose warnings have no levels",
         "identify it again",
     ),
     "earlier_sentence": FindingKind("other", LEVEL_NOTE, "{text}"),
@@ -946,8 +949,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "other_optimum": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "from automatic initial guesses the chosen structure fits {output} better than in the "
-        "cross-validation: another optimum, which is .best",
+        "automatic initial guesses lead the chosen structure to an optimum that fits {output} better than in the "
+        "cross-validation; .best is that optimum",
     ),
     "none_is_the_machine": FindingKind(
         "useless",
@@ -963,13 +966,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "other",
         LEVEL_FACT,
         "fractional orders improve the prediction significantly ({parameter}): on {parts} of validation data "
-        "they gain {gain:.2g} points of fit over {other}, and no part loses",
+        "they gain {gain:.2g} percentage points of fit over {other}, and no part loses",
     ),
     "fractional_orders_gain_nothing": FindingKind(
         "other",
         LEVEL_FACT,
-        "fractional orders do not improve the prediction significantly ({parameter}): {gain:.2g} points of "
-        "fit over {other}, on {parts} of validation data",
+        "fractional orders do not improve the prediction significantly ({parameter}): {gain:.2g} percentage points "
+        "of fit over {other}, on {parts} of validation data",
     ),
     "fractional_orders_not_told": FindingKind(
         "other",
@@ -992,18 +995,18 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "parts_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "residuals are not white: the structure is incomplete, and parts with other excitation may give "
-        "other parameters; then the structure is wrong, and the machine has not changed",
+        "residuals are not white: the structure is incomplete, so parts with different excitation may give "
+        "different parameters although the machine has not changed",
     ),
     "prediction_in_doubt": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "the predicted standard errors assume a right model, and a finding on this one says: {text}",
+        "the predicted standard errors assume a complete model, but a finding on this one says: {text}",
         "the predicted standard errors assume a complete model, and this one is incomplete",
-        "add what it leaves out, identify again, and design on that model",
+        "add the missing terms, identify again, and design the input on that model",
     ),
     "designed_for_white_noise": FindingKind(
-        "residuals", LEVEL_FACT, "predicted for white noise, and a finding on the model says: {text}"
+        "residuals", LEVEL_FACT, "the predictions assume white noise, but a finding on the model says: {text}"
     ),
 }
 
@@ -1017,14 +1020,14 @@ class _Reference:
 
 
 class _Choice:
-    """Texts of the interface in use in templates: ``{choose[validate]}``."""
+    """Texts in templates that differ between Python and the command line: ``{choose[validate]}``."""
 
     def __getitem__(self, key: str) -> str:
         return choose_text(*INTERFACE_TEXTS[key])
 
 
 class _Sentence(string.Formatter):
-    """Formatter of templates. A number that a file keeps as text, such as inf, is shown as it is."""
+    """Formatter of templates. A number that was stored as text, such as inf, is inserted unchanged."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         return value if isinstance(value, str) else str(format(value, format_spec))
@@ -1038,13 +1041,13 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     code
         Code in the catalogue.
     run, output, input, parameter, method
-        What it is about, where it applies; several names are joined by commas.
+        Subject of the finding, where it applies; several names are joined by commas.
     role
         ``"validation"`` for a run that the model was not identified from.
     numbers
-        Figures and words of its sentence, by name.
+        Numbers and texts that are inserted in its sentence, by name.
     written
-        Sentence as the file of a model keeps it, for versions that do not know the code.
+        Sentence as stored in the file of a model, for versions that do not know the code.
     """
 
     code: str
@@ -1059,7 +1062,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def kind(self) -> FindingKind:
-        """Entry in the catalogue. A code that this version does not know is to be read with care."""
+        """Entry in the catalogue. A code that this version does not know has the level "with care"."""
         return FINDING_CATALOGUE.get(self.code) or FindingKind("other", LEVEL_WITH_CARE, "{written}", "{written}")
 
     @property
@@ -1096,7 +1099,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def remedy(self) -> str:
-        """Remedy for the method that was used; empty if there is none beyond the sentence."""
+        """Remedy for the method that was used; empty if the catalogue has none."""
         if self.kind.remedy:
             return self._render(self.kind.remedy)
         topic = self.topic
@@ -1112,7 +1115,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
                 words["remedy"] = self.remedy
             return _Sentence().vformat(template, (), words)
         except (KeyError, ValueError, TypeError):
-            # A file may lack a number of its sentence.
+            # A file may lack a number of the sentence.
             return self.written or self.code
 
     def to_file(self) -> Finding:
@@ -1192,7 +1195,7 @@ class FindingGroup:
 
 
 def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
-    """Group findings by topic, most serious first; one of no topic is a group of its own."""
+    """Group findings by topic, most serious first; each finding of the topic "other" is a group of its own."""
     order = list(FINDING_TOPICS)
     by: dict[tuple[int, int, int], list[Finding]] = {}
     for place, item in enumerate(unique(findings)):
@@ -1203,6 +1206,6 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
 
 
 def hidden_findings_text(found: Sequence[FindingGroup]) -> str:
-    """Text on the number of findings that a summary omits; empty if it omits none."""
+    """Return the number of findings that a summary omits, as text; empty if it omits none."""
     count = sum(len(g.findings) for g in found) - len(found[:MAX_SUMMARY_FINDINGS])
     return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

@@ -575,7 +575,11 @@ def test_data_are_never_changed():
         ({"structure": "D U = a U + b sat(I, 3)"}, ftlm.ModelError, r"I saturates or has a dead zone, which a frequ"),
         ({"structure": "D U = a U + b I + c"}, ftlm.ModelError, r"have an offset, which a frequency response does not"),
         ({"structure": "D U = a U"}, ftlm.ModelError, r"the equations of U have no input"),
-        ({"structure": "D y = a y + b I"}, ftlm.DataError, r"cell has the output 'U', which is no output of the equa"),
+        (
+            {"structure": "D y = a y + b I"},
+            ftlm.DataError,
+            r"cell has the output 'U', which is not an output of the equa",
+        ),
         ({"structure": "D U = a U + b I + d J"}, ftlm.DataError, r"no record is from J, an input of the equations"),
         ({"orders": {"alpa": 1.0}}, ftlm.ModelError, r"alpa"),
         ({"fixed": {"q": 1.0}}, ftlm.ModelError, r"fixed coefficient 'q' does not occur"),
@@ -616,7 +620,7 @@ def test_too_few_frequencies_and_responses_of_size_0_are_refused():
             ("f", "Hz", "dB"),
             r"the columns 'f' and 'Hz' may both be the frequency; name one with columns=\{part",
         ),
-        (("freq [parsec]", "re", "im"), r"states the unit 'parsec', which is no unit of frequency"),
+        (("freq [parsec]", "re", "im"), r"states the unit 'parsec', which is not a unit of frequency"),
         (("Hz", "Re (Ohm)", "Im (mOhm)"), r"have the units 'Ohm' and 'mOhm'; give both in one unit"),
     ],
 )
@@ -634,7 +638,7 @@ def test_what_is_said_of_a_file_is_checked(tmp_path):
         ({"magnitude_unit": "dB", "phase_unit": "turns"}, r"phase_unit='turns' is unknown"),
         (
             {"columns": {"frequncy": "f"}},
-            r"'frequncy' is no part of a frequency response \(did you mean 'freq",
+            r"'frequncy' is not part of a frequency response \(did you mean 'freq",
         ),
         ({"columns": {"frequency": "g"}}, r"column 'g' \(frequency\) is not in 'x.csv'"),
         ({"columns": 3}, r"columns is a int; pass a dict of part: column"),

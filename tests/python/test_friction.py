@@ -330,7 +330,7 @@ def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
     page = found.report(tmp_path / "cart.html").read_text()
     assert "sgn" in page
     assert "Coulomb friction" in page
-    # What is not known is no row of four times "undefined": the reason stands there.
+    # What is not known is not a row of four times "undefined": the reason stands there.
     reason = "y has no equation error: friction acts on it, and the sign of a measured velocity is that of its noise"
     assert reason in page
     assert '<data value="nan">' not in page

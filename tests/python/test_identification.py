@@ -482,11 +482,11 @@ def test_a_trace_that_diverges_is_infinite_there():
     [
         ("D^alpha y = a y + b u", {}, "a trace needs one equation whose orders are numbers"),
         ("D y = a y; D z = b z", {}, "a trace needs one equation whose orders are numbers"),
-        (WORDS, {"every": 0}, "every = 0 is no whole number from 1"),
-        (WORDS, {"every": "x"}, "every = 'x' is no whole number from 1"),
+        (WORDS, {"every": 0}, "every = 0 is not a whole number of at least 1"),
+        (WORDS, {"every": "x"}, "every = 'x' is not a whole number of at least 1"),
         (WORDS, {"innovation_length": 0}, "innovation_length = 0"),
         (WORDS, {"prior_covariance": 0}, "prior_covariance = 0 is not positive"),
-        (WORDS, {"m": 300}, "m = 300 is no power of two"),
+        (WORDS, {"m": 300}, "m = 300 is not a power of two"),
         (WORDS, {"row_basis": "x"}, "row_basis = 'x' is not known"),
     ],
 )

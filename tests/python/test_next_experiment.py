@@ -430,14 +430,14 @@ BAD = {
     "too short": ({"duration": 0.5}, None, "11 rows; give a run of 32 to 50000"),
     "too long": ({"duration": 1e12}, None, "rows; give a run of 32 to 50000"),
     "noise": ({"noise": {"y": 0}}, None, "noise of y = 0 is not above 0"),
-    "tiny limit": ({"limits": {"y": 1e-320}}, None, "limits of y = .* is no size from 1e-50 to 1e.50; use other units"),
-    "huge peak": ({"peak": 1e308}, None, "peak of u = 1e.308 is no size"),
+    "tiny limit": ({"limits": {"y": 1e-320}}, None, "limits of y = .* is not between 1e-50 and 1e.50; use other units"),
+    "huge peak": ({"peak": 1e308}, None, "peak of u = 1e.308 is not between"),
     "tiny slew": ({"slew": 1e-45}, None, "slew of u = 1e-45 a second takes"),
-    "tiny noise": ({"noise": 1e-320}, None, "noise of y = .* is no size"),
+    "tiny noise": ({"noise": 1e-320}, None, "noise of y = .* is not between"),
     "criteria": ({"criterion": np.array(["D", "E"])}, None, "criterion = array"),
     "progress": ({"progress": 5}, None, "progress is a int"),
     "no list": ({"parameters": 5}, None, "names is a int"),
-    "no name": ({"parameters": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is no free parameter"),
+    "no name": ({"parameters": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is not a free parameter"),
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),
     "seed": ({"seed": -1}, None, "seed = -1"),
     "period": ({"period": 0.01}, None, "period = 0.01 s is not between"),
@@ -574,7 +574,7 @@ def test_the_command_says_writes_and_refuses(found: ftlm.Identification, tmp_pat
         ("--slew", "fast"): "neither a number nor INPUT=NUMBER",
         ("--slew", "1e-3"): "raise --slew or --duration",
         ("--limits", "z=1"): "limits names 'z'",
-        ("--parameters", "beta"): "is no free parameter of the model",
+        ("--parameters", "beta"): "is not a free parameter of the model",
     }
     for more, said in refused.items():
         failed = CliRunner().invoke(app, [*words, *more])

@@ -425,7 +425,9 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     run = struck(1)
     plain = ftlm.identify(run, ftlm.equation(FREE))
     (said,) = [w for w in plain.warnings if "huber" in w]
-    assert said.startswith("4 of 398 residuals of y lie beyond 5 times the usual one and hold 99 % of their squares, ")
+    assert said.startswith(
+        "4 of 398 residuals of y lie beyond 5 times the usual deviation and hold 99 % of the sum of squares, "
+    )
     assert "first at row " in said
     robust = ftlm.identify(run, ftlm.equation(FREE), method=ftlm.OutputError(loss="huber"))
     near_truth(robust)
@@ -448,7 +450,9 @@ def test_one_outlier_that_holds_most_of_the_squares_is_named() -> None:
     u, y = noisy(3)
     y[150] += 30 * np.std(y)
     (said,) = [w for w in ftlm.identify(run_of(u, y), ftlm.equation(FREE)).warnings if "huber" in w]
-    assert said.startswith("1 of 398 residuals of y lies beyond 5 times the usual one and holds 100 % of their squares")
+    assert said.startswith(
+        "1 of 398 residuals of y lies beyond 5 times the usual deviation and holds 100 % of the sum of squares"
+    )
     # One of four deviations more is not worth a word.
     u, y = noisy(3)
     y[150] += 0.06 * np.std(y)

@@ -67,7 +67,7 @@ def test_the_environment_gives_the_threads_of_what_does_not_say_its_own(monkeypa
     assert check_threads(None) == available_threads()
     for wrong in ("0", "-1", "1025", "two", "1.5", "9" * 5000, "\u0663"):
         monkeypatch.setenv("FTLM_THREADS", wrong)
-        with pytest.raises(ftlm.ModelError, match=r"^FTLM_THREADS=.* is no number of threads; give 1 to 1024"):
+        with pytest.raises(ftlm.ModelError, match=r"^FTLM_THREADS=.* is not a number of threads; give 1 to 1024"):
             check_threads(None)
 
 

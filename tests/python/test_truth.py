@@ -145,7 +145,7 @@ def test_any_known_parameter_gives_the_same_arm(fitted: ftlm.Identification) -> 
     ("known", "words"),
     [
         ({}, "one per stage must be known"),
-        ({"J11": 1.0}, "'J11' is no physical parameter"),
+        ({"J11": 1.0}, "'J11' is not a physical parameter"),
         ({"J_11": 1.0, "K_s1": 2.0}, "one too many"),
         ({"J_11": -1.0}, "is not positive"),
         ({"J_11": float("nan")}, "J_11"),

@@ -309,7 +309,7 @@ def test_a_saved_model_keeps_the_records(found, tmp_path):
     for bad in ([{"level": "trust", "reason": "x"}], [{"numbers": {}}], ["x"], {}, [{"code": 3}]):
         document["estimate"]["against"] = bad
         path.write_text(json.dumps(document), encoding="utf-8")
-        with pytest.raises(ftlm.DataError, match="is no ftlm model"):
+        with pytest.raises(ftlm.DataError, match="is not an ftlm model"):
             ftlm.load_model(path)
     # A code of a later version is shown as its text, and one that lacks its numbers by the text of its file.
     for code, level, reason in (("later", "with care", "<script>x</script>"), ("poor_fit", "do not use", "poor_fit")):

@@ -428,8 +428,8 @@ def test_arms_differ_in_what_they_are_called_for():
     [
         ({"arms": ["whole"]}, "arm 'whole' is not known"),
         ({"arms": "whole orders"}, "is a text; give a list of names"),
-        ({"records": 0}, "records = 0 is no whole number from 1"),
-        ({"records": 2.5}, "records = 2.5 is no whole number from 1"),
+        ({"records": 0}, "records = 0 is not a whole number from 1"),
+        ({"records": 2.5}, "records = 2.5 is not a whole number from 1"),
         ({"increment": 0.0}, "increment"),
         ({"rivals_increment": 0.0}, "increment"),
         ({"rivals_increment": "0.1"}, "increment"),

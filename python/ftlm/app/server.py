@@ -91,7 +91,7 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     paths = [Path(file) for file in files]
     for path in paths:
         if not path.is_file():
-            raise DataError(f"{str(path)!r} is no file; check the path")
+            raise DataError(f"{str(path)!r} is not a file; check the path")
     sock, note = open_socket(port)
     if note:
         print(f"ftlm: {note}", file=sys.stderr)

@@ -332,7 +332,7 @@ def check_order_names(grid: OrderGrid, structure: Structure) -> None:
     for name in grid.orders:
         if name not in {"alpha", *structure.order_names}:
             free = ", ".join(structure.order_names) or "none"
-            raise ModelError(f"--order-grid {name!r} is no free order; free are {free}")
+            raise ModelError(f"--order-grid {name!r} is not a free order; free are {free}")
 
 
 def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:

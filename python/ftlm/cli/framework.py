@@ -54,7 +54,7 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
         try:
             values[name] = float(value)
         except ValueError:
-            raise ModelError(f"{option} {name}={value}: {value!r} is no number") from None
+            raise ModelError(f"{option} {name}={value}: {value!r} is not a number") from None
     return values
 
 

@@ -255,7 +255,7 @@ def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,)."""
     raw = as_array("path", path)
     if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
-        raise DataError(f"path is no array of 16 to {MAX_PATH_ROWS} numbers, one a sample")
+        raise DataError(f"path is not an array of 16 to {MAX_PATH_ROWS} numbers, one per sample")
     rows = np.array(raw, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(rows))
     if bad.size:

@@ -53,12 +53,12 @@ class CircuitProblem(ResponseProblem):
         return np.where(self.is_log, np.exp(np.where(self.is_log, values, 0.0)), values)
 
     def in_problem_units(self, values: Floats) -> Floats:
-        """Return logarithms of parameters; NaN for those that are not above 0."""
+        """Return the logarithms of positive parameters, and other parameters unchanged; NaN if one is not above 0."""
         safe = np.where(values > 0, values, np.nan)
         return np.where(self.is_log, np.log(np.where(self.is_log, safe, 1.0)), values)
 
     def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-        """Return intervals of given half-widths; of positive parameters by their logarithms, and so above 0."""
+        """Return intervals of given half-widths. Those of positive parameters are symmetric in the logarithm."""
         found = super().intervals(values, widths)
         for name, value, is_log in zip(self.names, values.tolist(), self.is_log.tolist(), strict=True):
             if is_log:
@@ -67,7 +67,7 @@ class CircuitProblem(ResponseProblem):
         return found
 
     def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
-        """Convert a Jacobian by logarithms to one by the parameters."""
+        """Convert a Jacobian with respect to logarithms to one with respect to the parameters."""
         return slopes / np.where(self.is_log, self.in_seconds(values), 1.0)
 
     def responses(self, values: Floats, *, slopes: bool = True) -> list[tuple[Complex, Complex | None]]:

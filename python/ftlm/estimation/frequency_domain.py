@@ -299,7 +299,7 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
                 own[side] = known[0]
             elif own[side] not in known:
                 raise DataError(
-                    f"{record.name} has the {side} {own[side]!r}, which is no {side} of the equations; these have "
+                    f"{record.name} has the {side} {own[side]!r}, which is not an {side} of the equations; these have "
                     f"{', '.join(known)}: write the equation in the names of the data, or say {parameter(side)} when "
                     "loading"
                 )

@@ -283,7 +283,7 @@ class FrequencyIdentification:
         Raises
         ------
         ModelError
-            A circuit that is no equation with powers of s.
+            A circuit that is not an equation with powers of s.
         """
         if isinstance(self.source, Model):
             return self.source

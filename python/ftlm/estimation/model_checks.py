@@ -33,7 +33,7 @@ from ftlm.validation.data_advice import check_excitation, find_dead_channel
 #: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
 #: Least number of samples per period of a mode whose numbers do not rest on the inputs between samples, and damping
-#: ratio from which on a mode is no swing.
+#: ratio from which on a mode is not a swing.
 MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
 #: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
@@ -124,7 +124,7 @@ def second_optimum_findings(
     """Return a finding on the most likely other optimum at values over three standard errors apart.
 
     Each optimum comes with the fall of the log likelihood and its own standard errors: what it does not determine
-    itself is no value.
+    itself is not a value.
     """
     for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
         if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:

@@ -361,7 +361,7 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
         few = refit_from(joint, runs, replace(asked, initial="caputo"), loss)
-        # On the same kind of grid: what a coarse one leaves is no history.
+        # On the same kind of grid: what a coarse one leaves is not a history.
         many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
         return None

@@ -202,7 +202,7 @@ def covariance(attempt: Iterate, grid: Objective) -> Floats:
 
 
 def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) -> Floats:
-    """Return the covariance from a Jacobian (row a parameter), residual series and their sum of squares.
+    """Return the covariance from a Jacobian (one row per parameter), residual series and their sum of squares.
 
     Missing residuals are NaN. Covariances with a parameter of infinite variance are NaN.
     """

@@ -42,9 +42,9 @@ class UnstableOptimum:
         Whether the fit is the unstable optimum, because the data require it or no stable one exists.
     residual_excess
         Relative excess of the root-mean-square residuals of the stable optimum. Infinite if there is none; negative if
-        the unstable point is no optimum.
+        the unstable point is not an optimum.
     at_stability_limit
-        Whether the stable point lies on the stability limit and is no optimum of its own.
+        Whether the stable point lies on the stability limit and is not an optimum of its own.
     """
 
     is_accepted: bool

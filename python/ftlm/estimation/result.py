@@ -215,7 +215,7 @@ class Identification:
         Raises
         ------
         ModelError
-            A model without coefficient law or intervals, or a name that is no parameter of it.
+            A model without coefficient law or intervals, or a name that is not a parameter of it.
         """
         if self.joint is None:
             raise ModelError(

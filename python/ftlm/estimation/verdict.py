@@ -396,7 +396,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     yield from coupled
     yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in judged)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
-    # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
+    # With a reference the loop is known: its noise is not part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]
     yield from (make_finding("residuals_not_white", output=o) for o in coloured)
 

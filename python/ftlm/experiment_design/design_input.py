@@ -436,7 +436,10 @@ def _positive(name: str, value: object, what: str) -> float:
 
 
 def _largest_values(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]:
-    """Largest size of signals of a run, of outputs from their first value; omits missing and constant signals."""
+    """Return the largest absolute values of signals of a run; missing and constant signals are omitted.
+
+    With ``moved`` they are measured from the first value of each signal.
+    """
     out = {}
     for name in names:
         if name in run:
@@ -461,7 +464,7 @@ def _parameter_indices(laid: ModelFit, names: Sequence[str] | None) -> tuple[int
         if not isinstance(name, str) or name not in laid.names:
             near = nearest(name, laid.names) if isinstance(name, str) else ""
             raise ModelError(
-                f"names[{k}] = {short_repr(name)} is no free parameter of the model{near}; it has "
+                f"names[{k}] = {short_repr(name)} is not a free parameter of the model{near}; it has "
                 f"{', '.join(laid.names)}"
             )
         if name in given[:k]:
@@ -544,7 +547,7 @@ def _robust_scale(wanted: DesignTask, known: Sensitivities, commands: Floats) ->
 
 
 def _errors(laid: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
-    """Standard errors of the model, and predicted ones of fits of the designed and of the reference run."""
+    """Return standard errors of the model, and those predicted for fits to the reference and to the designed run."""
     now, new = laid.covariance, laid.predicted_covariance(run)
     size = np.sqrt(np.diag(now))
     told = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))

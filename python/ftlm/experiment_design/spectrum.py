@@ -138,7 +138,10 @@ def _response_sensitivities(laid: ModelFit, w: Floats, step: float) -> tuple[Com
 
 
 def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
-    """Output responses for simulated coupling, or for measured coupling with given responses of the other signals."""
+    """Return the frequency responses of the outputs to the inputs, shape (outputs, inputs, frequencies).
+
+    With measured coupling the equations read other signals, whose responses to the inputs are ``drives``.
+    """
     if coupling == "simulated":
         return frequency_response(model, w)
     alone = frequency_response(model, w, coupling="measured")

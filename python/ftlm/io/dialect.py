@@ -522,7 +522,7 @@ def _header(
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
     if commas and not own and count == 1:
         raise DataError(
-            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is no line of names; say "
+            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is not a line of names; say "
             f"{layout_parameter(decimal='comma')}"
         )
     check_distinct(names, line.at, source)
@@ -561,7 +561,8 @@ def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool,
     if rows:
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
-            f"a table of {width} cells a row; give every line the same number of cells, or say how many lines to leave "
+            f"a table of {width} cells per row; give every line the same number of cells, or say how many lines to "
+            "leave "
             f"out with {layout_parameter(skip=Placeholder('LINES'))}"
         )
 

@@ -96,7 +96,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.structure.equations != other.structure.equations:
             return "another equation"
         if self.values != other.values:
-            return "another lattice"
+            return "another order grid"
         changed = [n for n in self.settings if self.settings[n] != other.settings.get(n)]
         if changed:
             return "other settings: " + ", ".join(f"{n} = {self.settings[n]}" for n in changed)
@@ -289,7 +289,7 @@ def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corrupt
                 contents.sections[frame.search].add_frame(frame)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
             raise DataError(
-                f"{path} holds something else in record {number}: {error}; start the search again in another file"
+                f"{path} has an unexpected entry in record {number}: {error}; start the search again in another file"
             ) from error
     return cast("Contents", contents)
 
@@ -360,7 +360,8 @@ class Store:
             difference = one.difference(other)
             if difference is not None:
                 raise DataError(
-                    f"store {self.path} holds another search of {one.name} (asked is {difference}); choose another file"
+                    f"store {self.path} holds another search of {one.name} (this one has {difference}); choose "
+                    "another file"
                 )
 
     def outdated_error(self) -> DataError:
@@ -383,7 +384,7 @@ class Store:
             self.contents.sections[frame.search].add_frame(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
-        """Note the progress of a block of rounds; it is written with others, or when the flush interval ends."""
+        """Queue the progress of a block of rounds; write the queue if the flush interval has passed."""
         if checkpoint is not None:
             (*place, order), anew, (rows, counts, failures) = checkpoint
             before = self._waiting.get((search, first))

@@ -95,7 +95,7 @@ class OrderCertificate:
         return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "lower_bound": self.lower_bound,
             "best": self.best if self.orders else None,
@@ -262,7 +262,7 @@ class SearchResult:
         return to_frame(rows, ["rank"])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "candidates": self.candidates,
             "exclusion_counts": self.exclusion_counts,
@@ -392,7 +392,7 @@ class StoreStatus:
         return self.done_count == self.candidates
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {**asdict(self), "complete": self.complete}
 
     def __str__(self) -> str:

@@ -96,7 +96,7 @@ def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, flo
             e,
             structure.delay,
             structure.limits,
-            # A level is added to the output, and is no term of its equation.
+            # A level is added to the output, and is not a term of its equation.
             "" if "level" in own.get(e.output, {}) else own.get(e.output) or structure.offset_in_words,
         )
         for e in model.equations

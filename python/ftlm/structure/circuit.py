@@ -50,7 +50,7 @@ class Element:
     impedance
         Impedance at s, and its derivatives: by logarithms of parameters, by an exponent itself.
     ratio
-        Numerator and denominator of the impedance as polynomials; None for a function of s that is no ratio of powers.
+        Numerator and denominator of the impedance as polynomials; None if the impedance is not a ratio of powers of s.
     """
 
     meaning: str
@@ -228,7 +228,7 @@ class Circuit:
         Raises
         ------
         ModelError
-            An element whose impedance is no ratio of powers of s.
+            An element whose impedance is not a ratio of powers of s.
         """
 
         def product(one: Polynomial, other: Polynomial) -> Polynomial:

@@ -66,7 +66,7 @@ def plane_chart(
     if np.any(bad):
         raise DataError(f"point {int(np.argmax(bad))} of {values.size} is not finite; leave it out")
     if not 0 < sector < math.pi:
-        raise DataError(f"sector = {sector!r} is no angle between 0 and pi")
+        raise DataError(f"sector = {sector!r} is not an angle between 0 and pi")
     inside = int(np.sum(np.abs(np.angle(values)) < sector))
     far = float(np.max(np.abs(values), initial=0.0)) or 1.0
     listed = ", ".join(map(_complex_text, values.tolist()))
