@@ -535,7 +535,7 @@ impl Bank {
         &self.columns
     }
 
-    /// Column at a position, one value a pulse.
+    /// Column at a position, one value per pulse.
     ///
     /// # Panics
     /// If the column does not exist.
@@ -544,7 +544,7 @@ impl Bank {
         &self.columns[position * self.m..(position + 1) * self.m]
     }
 
-    /// Kernel of an own-output column, one value a pulse. Empty for any other column.
+    /// Kernel of an own-output column, one value per pulse. Empty for any other column.
     ///
     /// # Panics
     /// If the column does not exist.

@@ -273,7 +273,7 @@ pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -
 ///
 /// `signals` are point samples of the record's signals at intervals of `step`. Those of the equations' outputs are
 /// ignored. Every α must be an integer, every order of an output an integer below its α, every other order 0. Returns
-/// one sample a row for each equation, not finite if the step is unstable.
+/// one sample per row for each equation, not finite if the step is unstable.
 ///
 /// # Errors
 /// [`Error::Structure`] naming the equation whose orders are not integers, and as [`respond`] for equations, signals,

@@ -437,7 +437,7 @@ def way_out(table):
     import pytest
 
     sys.path.insert(0, str(HERE / "python"))
-    import test_way_out as rig
+    import test_shutdown as rig
 
     for failing in (*rig.PAIRS, *rig.TRIPLES):
         for raises in (False, True):

@@ -10,7 +10,7 @@ import ftlm
 from ftlm import control
 from ftlm.cli.main import app
 from test_control import PID
-from test_quadratic import BROKEN, designed, model
+from test_lqg import BROKEN, designed, model
 
 
 @pytest.fixture(scope="module")

@@ -150,13 +150,13 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
     older = Request(request.algorithm + 1, "0.0.1", request.runs, request.candidates, request.validation)
     with Store(tmp_path / "older.ftlm", older):
         pass
-    with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
+    with pytest.raises(ftlm.DataError, match=r"was written by ftlm 0\.0\.1, algorithm .* finish the selection"):
         ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "older.ftlm")
     # Digests of another version tell nothing of what it was asked.
     strange = Request(request.algorithm, "0.0.1", b"other", b"others", b"another")
     with Store(tmp_path / "strange.ftlm", strange):
         pass
-    with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
+    with pytest.raises(ftlm.DataError, match=r"was written by ftlm 0\.0\.1, algorithm .* finish the selection"):
         ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "strange.ftlm")
     assert place.read_bytes() == before
     text = tmp_path / "notes.txt"

@@ -1,4 +1,4 @@
-"""The landscape of a joint fit: its valley is the covariance's, its optimum the fit's, its words are true."""
+"""Cost surface of a joint fit: its valley follows the covariance, its optimum is the fit, its texts are true."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Saturations and dead zones of inputs: free runs as SciPy's of inputs bent by hand, estimates, words."""
+"""Saturation and dead zone of inputs: simulations against SciPy's of limited inputs, estimates, messages."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What is printed is true, what is asked for is used: options, delays, units of time, brackets, words of commands."""
+"""Messages and options: every option is used or refused; delays, units of time, brackets and help texts are printed."""
 
 from __future__ import annotations
 

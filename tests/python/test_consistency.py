@@ -1,4 +1,4 @@
-"""Parts of a run are one model where the machine is one, and where it is not words say which number of which part."""
+"""Consistency of segments: segments of one machine agree, and a changed parameter is named with its segment."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What surrounds ftlm: a program's log, a shell that completes, an environment that gives threads."""
+"""Environment of ftlm: the log of a program, shell completion, threads from environment variables."""
 
 from __future__ import annotations
 

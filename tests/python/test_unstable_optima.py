@@ -1,4 +1,4 @@
-"""Optima whose free run grows: told by their poles, kept where the runs force them, left where they do not."""
+"""Unstable optima: found by their poles, kept if the runs require them, replaced by stable ones otherwise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Truth under noise: instrumental variables, physical parameters, and the Monte-Carlo promises (the long ones slow)."""
+"""Estimates under noise: instrumental variables, physical parameters, and Monte-Carlo tests (the long ones slow)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What verdicts are made of: the rule, the rivals, printed models run, the tables as the paper computed them."""
+"""Verdicts of the reproduction: their rule, the rivals, the printed models simulated, the paper's tables."""
 
 import threading
 from dataclasses import replace

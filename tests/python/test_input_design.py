@@ -1,4 +1,4 @@
-"""The next experiment: what it is predicted to tell, beside SciPy, naive loops, and fits of what is measured then."""
+"""Optimal input design: predicted standard errors against SciPy, naive loops, and fits of simulated runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The way out of a rig when calls fail on it and signals come in it: the motors end without current, or it is said."""
+"""Shutdown of a rig with failing calls and signals: the motors end without current, or a message says otherwise."""
 
 import itertools
 import signal

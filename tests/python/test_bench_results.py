@@ -1,4 +1,4 @@
-"""Measured figures: the page is made from the records that benches write, and each record says where it comes from."""
+"""Measured figures: the page is generated from the records of the benches, and each record names its command."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What real records have: samples that were not read, times of their own, outliers, colour, coarse steps."""
+"""Real records: missing samples, irregular sample times, outliers, colored noise, coarse quantization."""
 
 from __future__ import annotations
 

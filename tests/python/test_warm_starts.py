@@ -1,4 +1,4 @@
-"""Identification from what is known already: never worse than from there, by whatever name it is known."""
+"""Warm starts from known values: never a larger cost than from there, in any form in which the values are given."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Realisations, observers, linear-quadratic loops and inverse dynamics, against SciPy, recursions and powers of jw."""
+"""Realizations, observers, linear-quadratic loops and inverse dynamics, against SciPy, recursions and powers of jw."""
 
 import importlib
 import math

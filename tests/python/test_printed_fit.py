@@ -1,4 +1,4 @@
-"""The printed fit is that of the printed model: sample by sample, as SciPy and the model's own simulation have it."""
+"""The printed fit is that of the printed model, sample by sample, as SciPy and the model's own simulation have it."""
 
 import control
 import mpmath

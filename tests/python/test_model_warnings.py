@@ -1,4 +1,4 @@
-"""A model that cannot be trusted says so, and what is printed can be computed again from what is saved."""
+"""Warnings on models that must not be used; printed values can be computed again from saved files."""
 
 import re
 

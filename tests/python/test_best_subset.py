@@ -1,4 +1,4 @@
-"""Every subset of what drives, judged in closed form: beside SciPy's responses, and beside the fits that it spares."""
+"""Best-subset search over input terms in closed form, against SciPy's responses and against joint fits."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Runs that start in motion: the past is estimated where the runs ask for it, and intervals cover as from rest.
+"""Nonzero initial conditions: the past is estimated if the runs require it, and intervals cover as from rest.
 
 Truth is exact and shares no code with the estimator: residues and the integral along the branch cut (motion.py).
 """

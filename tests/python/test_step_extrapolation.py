@@ -1,4 +1,4 @@
-"""The limit for step 0: against powers of the step, kinks, grids without numbers, and state space behind a filter."""
+"""Extrapolation to step 0: against powers of the step, kinks, grids without numbers, and a filtered state space."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Integer against fractional orders on runs that were not fitted to: verdicts follow numbers, the page shows both."""
+"""Integer against fractional orders on validation runs: verdicts follow the numbers, the page shows both."""
 
 import json
 from dataclasses import replace
