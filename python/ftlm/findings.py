@@ -66,47 +66,53 @@ FINDING_TOPICS: dict[str, Topic] = {
         "the motion is chaotic",
         "fit parts of the run that are shorter than that, or use {ask[method is least-squares]}",
     ),
-    "range": Topic("the simulation overflows", "choose other orders, or fewer terms"),
-    "unseen": Topic(
+    "overflow": Topic("the simulation overflows", "choose other orders, or fewer terms"),
+    "not_separable": Topic(
         "some parameters are not separately identifiable from the runs",
         "leave a term out, fix one of them, or record a richer input",
     ),
-    "identity": Topic(
+    "near_identity": Topic(
         "its equation nearly says that an output equals itself", "keep own orders well below the highest one"
     ),
-    "useless": Topic(
+    "poor_fit": Topic(
         "the simulation explains little of an output",
         "add a missing input, a delay or a term",
         "or use {ask[method is output-error]}",
         "output-error",
     ),
-    "lost": Topic(
+    "validation_loss": Topic(
         "the model predicts other runs worse than its own", "use fewer free parameters, or more runs in one fit"
     ),
     "offset": Topic("a constant is missing, or not identifiable", "{ask[offset is constant]} or {ask[offset is auto]}"),
-    "loop": Topic(
+    "closed_loop": Topic(
         "the runs were recorded in a closed loop", "name the reference signal with {ask[reference]}, or open the loop"
     ),
-    "instrument": Topic("the reference explains little of the input", "record a stronger reference"),
-    "untold": Topic("a parameter is not identifiable from the runs", "fix it, leave it out, or record a richer input"),
+    "weak_instrument": Topic("the reference explains little of the input", "record a stronger reference"),
+    "not_identifiable": Topic(
+        "a parameter is not identifiable from the runs", "fix it, leave it out, or record a richer input"
+    ),
     "residuals": Topic("the model is incomplete", "add a term, a delay or a free order; ftlm select compares them"),
     "provisional": Topic("the fit is provisional", "give {ask[start]} another result, or free fewer parameters"),
-    "vague": Topic(
+    "imprecise": Topic(
         "some parameters are poorly determined", "fix a parameter, leave a term out, or record a richer input"
     ),
-    "rough": Topic("some intervals are approximate", "{ask[intervals is profile]} computes them"),
-    "step": Topic("the sampling is coarse for this model", "sample faster, raise m, or trust its fast poles less"),
+    "approximate_intervals": Topic("some intervals are approximate", "{ask[intervals is profile]} computes them"),
+    "sampling": Topic("the sampling is coarse for this model", "sample faster, raise m, or trust its fast poles less"),
     "prior": Topic(
         "the prior shifts the coefficients",
         "raise {ask[prior_covariance]}, or use {ask[method is least-squares]}",
     ),
-    "law": Topic("the coefficient law is violated", "", "use {ask[method is output-error]}", "output-error"),
-    "edge": Topic("an order or another parameter is on its bound", "widen the bound"),
-    "search": Topic("the table of orders", "record a longer run, or fix an order"),
-    "history": Topic("the result depends on initial conditions", "begin the run at rest"),
-    "samples": Topic("some samples are unreliable", "see the warning"),
-    "same": Topic("a validation run is an estimation run", "give another run"),
-    "errors": Topic("the parameters have no standard errors", "", "use {ask[method is output-error]}", "output-error"),
+    "coefficient_law": Topic(
+        "the coefficient law is violated", "", "use {ask[method is output-error]}", "output-error"
+    ),
+    "bound": Topic("an order or another parameter is on its bound", "widen the bound"),
+    "order_table": Topic("the table of orders", "record a longer run, or fix an order"),
+    "initial_conditions": Topic("the result depends on initial conditions", "begin the run at rest"),
+    "data": Topic("some samples are unreliable", "see the warning"),
+    "repeated_run": Topic("a validation run is an estimation run", "give another run"),
+    "no_standard_errors": Topic(
+        "the parameters have no standard errors", "", "use {ask[method is output-error]}", "output-error"
+    ),
     "validation": Topic("the prediction of other data is not known"),
     "noise": Topic("the noise is colored"),
     "other": Topic("note"),
@@ -176,7 +182,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         remedy="record the reference signal of the controller, and validate on short pieces",
     ),
     "plant_unstable_in_pieces": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_WITH_CARE,
         "the model is unstable, and so is the plant, which a controller stabilizes: simulations restarted "
         "every {seconds:.2g} s explain {fit:.3g} % of the outputs, while a simulation of the whole run grows; noise "
@@ -221,7 +227,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "free initial conditions cancel its growing mode until the end of the run; the stable optimum was kept",
     ),
     "damping_not_told": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "an optimum that is not stable has residuals {smaller:.2g} % smaller, which is not significant: the "
         "free initial conditions cancel its growing mode until the end of the run|; the stable optimum was kept, "
@@ -233,19 +239,19 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{output}: the simulation with these coefficients is unstable|; do not use them",
     ),
     "swing_may_not_decay": _rule(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "an oscillation at {frequency:.4g} rad/s may not decay (damping {damping:.2g}{spread})",
         "add the term that damps it, or record until it has decayed",
     ),
     "out_of_range": FindingKind(
-        "range",
+        "overflow",
         LEVEL_DO_NOT_USE,
         "{output}: the simulation overflows, so its residuals cannot be tested",
         "the simulation overflows",
     ),
     "equation_says_identity": FindingKind(
-        "identity",
+        "near_identity",
         LEVEL_DO_NOT_USE,
         "{output}: {orders} close to alpha = {alpha:g}, so the equation nearly says that {output} equals "
         "itself|; its simulation has NR {nr:.3g} against {equation_nr:.3g} for the equation error. Do not "
@@ -253,16 +259,16 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "its equation nearly says that an output equals itself",
     ),
     "flattered_by_equation_error": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "{output}: the simulation| (NR {nr:.3g}) is far worse than the equation error ({equation_nr:.3g}), "
         "which does not measure the quality of this model",
     ),
     "explains_little": FindingKind(
-        "useless", LEVEL_DO_NOT_USE, "{output}: the simulation explains little of the output| (NR {nr:.3g})"
+        "poor_fit", LEVEL_DO_NOT_USE, "{output}: the simulation explains little of the output| (NR {nr:.3g})"
     ),
     "buried_in_noise": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_WITH_CARE,
         "{output}: the noise exceeds the response to the input (NR {nr:.3g}), and the residuals are not "
         "correlated with the input: this run gives no evidence that the model is incomplete",
@@ -270,7 +276,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "excite the input more, record longer, or average repeated runs",
     ),
     "end_row_far_off": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_WITH_CARE,
         "{output}: its first or last row is an outlier: with it the simulation explains little of the output "
         "(NR {nr:.3g}), without it {inner:.3g} %",
@@ -278,9 +284,9 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "rows is explained)",
         "cut that row away, or mark it as missing",
     ),
-    "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the simulation explains little of {where}{shown}"),
+    "poor_fit": _rule("poor_fit", LEVEL_DO_NOT_USE, "the simulation explains little of {where}{shown}"),
     "fit_falls": FindingKind(
-        "lost",
+        "validation_loss",
         LEVEL_WITH_CARE,
         "the fit of {output} falls from {before:.3g} % on the estimation data to {after:.3g} %|: the model "
         "is overfitted to the estimation data",
@@ -288,13 +294,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         prefix="{run}: ",
     ),
     "sampling_coarse": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
         "the simulation on {run} still depends on the step at the finest grid: the model is too stiff for "
         "this sampling interval, and its output error is provisional",
     ),
     "mode_sampled_coarsely": FindingKind(
-        "step",
+        "sampling",
         LEVEL_FACT,
         "a mode of {frequency:.4g} rad/s has {samples:.2g} samples per period|: its parameters depend on the "
         "inputs between samples; zero- and first-order hold differ there by half a sample ({phase:.0f} "
@@ -312,47 +318,47 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         prefix="{run}: ",
     ),
     "scheme_unstable": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
         "{output}: with {m} pulses the discretization itself is unstable| (margin {margin:.2g}), whether or "
         "not the model is; raise m",
     ),
     # Parameters
     "not_told_apart": FindingKind(
-        "unseen",
+        "not_separable",
         LEVEL_DO_NOT_USE,
         "not separately identifiable from these runs: {parameter}; changed together they leave the outputs unchanged, "
         "so their intervals are infinite; {remedy}",
         "not separately identifiable from the runs: {shown}",
     ),
     "errors_undefined": FindingKind(
-        "unseen",
+        "not_separable",
         LEVEL_DO_NOT_USE,
         "the standard errors of {parameter} are not defined: the covariance of the fit is not finite",
     ),
     "numbers_correlated": FindingKind(
-        "vague", LEVEL_FACT, "barely separately identifiable from these runs: {parameter}| ({why})"
+        "imprecise", LEVEL_FACT, "barely separately identifiable from these runs: {parameter}| ({why})"
     ),
     "order_not_told": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "order {parameter} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
     "input_number_not_told": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "the {words} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
-    "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
+    "on_bound": FindingKind("bound", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
     "coefficient_on_bound": FindingKind(
-        "edge",
+        "bound",
         LEVEL_WITH_CARE,
         "{parameter} = {value:.4g} is on its bound; without the bound the estimate is {outside:.4g}|. {parameter} has "
         "no interval, and the intervals of the other parameters hold for this value",
         "{parameter} = {value:.4g} is on its bound; without the bound the estimate is {outside:.4g}",
     ),
     "genetic_on_bound": FindingKind(
-        "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
+        "bound", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
     ),
     "nonlinear_range": FindingKind(
         "other",
@@ -367,26 +373,26 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "parameters too strongly for a fit, and a fit to the whole run has no intervals; {remedy}",
     ),
     "free_runs_of_some": FindingKind(
-        "search",
+        "order_table",
         LEVEL_FACT,
         "the best {count} of {candidates} candidates by equation error were ranked by simulation: with non-linear "
         "terms no bound excludes the other candidates, so one of them may be better|; narrow the intervals of the "
         "orders, or identify by output error from here",
     ),
     "rows_repeat": FindingKind(
-        "search",
+        "order_table",
         LEVEL_FACT,
         "{rows} rows contain {models} distinct model{plural}: adding a constant to all free orders does not "
         "change an equation from rest; give one order as a number, such as the lowest as 0",
         remedy="give one order as a number, such as the lowest as 0",
     ),
     "ranks_alike": FindingKind(
-        "search",
+        "order_table",
         LEVEL_FACT,
         "ranks 1 to {last}{every} are equal within noise at 99 % ({shown})",
     ),
     "noise_decides": FindingKind(
-        "search",
+        "order_table",
         LEVEL_WITH_CARE,
         "noise decides the ranking: ranks 1 to {last}{every} are equal within noise at 99 % ({shown}), so "
         "these orders are not identifiable from the run",
@@ -400,43 +406,45 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         remedy="use {ask[method is output-error]}",
     ),
     "certified_run_fails": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "the simulation with these orders explains little of the output (NR {nr:.3g}): the certificate "
         "bounds the equation error, not the error of a simulation",
         remedy="use {ask[method is output-error]}",
     ),
     "rank_not_judged": FindingKind(
-        "search",
+        "order_table",
         LEVEL_WITH_CARE,
         "rank 1 could not be validated: {text}",
         "rank 1 could not be validated: {text}",
         "identify at these orders",
     ),
     "on_edge": FindingKind(
-        "edge", LEVEL_WITH_CARE, "order {parameter} = {value:g} is on the edge of its interval|; widen it"
+        "bound", LEVEL_WITH_CARE, "order {parameter} = {value:g} is on the edge of its interval|; widen it"
     ),
     "not_different_from_0": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_FACT,
         "coefficient {parameter} = {value:.4g} does not differ significantly from 0| (standard error {error:.3g})",
     ),
     "interval_open": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "unbounded intervals ({sides}): with all other parameters refitted the cost never rises significantly; "
         "{remedy}",
         "unbounded intervals: {parameter}",
     ),
-    "number_vague": _rule("vague", LEVEL_WITH_CARE, "poorly identifiable from the runs: {shown}"),
+    "number_vague": _rule("imprecise", LEVEL_WITH_CARE, "poorly identifiable from the runs: {shown}"),
     "coefficient_law_broken": FindingKind(
-        "law",
+        "coefficient_law",
         LEVEL_WITH_CARE,
         "coefficient law: {parameter} = {value:.4g}, but the other equation gives {wanted:.4g}|; the equation-error "
         "estimators do not impose the law",
     ),
     "inertia_ratio_broken": FindingKind(
-        "law", LEVEL_WITH_CARE, "coefficient law: the inertia ratio {parameter} must exceed 1, but is {listed}"
+        "coefficient_law",
+        LEVEL_WITH_CARE,
+        "coefficient law: the inertia ratio {parameter} must exceed 1, but is {listed}",
     ),
     "prior_pulls": FindingKind(
         "prior",
@@ -452,12 +460,12 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{share:.2g} of that of a zero output. Raise {ask[prior_covariance]}, or leave it out",
     ),
     "no_standard_errors": _rule(
-        "errors",
+        "no_standard_errors",
         LEVEL_WITH_CARE,
         "{method} gives no standard errors, so the uncertainty of the parameters is unknown",
     ),
     "intervals_rough": FindingKind(
-        "rough",
+        "approximate_intervals",
         LEVEL_FACT,
         "the cost is not quadratic along {parameter}, and a profile likelihood would take long: these intervals "
         "are approximate|; {remedy}",
@@ -496,14 +504,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "every seed has found the optimum",
     ),
     "step_moves_estimate": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
         "at {pulses} pulses per sample the discretization still changes estimates by over a tenth of their "
         "standard errors: the model is too stiff for this sampling interval|; sample faster, or trust its fast poles "
         "less",
     ),
     "step_bias": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
         "with {m} pulses the discretization alone changes coefficient {parameter} by {amount} standard errors, "
         "which do not include it|; {finer}use {ask[method is output-error]}, which refines the discretization",
@@ -573,7 +581,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "run in which it changes",
     ),
     "loop_found": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_WITH_CARE,
         "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
         "loop, or was measured with noise: the noise in {input} biases estimates{effect}, which their intervals do "
@@ -581,14 +589,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{input} depends on past values of {output}: a closed loop, which biases the estimates",
     ),
     "loop_harmless": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
         "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
         "loop, or was measured with noise: output-error estimates are biased{effect}, and equation-error estimates "
         "may be biased more",
     ),
     "moves_within_row": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
         "{output}: residuals are correlated with {input} of the same row only (correlation {value:.2g}): "
         "{input} depends on {output} within a row, or has direct feedthrough to it; then add that term",
@@ -597,7 +605,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "residuals", LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run"
     ),
     "reference_weak": FindingKind(
-        "instrument",
+        "weak_instrument",
         LEVEL_WITH_CARE,
         "{reference} explains little of {input} compared with the noise in it| (F = {f:.2g}, at least {needed:g} is "
         "needed): a weak instrument, with which estimates are biased and their intervals too narrow; excite "
@@ -627,7 +635,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "a mean, {ask[offset is auto]} estimates it",
     ),
     "offset_hidden": _rule(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
         "the offset of {shown} is not separately identifiable from the initial conditions",
     ),
@@ -647,7 +655,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         prefix="{run}: ",
     ),
     "rest_assumed": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
         "{input} is constant from row {row} on, so the state of the plant before the run is unknown|: the "
         "gain assumes that it rested at {shown}; if it was moving, the gain is not determined",
@@ -656,7 +664,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         prefix="{run}: ",
     ),
     "start_not_told": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
         "the initial state is not identifiable|: if the run begins {taken}, the gain of {output} from "
         "{input} is {gain:.4g} ± {error:.2g}; if it begins {other}, it is {other_gain:.4g} ± "
@@ -678,67 +686,67 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         prefix="{run}: ",
     ),
     "looked_like_rest": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_FACT,
         "{run}: the first values look like rest, but the residuals of a fit from rest show nonzero initial "
         "conditions|, which are estimated with the model",
     ),
     "simulated_from_rest": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
         "{run} starts at zero and is simulated from rest, but the residuals decay like the response to inputs before "
         "the start|; give the structure of the model {ask[initial is history]} to estimate it",
     ),
     # Data
     "outliers": FindingKind(
-        "samples",
+        "data",
         LEVEL_FACT,
         "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual deviation, {first}: "
         "{noun}, or events that are not modeled|; they make least squares less precise: {ask[loss is huber]} "
         "reduces their weight",
     ),
     "outliers_dominate": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual deviation and "
         "{holds} {power:.0f} % of the sum of squares, {first}: {noun}, or events that are not modeled|; they make "
         "least squares less precise: {ask[loss is huber]} reduces their weight",
     ),
     "quantised": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "{output} is quantized in steps of {step:.3g} in {run}, and its residuals are {noise:.3g}: rounding "
         "errors, which repeat with the signal and are not noise|; intervals do not include them; use a finer "
         "converter or scale",
     ),
     "times_not_honoured": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "{run}: outputs have sample times of their own, but a free delay, or signals behind a sensor filter, "
         "require a regular grid: outputs were interpolated linearly, and the intervals do not include that "
         "error",
     ),
     "friction_unsigned": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "the velocity of {output} never changes its sign in a run: while it slides, friction is a constant "
         "like the offset, and only phases at rest distinguish them|; add a run that moves both ways, or use "
         "{ask[offset is none]}",
     ),
     "stribeck_slow_untold": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "{output} moves at less than {ratio:g} vs = {speed:.3g} per s in {slow} of {total} intervals: fs and "
         "vs are not identifiable, only fc|; add a run that creeps, or leave the Stribeck term out",
     ),
     "stribeck_fast_untold": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "{output} never moves faster than vs = {speed:.3g} per s: fc and fs are not separately "
         "identifiable|; add a run that slides faster, or leave the Stribeck term out",
     ),
     "rig_stopped": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "the rig stopped the run before its end|: {cause}",
         remedy="record it again without the fault",
@@ -747,98 +755,98 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "data_note": FindingKind("other", LEVEL_NOTE, "{text}", prefix="run {run}: "),
     # Advice on a run
     "twin": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "{other} and {signal} have equal values in every row: one of them is the wrong column",
     ),
     "constant_input": FindingKind(
-        "samples",
+        "data",
         LEVEL_FACT,
         "input {input} is {level} in all {rows} rows: it excites only one transient at the start; record its "
         "command, or a run in which it changes",
     ),
     "constant_output": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} is {level} in all {rows} rows: a dead channel, or the wrong column; check the sensor",
     ),
     "channel_off": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} is exactly {level} from {begin:.4g} s to {end:.4g} s ({rows} rows) and changes from row to "
         "row elsewhere: a channel that was off or was being zeroed|; {after}",
         prefix="run {run}: ",
     ),
     "saturation": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} stays at its {extreme} value {level} for {rows} rows ({share:.2g} %), cut off while moving: "
         "saturated; the true value is not known there: lower the amplitude or widen the range",
     ),
     "saturation_input": FindingKind(
-        "samples",
+        "data",
         LEVEL_FACT,
         "input {input} stays at its {extreme} value {level} for {rows} rows ({share:.2g} %), cut off while moving: "
         "saturated; harmless if this is what the machine received, else record the measured input",
     ),
     "spikes": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} has {count} spike{plural}, first at row {first} ({time:.4g} s), the largest of {height} at "
         "row {worst}: single wrong samples; replace them by the mean of their neighbors",
     ),
     "wrap": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} jumps by {size}{turn} {times} while moving the other way, first at row {first}: an encoder "
         "that wraps; unwrap it (numpy.unwrap) before loading",
     ),
     "one_sine": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "input {input} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it determines "
         "two parameters of an equation; add frequencies (square, PRBS, multisine, chirp), or use this run "
         "for validation",
     ),
     "inputs_collinear": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "inputs {other} and {input} are collinear (correlation {correlation:.4f}): their effects are not "
         "separately identifiable; excite them one after the other, or by different signals",
     ),
     "excitation_short": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "the equation of {output} has {free} free parameters, but {listed} determines {known} in steady "
         "state: the others depend on its transient at the start|; add frequencies to the input, or fix "
         "orders or coefficients",
     ),
     "few_rows": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "the run has {rows} rows: too few for orders and coefficients; record at least {needed}, better thousands",
     ),
     "short": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "output {output} crosses its mean {times} in {duration:.4g} s and is still moving at the end: the run "
         "is shorter than the dominant period; record several times its slowest period",
     ),
     "loop_in_data": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
         "input {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
         "loop, or was measured with noise: equation-error estimates are biased; use the output error, and if "
         "possible a reference that excites the machine well",
     ),
     "loop_not_told": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
         "whether input {input} depends on past values of output {output} is undecided: {reason}; if a "
         "controller generated it, name the reference signal with {ask[reference]}",
     ),
     "drift": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation), which the "
         "inputs do not explain; let the sensor settle, or estimate the trend with the model: {ask[offset is "
@@ -846,28 +854,28 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         remedy="{ask[offset is ramp]} estimates a linear trend with the model",
     ),
     "starts_off_zero": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_FACT,
         "output {output} starts at {level}, not at rest: initial terms will be estimated; if this is only a sensor "
         "offset, subtract it, and start the run before the input moves",
     ),
     "signal_constant": FindingKind(
-        "samples", LEVEL_FACT, "{signal} is constant ({level:g}): a dead channel, or nothing happened"
+        "data", LEVEL_FACT, "{signal} is constant ({level:g}): a dead channel, or nothing happened"
     ),
     "signal_in_motion": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_FACT,
         "{output} does not start at rest (first value {level:.4g}): initial terms will be estimated",
     ),
     # Validation
     "validates_itself": FindingKind(
-        "same",
+        "repeated_run",
         LEVEL_FACT,
         "its outputs are those of {other}, from which the model was identified, so it does not validate the model",
         prefix="{run}: ",
     ),
     "run_of_its_own": FindingKind(
-        "same",
+        "repeated_run",
         LEVEL_FACT,
         "it has the name of a run from which the model was identified",
         prefix="{run}: ",
@@ -893,7 +901,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "earlier_sentence": FindingKind("other", LEVEL_NOTE, "{text}"),
     # Frequency responses
     "response_missed": _rule(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "the residuals are {rms:.3g} % of {output} from {input} ({run})",
         "add a term, a delay or a free order",
@@ -905,7 +913,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "measure a wider band, bound the coefficient that makes it unstable, or use fewer terms",
     ),
     "response_lost": _rule(
-        "lost",
+        "validation_loss",
         LEVEL_WITH_CARE,
         "the residuals are {own:.3g} % of the estimation data and {rms:.3g} % of {run}",
         "use fewer free parameters, or both records in one fit",
@@ -932,15 +940,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "add an element or a term, and compare the errors",
     ),
     "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit has not converged"),
-    "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "a parameter is on its bound: {bound}"),
+    "response_on_bound": _rule("bound", LEVEL_WITH_CARE, "a parameter is on its bound: {bound}"),
     "response_not_told_apart": FindingKind(
-        "unseen",
+        "not_separable",
         LEVEL_DO_NOT_USE,
         "not separately identifiable from the data: {parameter}; leave a term out, or fix one of them",
         "not separately identifiable from the data: {parameter}",
     ),
     "response_number_vague": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}; fix it, or leave it out",
         "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}",
@@ -953,12 +961,12 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "cross-validation; .best is that optimum",
     ),
     "none_is_the_machine": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "the best candidate predicts validation data with {fit} %: no candidate describes the machine",
     ),
     "worse_than_mean": FindingKind(
-        "lost",
+        "validation_loss",
         LEVEL_WITH_CARE,
         "the chosen structure predicts worse than the mean of the validation data on {parts}",
     ),
@@ -980,7 +988,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "whether fractional orders improve the prediction ({parameter}) is undecided: {reason}",
     ),
     "not_told_by_part": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_FACT,
         "{parameter}: not identifiable from some part, so it agrees with every value of the others",
     ),

@@ -319,7 +319,7 @@ class ProfileLikelihood:
         return self._minimize(i, values, 1, REFIT_TOLERANCE)
 
     def _minimize(self, i: int, values: Floats, evaluations: int, tolerance: float) -> Iterate:
-        return self.grid.minimize(_attempt(self.grid, values), evaluations, plain=True, held=i, tolerance=tolerance)
+        return self.grid.minimize(_attempt(self.grid, values), evaluations, plain=True, fixed=i, tolerance=tolerance)
 
 
 #: A search for an end: it yields the free runs it took, is sent how many it may have taken, and returns the end.

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.structure.circuit import impedance_with_slopes
+from ftlm.structure.circuit import impedance_and_derivatives
 
 F = np.geomspace(1e5, 5e-3, 70)
 W = 2 * np.pi * F
@@ -95,7 +95,7 @@ def test_impedance_and_its_slopes_are_those_of_the_formulas(text):
     circuit = ftlm.Circuit(text)
     known = circuit.with_values(dict(zip(circuit.names, true, strict=True)))
     assert known.impedance(W) == pytest.approx(formula(*true), rel=1e-12)
-    _, slopes = impedance_with_slopes(known, W, {})
+    _, slopes = impedance_and_derivatives(known, W, {})
     for k, name in enumerate(circuit.names):
         ends = []
         for step in (1e-6, -1e-6):

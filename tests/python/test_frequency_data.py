@@ -92,7 +92,7 @@ def test_slopes_are_those_of_differences(name):
     seconds = 1.1 * np.array([truth[n.replace("delay_i", "delay_u")] for n in problem.names])
     values = problem.in_problem_units(seconds)
     _, slopes = problem.residuals(values)
-    own = problem.slopes_in_seconds(values, slopes)
+    own = problem.jacobian_in_seconds(values, slopes)
     np.testing.assert_allclose(problem.in_seconds(values), seconds, rtol=1e-12)
     for k, at in enumerate(seconds):
         step = 1e-6 * max(abs(at), 1e-3)
@@ -100,7 +100,7 @@ def test_slopes_are_those_of_differences(name):
         for side in (step, -step):
             moved = seconds.copy()
             moved[k] += side
-            ends.append(problem.residuals(problem.in_problem_units(moved), slopes=False)[0])
+            ends.append(problem.residuals(problem.in_problem_units(moved), jacobian=False)[0])
         naive = (ends[0] - ends[1]) / (2 * step)
         assert np.max(np.abs(own[:, k] - naive)) < 1e-5 * np.max(np.abs(naive)), problem.names[k]
 
@@ -518,7 +518,7 @@ def test_the_command_says_what_python_says(tmp_path):
     for words, code, text in (
         (["--structure", ARC, "--weights", "deviation"], 3, "states no standard deviation; use --weights relative"),
         (["--structure", "arm:1"], 2, "a frequency response takes an equation in words"),
-        (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is no part"),
+        (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is not part"),
         (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is asked for"),
         (["--structure", ARC, "--start", "alfa=1"], 2, "did you mean alpha?"),
         (["--equation", ARC], 2, "--structure takes equations in words, too"),

@@ -236,7 +236,7 @@ def test_words_are_read_and_written() -> None:
     ("words", "said"),
     [
         ("D^2 y = u + fc*sign(D y)", "it is subtracted"),
-        ("D^2 y = u - fc*sign(D u)", "own output"),
+        ("D^2 y = u - fc*sign(D u)", "velocity of the output of the equation"),
         ("D^2 y = u - fc*sign(y)", "of a measured speed .*fc.tanh"),
         ("D^2 y = u - fc*sign(D y) - fs*sign(D y)", "twice"),
         ("D^0.8 y = u - fc*sign(D y)", r"outside \(1, 2\]"),

@@ -333,8 +333,8 @@ def test_a_prior_that_pulls_is_named(small_run, structure):
     found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=0.01))
     (warning,) = (w for w in found.warnings if "the prior" in w)
     assert "y: the prior (K0 = 0.01, coefficients near 0) shifts a coefficient by" in warning
-    assert "Raise prior_covariance or use method='least-squares'" in warning
-    assert "p = 7 only weighs the data against it" in warning
+    assert "Raise prior_covariance=, or use method='least-squares'" in warning
+    assert "p = 7 only sets the weight of the data relative to the prior" in warning
     weak = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=1e6))
     assert not any("the prior" in w for w in weak.warnings)
     # As weak as numbers go.

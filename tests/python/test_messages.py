@@ -406,7 +406,7 @@ def functions_behind():
     from ftlm.analysis.conversion import export_text
     from ftlm.app.server import serve
     from ftlm.estimation.linear import Streaming
-    from ftlm.reproduction.cross_validation import orders_on_unseen_runs
+    from ftlm.reproduction.cross_validation import cross_validate_orders
     from ftlm.reproduction.demo import run_demo
 
     reading = (ftlm.load, ftlm.open_file, ftlm.Layout)
@@ -438,7 +438,7 @@ def functions_behind():
         "design-input": (*reading, ftlm.design_input),
         "demo": (run_demo,),
         "reproduce": (*reading, ftlm.reproduce, ftlm.GeneticAlgorithm),
-        "orders": (*reading, orders_on_unseen_runs),
+        "orders": (*reading, cross_validate_orders),
         "app": (serve,),
     }
 

@@ -9,13 +9,13 @@ import pytest
 import ftlm
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction
 from ftlm.reproduction.cross_validation import (
+    cross_validate_orders,
+    cross_validation_page,
+    cross_validation_text,
     link_structure,
-    orders_on_unseen_runs,
-    places_table,
-    sentence,
+    rate_effect_table,
     stages_in,
-    unseen_page,
-    unseen_text,
+    verdict_sentence,
 )
 from test_cli import ftlm_command
 
@@ -52,14 +52,14 @@ def link_run(order: float, damping: float, seed: int, name: str) -> ftlm.Run:
 def fractional():
     """Two runs of a link whose damping has order 0.4."""
     runs = [link_run(0.4, 8.0, seed, name) for seed, name in ((1, "first"), (2, "second"))]
-    return orders_on_unseen_runs(runs, filtered=False, threads=1)
+    return cross_validate_orders(runs, filtered=False, threads=1)
 
 
 @pytest.fixture(scope="module")
 def whole():
     """Two runs of a link whose orders are whole."""
     runs = [link_run(1.0, 1.0, seed, name) for seed, name in ((1, "first"), (2, "second"))]
-    return orders_on_unseen_runs(runs, filtered=False, threads=1)
+    return cross_validate_orders(runs, filtered=False, threads=1)
 
 
 SURE, OTHER, WIDE = (0.2, 0.4), (0.6, 0.8), (-0.2, 0.4)
@@ -98,7 +98,7 @@ def test_a_fractional_damping_earns_its_place_where_the_link_has_one(fractional)
     assert min(link.gains("fractional damping").values()) > 2 * MIN_FIT_GAIN
     for low, high in link.intervals("fractional damping")["mu2"].values():
         assert low < 0.4 < high
-    assert sentence("theta12", link.verdict("fractional damping")) == (
+    assert verdict_sentence("theta12", link.verdict("fractional damping")) == (
         "θ₁₂: a fractional order of the damping earns its place."
     )
 
@@ -151,7 +151,7 @@ def test_a_fit_that_failed_cannot_be_told(fractional):
     assert "second → first" in verdict.words
     assert "no fit" in verdict.words
     assert broken.verdict("both fractional").earns is True
-    assert sentence("theta12", verdict).endswith("cannot be told.")
+    assert verdict_sentence("theta12", verdict).endswith("cannot be told.")
 
 
 def test_a_fit_that_is_worse_than_what_it_contains_tells_nothing(fractional):
@@ -170,7 +170,7 @@ def test_a_fit_that_is_worse_than_what_it_contains_tells_nothing(fractional):
 
 
 def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
-    page = unseen_page(fractional, tmp_path / "orders.html")
+    page = cross_validation_page(fractional, tmp_path / "orders.html")
     text = page.read_text()
     first = text[text.index('id="section-1"') : text.index('id="section-2"')]
     assert "fractional orders earn their place." in first
@@ -181,11 +181,11 @@ def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
         assert f"{kind[1:]} {link.fits[kind]['first'].fit('second'):.1f} %" in first
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert page.stat().st_size < 1_000_000
-    assert unseen_page(fractional, tmp_path / "again.html").read_bytes() == page.read_bytes()
+    assert cross_validation_page(fractional, tmp_path / "again.html").read_bytes() == page.read_bytes()
     with pytest.raises(ftlm.DataError, match="exists"):
-        unseen_page(fractional, page)
+        cross_validation_page(fractional, page)
     json.dumps(fractional.to_dict(), allow_nan=False)
-    assert "first → second" in unseen_text(fractional)
+    assert "first → second" in cross_validation_text(fractional)
 
 
 def test_a_page_without_a_fit_says_so(fractional, tmp_path):
@@ -194,11 +194,11 @@ def test_a_page_without_a_fit_says_so(fractional, tmp_path):
     del lacking["both fractional"]["first"]
     broken = replace(link, fits=lacking, failed={("both fractional", "first"): "no start was found"})
     found = replace(fractional, deflections={"theta12": broken})
-    text = unseen_page(found, tmp_path / "orders.html").read_text()
+    text = cross_validation_page(found, tmp_path / "orders.html").read_text()
     assert "both fractional: no fit" in text
     assert "no start was found" in text
     assert "cannot be told." in text
-    assert "no fit" in unseen_text(found)
+    assert "no fit" in cross_validation_text(found)
 
 
 def test_both_stages_push_on_each_other():
@@ -223,24 +223,24 @@ def test_the_rate_of_the_other_deflection_stands_where_it_was_measured():
 def test_places_are_told_before_and_after_the_rate(fractional, tmp_path):
     # As if the rate had taken the order's place: what is fractional without it gains nothing beside it.
     link = fractional.deflections["theta12"]
-    assert places_table(fractional) is None
+    assert rate_effect_table(fractional) is None
     idle = {
         run: replace(each, comparisons=link.fits["whole orders"][run].comparisons)
         for run, each in link.fits["fractional damping"].items()
     }
-    after = replace(link, fits={**link.fits, "fractional damping": idle}, before=link)
+    after = replace(link, fits={**link.fits, "fractional damping": idle}, without_rate=link)
     found = replace(fractional, deflections={"theta12": after})
-    table = places_table(found)
+    table = rate_effect_table(found)
     assert [row[0] for row in table.rows] == ["fractional elasticity", "fractional damping", "both fractional"]
     assert list(table.rows[1][1:]) == ["yes", "no"]
     assert list(table.rows[2][1:]) == ["yes", "yes"]
-    page = unseen_page(found, tmp_path / "orders.html").read_text()
+    page = cross_validation_page(found, tmp_path / "orders.html").read_text()
     assert "Does the order earn its place?" in page
     assert page.count("θ₁₂, without the rate of the other deflection") >= 2
     said = found.to_dict()["deflections"]["theta12"]
     assert said["without_rate"] == fractional.to_dict()["deflections"]["theta12"]
     assert [s["verdicts"]["fractional damping"]["earns"] for s in (said["without_rate"], said)] == [True, False]
-    text = unseen_text(found)
+    text = cross_validation_text(found)
     told = text[text.index("θ₁₂, without the rate of the other deflection:") :]
     assert "θ₁₂: a fractional order of the damping earns its place." in told
     assert "θ₁₂: a fractional order of the damping does not earn its place." not in told
@@ -252,9 +252,9 @@ def test_stages_are_those_that_all_runs_have(fractional):
     with pytest.raises(ftlm.DataError, match="no stage of the arm has both of its angles in all runs"):
         stages_in([run, run.select(["theta12"])])
     with pytest.raises(ftlm.DataError, match="give two or more"):
-        orders_on_unseen_runs([run])
+        cross_validate_orders([run])
     with pytest.raises(ftlm.DataError, match="names of their own"):
-        orders_on_unseen_runs([run, run])
+        cross_validate_orders([run, run])
 
 
 @pytest.mark.parametrize(

@@ -347,7 +347,7 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     structure = found.task.structure
     short = ftlm.identify(bent, structure)
     assert "c" not in short.profiles
-    (said,) = [w for w in short.warnings if "its profile would take long" in w]
+    (said,) = [w for w in short.warnings if "a profile likelihood would take long" in w]
     assert "along c" in said
     assert "intervals='profile'" in said
     half = 1.959963984540054 * short.standard_errors["c"]

@@ -580,7 +580,7 @@ def test_the_command(tmp_path):
     first = ["--structure", "D y = a y + b u"]
     asked = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", "runs"])
     assert asked.exit_code == 2
-    assert "--validation runs leaves one run out at a time, and there is one" in asked.output
+    assert "--validation runs leaves one run out at a time, but there is only one" in asked.output
     assert "or use --validation blocks" in asked.output
     by_file = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", files[1]])
     assert by_file.exit_code == 0, by_file.output

@@ -257,11 +257,11 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
     def ask(kept, what):
         if what == "a fit":
             return kept.fit(FIRST, [], True, lambda: joint)
-        if what == "a judgement":
+        if what == "a validation":
             return kept.validation("first", FIRST, joint, False, lambda: trial.Trial("first", FIRST, 2, failed="x"))
         return kept.subsets(FIRST, list)
 
-    questions, answers = ("a fit", "a judgement", "subsets"), {}
+    questions, answers = ("a fit", "a validation", "subsets"), {}
     for what in questions:
         with Store(tmp_path / f"{what}.ftlm", request) as kept:
             ask(kept, what)
@@ -274,7 +274,7 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
             place = _forged(tmp_path / f"{what} {held}.ftlm", request, RECORD_ENCODER.encode(StoredAnswer(key, answer)))
             with (
                 Store(place, request) as kept,
-                pytest.raises(ftlm.DataError, match=f"holds {held} where {what} was asked for; choose another file"),
+                pytest.raises(ftlm.DataError, match=f"holds {held} where {what} is expected; choose another file"),
             ):
                 ask(kept, what)
 

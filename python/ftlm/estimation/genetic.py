@@ -485,8 +485,9 @@ class GeneticAlgorithm:
     population
         Candidates of one generation, at least 8.
     bounds
-        (low, high) of coefficients by name. By default ±2 times the value that the maker states, or else ±4 times the
-        coefficient with which its term alone would be as large as the output, at the middle of the orders' intervals.
+        (low, high) of coefficients by name. By default ±2 times the value that the manufacturer states. Without one, ±4
+        times the coefficient with which its term alone would be as large as the output, at the middle of the intervals
+        of the orders.
 
     Raises
     ------

@@ -201,7 +201,7 @@ class JointFit:
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
     @property
-    def choice(self) -> str:
+    def origin_text(self) -> str:
         """Description of the initial guess that led to this optimum, and of the cost of the next optimum."""
         if not self.starts:
             return f"from {self.origin}"
@@ -294,13 +294,13 @@ def fit_output_error(
     loss: Loss = "squares",
     known: Sequence[Mapping[str, float]] = (),
     near: JointFit | None = None,
-    raced: _core.JointMultistart | None = None,
+    multistart: _core.JointMultistart | None = None,
 ) -> JointFit:
     """Fit all equations of a structure to all runs by output error, with automatic initialization.
 
     A coefficient law of the structure is imposed, and its initial terms must be decided. `start` gives values of all
     free parameters by name and replaces the automatic initial guesses; `known` adds to them. `near` is a fit of the
-    same structure to nearly the same runs, whose grid and weights are reused. `raced` is the result of an earlier
+    same structure to nearly the same runs, whose grid and weights are reused. `multistart` is the result of an earlier
     multistart. Without `refine` the grid is not refined below the samples. Progress is called with (parts done, total
     parts). The loss ranks optima on all samples, but not the initial guesses.
 
@@ -327,7 +327,7 @@ def fit_output_error(
         [[v[n] for n in problem.names] for v in known],
         None if start is None else [start[n] for n in problem.names],
         given_near,
-        raced,
+        multistart,
         loss == "huber",
         refine,
         (threads, memory_limit()),

@@ -210,7 +210,7 @@ class Section:
             self.table = frame
             return
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
+            raise ModelError(f"rounds {frame.first} to {frame.last} are not a valid range")
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.frames[self._firsts[place - 1]].last > frame.first:
             raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")

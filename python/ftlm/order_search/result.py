@@ -324,7 +324,7 @@ class SearchResult:
         lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.excluded_summary}")
         if self.verdict is not None:
             lines.append(f"rank 1: {self.verdict}")
-        of_table = [f for f in self.findings if f.kind.topic == "search"]
+        of_table = [f for f in self.findings if f.kind.topic == "order_table"]
         of_model = [f for f in self.findings if f.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) and f not in of_table]
         lines += [f"! {g.first_finding}{g.count}" for g in group_findings(of_model)] + [f"! {f}" for f in of_table]
         return "\n".join([*lines, f"next: {self.next_step}"])

@@ -774,7 +774,7 @@ def _model_and_data(
     if not isinstance(result, (FrequencyIdentification, Model)):
         raise ModelError(f"result is {type(result).__name__}; give what identify_frequency returns, or a model")
     if isinstance(result, FrequencyIdentification):
-        model, records = result.source, list(result.data)
+        model, records = result.system, list(result.data)
     else:
         model, records = result, []
     if isinstance(data, FrequencyValidation):

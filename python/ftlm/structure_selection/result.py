@@ -162,14 +162,14 @@ class Selection(ReportMixin):
             if trial.parameters not in best or trial.score < best[trial.parameters].score:
                 best[trial.parameters] = trial
         along = sorted(best)
-        seen, unseen = (
+        seen, validation_data = (
             [best[n].estimation_fit for n in along],
             [max(best[n].validation_fit, MIN_FIT_PERCENT) for n in along],
         )
-        chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, unseen, strict=True)]
+        chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, validation_data, strict=True)]
         return line_chart(
             [float(n) for n in along],
-            [("estimation", seen), ("validation", unseen), ("chosen", chosen)],
+            [("estimation", seen), ("validation", validation_data), ("chosen", chosen)],
             title="Fit by number of parameters",
             x_label="estimated parameters",
             y_label="fit in %",

@@ -366,7 +366,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
     for part in choice.parts or (choice,):
         findings += _fractional_order_findings(part.winner, part.ranked, found)
-    unseen = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
+    validation_data = [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in folds.runs)]
     return Selection(
         choice.ranked,
         choice.ranked.index(winner),
@@ -375,7 +375,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         choice.reason,
         work.done_count,
         tuple(findings),
-        None if not unseen else found.validate(unseen),
+        None if not validation_data else found.validate(validation_data),
     )
 
 

@@ -105,7 +105,7 @@ def _draw_plane(
 def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
     """Points of complex values [px]; far outside of the plot it no longer matters where."""
     found = np.asarray(values, dtype=np.complex128)
-    xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.across(found.real), plot.down(found.imag)))
+    xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(found.real), plot.y_pixels(found.imag)))
     return list(zip(xs, ys, strict=True))
 
 

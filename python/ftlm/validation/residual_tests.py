@@ -161,7 +161,7 @@ class OutputResiduals:
         return tuple(name for name, test in self.feedback_tests.items() if test.has_feedback)
 
     @property
-    def fails_colored(self) -> bool:
+    def has_colored_correlation(self) -> bool:
         """Whether the residuals are finite, not white, and correlated with an input."""
         return math.isfinite(self.rms) and not self.whiteness.passed and any(t.failed for t in self.inputs.values())
 
@@ -397,7 +397,7 @@ def run_residual_tests(
             row = model.outputs.index(name)
             moves = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
             outputs[name] = _test_direction(outputs[name], name, moves, lags, item.order.constant)
-        if sensitivities is not None and outputs[name].fails_colored:
+        if sensitivities is not None and outputs[name].has_colored_correlation:
             outputs[name] = _test_beyond_parameters(outputs[name], sensitivities().get(name, []), signals, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)

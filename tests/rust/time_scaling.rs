@@ -1,4 +1,4 @@
-//! Numbers in the unit of the runs' own: every product before a term is the power of time that its orders make it.
+//! Time scaling: every product before a term is the power of the time unit that its orders imply.
 
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::estimation::joint_fit::{Problem, TimeScaling};

@@ -42,7 +42,7 @@ fn measured(model: &Equation, m: usize, initial: &[(f64, f64)], noise: f64, seed
 fn with_clean(record: &Record, output: usize, inputs: &[usize]) -> Record {
     let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
     signals[output] = project(record, output, inputs, true).unwrap();
-    record.clone().with_clean(PulseMeans::from_rows(signals)).unwrap()
+    record.clone().with_clean(PulseMeans::from_signals(signals)).unwrap()
 }
 
 fn run(records: &[Record], model: &Equation, fixed: &[Option<f64>], initial: &Initial) -> Vec<f64> {

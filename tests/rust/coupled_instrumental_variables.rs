@@ -1,4 +1,4 @@
-//! Instrumental variables of coupled equations: one step against dense algebra, where they stand still, their spread.
+//! Instrumental variables of coupled equations: one step against dense algebra, fixed points, covariance.
 
 use ftlm::equation::{Equation, Initial};
 use ftlm::estimation::instrumental_variables::coupled::CoupledProblem;

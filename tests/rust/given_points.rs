@@ -1,4 +1,4 @@
-//! Candidates given as points: against the naive division, early leaving, threads, and orders that make no equation.
+//! Candidates given as points: against the naive division, early termination, threads, and invalid orders.
 
 use ftlm::order_search::control::Control;
 use ftlm::order_search::given_points::{score_naive, Point, Points};

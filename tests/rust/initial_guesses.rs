@@ -1,4 +1,4 @@
-//! Where joint fits start: frequencies against sums, lattices against brute force, delays and limits, refusals.
+//! Initial guesses of joint fits: frequencies against sums, grids against brute force, delays and limits, errors.
 
 use std::f64::consts::PI;
 
@@ -33,7 +33,7 @@ fn plant() -> Recording {
     let terms = vec![term(0, NU), term(0, 0.0), term(1, 0.0)];
     let known = equation::Structure { output: 0, order: ALPHA, terms };
     let truth = equation::Equation::new(known, vec![-3.0, -20.0, 5.0]).unwrap();
-    let rest = Record::new(STEP, PulseMeans::from_rows(vec![vec![0.0; 800], input.clone()]), None).unwrap();
+    let rest = Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; 800], input.clone()]), None).unwrap();
     let mut y = point_samples(&respond(&[truth], &rest, &[]).unwrap()[0]);
     let size = 0.01 * deviation(&y);
     y.iter_mut().for_each(|v| *v += size * random.normal());

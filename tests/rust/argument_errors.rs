@@ -1,4 +1,4 @@
-//! What would panic, hang or exhaust memory later is refused at the door, in words.
+//! Arguments that would cause a panic, a hang or exhausted memory return an error at once.
 
 use ftlm::equation::{tidy, AffineOrder, Equation, Filter, Initial, Structure, Term};
 use ftlm::error::{check_dense, check_points, Error, MOST_POINTS};

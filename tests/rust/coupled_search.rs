@@ -1,4 +1,4 @@
-//! Order searches over a stage under its order law: the law's lattice, and the joined tables against enumeration.
+//! Order searches over a stage under its order law: the grid of the law, and the joined tables against enumeration.
 
 use std::collections::HashSet;
 use std::sync::atomic::Ordering;

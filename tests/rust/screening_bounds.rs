@@ -1,4 +1,4 @@
-//! Proofs that candidates cannot win: none reaches beyond the score itself, and none changes a table.
+//! Screening bounds of candidates: none exceeds the score itself, and none changes a table.
 
 use ftlm::equation::{Equation, Initial};
 use ftlm::order_search::batches::search;

@@ -1,4 +1,4 @@
-"""Calls of functions of Python that the extension does not judge, each with one or two bad values among sound ones.
+"""Calls of Python functions whose arguments the extension does not check, each with one or two bad values.
 
 Shapers, designs of controllers and observers, planned moves, files of controllers, what runs them, and a rig's loop; a
 fit takes seconds and is not called here.
@@ -10,7 +10,7 @@ import tempfile
 import warnings
 from pathlib import Path
 
-import hostile
+import extension_calls
 import numpy as np
 
 import ftlm
@@ -99,7 +99,7 @@ def ran_from(content):
     """Reads a controller from a file of this content, and runs it."""
     try:
         text = json.dumps(content).encode()
-    except (TypeError, ValueError, hostile.OursError) as error:
+    except (TypeError, ValueError, extension_calls.OursError) as error:
         raise Unwritable("no JSON") from error
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "c.json"
@@ -217,7 +217,7 @@ def bad(value, r):
     """Something else than this."""
     if r.random() < 0.5 or (isinstance(value, np.ndarray) and (value.ndim == 0 or value.dtype.kind == "O")):
         return r.choice(ODD)
-    return hostile.hostile(value, r, large=False)
+    return extension_calls.hostile(value, r, large=False)
 
 
 def late(*_):
@@ -236,7 +236,7 @@ def outcome(function, given):
         words = str(error)
         if isinstance(error, ftlm.InternalError) or not words or len(words) > LONGEST:
             return f"{type(error).__name__}: {words[:300]}"
-    except hostile.OursError:
+    except extension_calls.OursError:
         pass
     except Exception as error:
         return f"{type(error).__name__}: {str(error)[:300]}"
@@ -252,9 +252,9 @@ def calls(r, count, only=()):
     for _ in range(count):
         name = r.choice(list(only or known))
         function, given = known[name]
-        for _ in range(2 if r.random() < hostile.TWICE else 1):
-            at = r.choice(list(hostile.places(given)))
-            given = hostile.exchanged(given, at, lambda value: bad(value, r))
+        for _ in range(2 if r.random() < extension_calls.TWICE else 1):
+            at = r.choice(list(extension_calls.places(given)))
+            given = extension_calls.exchanged(given, at, lambda value: bad(value, r))
         told = outcome(function, given)
         yield name, None if told is None else f"{told}: {shown_all(given)}"
 

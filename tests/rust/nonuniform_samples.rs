@@ -1,4 +1,4 @@
-//! Pulse means to readings at times of their own, with the corners that jumps of held signals leave.
+//! Samples at nonuniform times from pulse means, with the corners that jumps of held signals leave.
 
 use ftlm::error::Error;
 use ftlm::fractional::kernels::block_pulse_kernel;

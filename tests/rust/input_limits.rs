@@ -86,9 +86,9 @@ fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
     let structure = Structure { output: 0, order: 1.8, terms };
     let body = friction::Body::single(Equation { structure, coefficients: vec![-1.0, 1.5] }, FrictionLaw::coulomb(f));
-    let record = Record::new(STEP, PulseMeans::from_rows(vec![vec![0.0; M], acting(&u, law, limit)]), None)?;
+    let record = Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; M], acting(&u, law, limit)]), None)?;
     let output = body.run(&record, &[vec![]])?.outputs.swap_remove(0);
-    let record = Record::new(STEP, PulseMeans::from_rows(vec![output.clone(), u]), None)?;
+    let record = Record::new(STEP, PulseMeans::from_signals(vec![output.clone(), u]), None)?;
     Experiment::new(record, 1, vec![point_samples(&output)], vec![1.0])
 }
 

@@ -1,4 +1,4 @@
-//! What searches refuse at the door, in words, instead of a panic, a hang or a wrong table later.
+//! Invalid arguments of searches return an error instead of a panic, a hang or a wrong table.
 
 use std::borrow::Cow;
 
@@ -23,7 +23,7 @@ fn axis(signal: usize, values: &[f64]) -> TermAxis {
 
 fn data() -> Record {
     let mut random = Random::new(5);
-    Record::new(0.1, PulseMeans::from_rows(vec![random.signal(64), random.signal(64)]), None).unwrap()
+    Record::new(0.1, PulseMeans::from_signals(vec![random.signal(64), random.signal(64)]), None).unwrap()
 }
 
 fn small() -> OrderGrid {
@@ -132,7 +132,7 @@ fn searches_refuse_records_without_their_signals() {
     let mut index = Index::default();
     index.insert(Key::integral(2, 0.5));
     assert!(matches!(Bank::new(&index, &data(), 0).err(), Some(Error::Structure { .. })));
-    let found = Record::new(0.1, PulseMeans::from_rows(vec![vec![1.0; 2]]), Some(vec![1.0, f64::NAN]));
+    let found = Record::new(0.1, PulseMeans::from_signals(vec![vec![1.0; 2]]), Some(vec![1.0, f64::NAN]));
     assert!(matches!(found, Err(Error::NotFinite { index: 1, .. })));
 }
 

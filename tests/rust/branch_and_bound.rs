@@ -1,4 +1,4 @@
-//! Boxes of orders: no box's bound exceeds a score of its candidates, and boxes change no table.
+//! Branch and bound: no bound of a box exceeds a score of its candidates, and boxes change no table.
 
 use ftlm::equation::Equation;
 use ftlm::estimation::multi_innovation::{Innovation, Prior, RowBasis};
