@@ -239,7 +239,7 @@ BAD = [
     (("identify", "square.csv", *SEARCH, "-o", "."), 3, ". is a folder; name a file in it"),
     (("search", "square.csv", "--structure", "D^1.5 y = a0 y + b0 u"), 2, "nothing to search"),
     (("compare", "none.json", "square.csv"), 3, "none.json"),
-    (("compare", "square.csv", "square.csv"), 3, "no ftlm model"),
+    (("compare", "square.csv", "square.csv"), 3, "not an ftlm model"),
     (("simulate", "none.json", "square.csv", "-o", "x.csv"), 3, "none.json"),
     (("simulate", "none.json", "square.csv"), 2, "Missing"),
     (("demo", "-o", "square.csv"), 3, "square.csv"),

@@ -118,8 +118,8 @@ def broken_files():
         "direct": 0.0,
         "lags": [],
     }
-    yield b"", "no ftlm controller"
-    yield b"[" * 100_000, "no ftlm controller"
+    yield b"", "not an ftlm controller"
+    yield b"[" * 100_000, "not an ftlm controller"
     yield json.dumps(good).encode(), "missing required field"
     yield json.dumps(good | {"controller": pid | {"kp": "1"}}).encode(), "Expected `float`"
     yield json.dumps(good | {"controller": pid | {"type": "bang"}}).encode(), "Invalid value 'bang'"

@@ -193,8 +193,6 @@ def issubclass_of_error(value: object) -> bool:
 
 
 def test_the_reference_names_every_public_name() -> None:
-    import ftlm
-
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     for name in ftlm.__all__:
         value = getattr(ftlm, name)

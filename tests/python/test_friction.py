@@ -250,7 +250,7 @@ def test_words_that_mean_nothing_are_refused(words: str, said: str) -> None:
 
 
 def test_a_negative_coefficient_is_refused() -> None:
-    with pytest.raises(ModelError, match="not negative"):
+    with pytest.raises(ModelError, match="at least 0"):
         model_of(BLOCK, fc=-0.1)
 
 

@@ -746,7 +746,7 @@ def test_a_pole_map_has_every_pole_and_its_sector():
     with pytest.raises(ftlm.errors.DataError, match="point 1 of 2 is not finite"):
         plane_chart([1j, complex("nan")], title="t", x_label="x", y_label="y")
     for bad in (0.0, 4.0, -1.0):
-        with pytest.raises(ftlm.errors.DataError, match="no angle"):
+        with pytest.raises(ftlm.errors.DataError, match="not an angle"):
             plane_chart([1j], title="t", x_label="x", y_label="y", sector=bad)
 
 

@@ -236,7 +236,7 @@ def test_words_that_mean_nothing_are_refused(words: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"fs": -0.1}, "not negative"),
+        ({"fs": -0.1}, "at least 0"),
         ({"vs": 0.0}, "positive"),
         ({"vs": -1.0}, "positive"),
         ({"vs": np.nan}, "finite"),

@@ -132,7 +132,7 @@ def select_structure(
             validation=validation,
             delay=ranges("--delay", shape.delay) if automatic else None,
             threads=threads,
-            # How many candidates come up turns with what earns its place.
+            # The number of candidates depends on which terms improve the prediction.
             progress=progress if listed else progress.so_far,
             store=store,
         )
