@@ -537,7 +537,7 @@ class Candidates:
         """Return the coefficients of so many order tuples; raise for another shape."""
         if coefficients.shape != (count, len(self._terms)):
             raise DataError(
-                f"coefficients has shape {coefficients.shape}; give ({count}, {len(self._terms)}), one row a tuple"
+                f"coefficients has shape {coefficients.shape}; give ({count}, {len(self._terms)}), one row per tuple"
             )
         return coefficients
 
@@ -703,7 +703,7 @@ class Recursion:
         """
         table = _finite("samples", samples)
         if table.ndim != 2 or table.shape[1] != self._count:
-            raise DataError(f"samples has shape {table.shape}; give (n, {self._count}), one column a signal")
+            raise DataError(f"samples has shape {table.shape}; give (n, {self._count}), one column per signal")
         return self._core.push(table)
 
     @property

@@ -146,7 +146,7 @@ def test_any_known_parameter_gives_the_same_arm(fitted: ftlm.Identification) -> 
     [
         ({}, "one per stage must be known"),
         ({"J11": 1.0}, "'J11' is not a physical parameter"),
-        ({"J_11": 1.0, "K_s1": 2.0}, "one too many"),
+        ({"J_11": 1.0, "K_s1": 2.0}, "only one may be known"),
         ({"J_11": -1.0}, "is not positive"),
         ({"J_11": float("nan")}, "J_11"),
         ({"J_21": 1.0}, "coefficient a3 is not in the fit"),

@@ -587,7 +587,7 @@ def test_the_command(tmp_path):
     assert "1, not fitted to" in by_file.output
     wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--orders", "alpha=1"])
     assert wrong.exit_code == 2
-    assert "--orders: of a structure that is given, not used with --structure auto" in wrong.output
+    assert "--orders: options of a given structure, not used with --structure auto" in wrong.output
 
 
 def test_a_fit_below_all_measure_keeps_its_column():

@@ -564,7 +564,7 @@ def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage
         for call in (ftlm.resume_search, ftlm.search_status):
             with pytest.raises(ftlm.DataError, match="its table is of another search"):
                 call(forged)
-    with Store(path) as kept, pytest.raises(ModelError, match="a table stands where none belongs"):
+    with Store(path) as kept, pytest.raises(ModelError, match="it has an unexpected final table"):
         kept.contents.sections[0].add_frame(CoupledTable(**held))
 
 
@@ -632,7 +632,7 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
         with pytest.raises(ftlm.DataError, match="are not those of"):
             call(path)
     path = tmp_path / "kinds.ftlm"
-    with Store(path, [job.request("stage")]) as kept, pytest.raises(ModelError, match="other verdicts"):
+    with Store(path, [job.request("stage")]) as kept, pytest.raises(ModelError, match="wrong number of verdicts"):
         kept.contents.sections[0].add_frame(Verdicts(0, 0, 2, bytes(8), b"\0"))
     with Store(path) as kept, pytest.raises(ModelError, match="not a valid range"):
         kept.contents.sections[0].add_frame(Rounds(0, 0, 1, ((), (0,) * 7, ())))
@@ -1017,10 +1017,10 @@ def test_a_store_that_was_given_a_log_is_one_file_again(run, whole, expected, tm
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"means": np.zeros((2, 4, 4))}, "sizes of a record do not fit"),
-        ({"means": np.zeros((2, 0))}, "sizes of a record do not fit"),
-        ({"means": np.zeros((3, 8))}, "sizes of a record do not fit"),
-        ({"sensor": np.ones((2, 2))}, "sizes of a record do not fit"),
+        ({"means": np.zeros((2, 4, 4))}, "sizes of a record are inconsistent"),
+        ({"means": np.zeros((2, 0))}, "sizes of a record are inconsistent"),
+        ({"means": np.zeros((3, 8))}, "sizes of a record are inconsistent"),
+        ({"sensor": np.ones((2, 2))}, "sizes of a record are inconsistent"),
         ({"states": 3}, "3 states of its sensor filter"),
         ({"initial": "nowhere"}, "has an unexpected entry in record 1"),
     ],

@@ -96,10 +96,10 @@ def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure
         parsed = [shape.structure(text) for text in texts]
         return parsed[0]
     if len(texts) > 1:
-        raise ModelError("--structure auto takes no other structure beside it; leave auto or the others out")
+        raise ModelError("--structure auto cannot be combined with another structure; leave one of them out")
     given = replace(shape, delay=None, only=None).given_options()
     if given:
-        raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")
+        raise ModelError(f"{', '.join(given)}: options of a given structure, not used with --structure auto")
     return None
 
 

@@ -200,14 +200,14 @@ def input_shaper(
     growing = [m for m in every if m.unstable or m.damping <= 0.0]
     if growing:
         raise ModelError(
-            f"the model is not stable ({growing[0]}): what no loop holds cannot be shaped; close a loop around it, and "
+            f"the model is not stable ({growing[0]}), so its response cannot be shaped; close a loop around it, and "
             "shape the poles of the loop"
         )
     swings = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
     if len(swings) < count:
         raise ModelError(
-            f"the model has {len(swings)} modes that swing, and {short_repr(count)} are to be shaped; what relaxes "
-            "needs no shaper"
+            f"the model has {len(swings)} oscillatory modes, and {short_repr(count)} are to be shaped; relaxing modes "
+            "need no shaper"
         )
     chosen = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)

@@ -214,7 +214,7 @@ def kalman_filter(
         good = bool(np.isfinite(gain).all())
     if not good or np.max(np.abs(np.linalg.eigvals(a - a @ gain @ c))) >= 1.0:
         raise ModelError(
-            f"no observer from {', '.join(measured)} comes to rest: they do not tell all states; measure more outputs"
+            f"no observer from {', '.join(measured)} is stable: not all states are observable; measure more outputs"
         )
     variances = np.einsum("ij,jk,ik->i", realisation.c, left[:-1, :-1], realisation.c)
     deviations = np.sqrt(np.maximum(variances, 0.0)).tolist()
@@ -321,9 +321,7 @@ class Lqg:
             self._states = self._a @ corrected + self._b[:, 0] * self._applied
             command = self.ahead * reference - float(self._gains[0] @ self._states)
         if not math.isfinite(command):
-            raise ModelError(
-                f"the command is {command}, which no machine takes: what is measured, asked for or held is not finite"
-            )
+            raise ModelError(f"the command is {command}: a measurement, the reference or a state is not finite")
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 

@@ -196,8 +196,8 @@ def result_profiles(
     """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
     if "reference" in result.settings:
         raise ModelError(
-            f"a fit with {parameter('reference')} is where residuals are orthogonal to instruments, and no minimum "
-            "of a cost: it has no profile; use its standard errors"
+            f"a fit with {parameter('reference')} makes residuals orthogonal to instruments, and has no cost to "
+            "profile; use its standard errors"
         )
     if "noise_model" in result.settings:
         raise ModelError(f"a fit with {parameter('noise', 'ar')} has no profile; use its standard errors")

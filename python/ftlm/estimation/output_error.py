@@ -61,15 +61,15 @@ class ProfileInterval:
     Parameters
     ----------
     low, high
-        Its ends, in the unit of the number; infinite where the cost does not rise to the threshold within the bounds,
-        as far as there is a finite simulation.
+        Ends, in the unit of the parameter; infinite if the cost does not reach the threshold within the bounds, or
+        within the range of finite simulations.
     level
-        Probability with which intervals of repeated runs hold the truth.
+        Confidence level.
     points
-        (value, rise) of every refit: the rise of the weighted sum of squares in units of the noise's variance, so that
-        its root counts standard deviations; widened for coloured residuals as the standard errors are.
+        (value, rise) of every refit. The rise is that of the sum of squares over the noise variance, so its root counts
+        standard deviations. It is corrected for colored residuals as standard errors are.
     evaluations
-        Free runs that it took.
+        Number of simulations.
     """
 
     low: float

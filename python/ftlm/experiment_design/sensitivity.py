@@ -182,7 +182,10 @@ class Sensitivities:
         return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.responses, self.length)
 
     def derivatives(self, commands: Floats) -> Floats:
-        """Derivatives over the noise, shape (parameters, outputs, rows), for commands of shape (inputs, rows)."""
+        """Return derivatives of the outputs over the noise standard deviation, shape (parameters, outputs, rows).
+
+        ``commands`` has shape (inputs, rows).
+        """
         drive = np.fft.rfft(commands, self.length)
         total = np.einsum("ipof,if->pof", self.spectra[0], drive)
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])

@@ -488,7 +488,7 @@ def _header(
     spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)
 
     def fit_names(line: _Line) -> list[str]:
-        """Return the names, adjusted by one at the end to the width of the rows."""
+        """Return the names, without a comment column that rows lack, or with an empty name for an empty last cell."""
         names = [cell.strip() for cell in line.cells]
         if len(names) == width + 1 and names[-1].casefold() in ("", _COMMENT_COLUMN_NAME):
             return names[:-1]

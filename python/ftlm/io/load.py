@@ -179,7 +179,7 @@ def run_from_tables(
     header = tables[0].header
     chosen = options.missing_policy(header)
     if header is not None and len(tables) > 1:
-        raise DataError(f"{str(tables[0].path)!r} is a whole run of its own; load it alone")
+        raise DataError(f"{str(tables[0].path)!r} is a complete run; load it alone")
     if header is not None:
         _apply_header(wanted, header)
     pool = Pool(tables)

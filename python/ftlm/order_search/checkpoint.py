@@ -70,7 +70,7 @@ def check_record(record: Record) -> None:
     sizes, sensor = (len(record.signals), len(record.inputs)), record.sensor
     shaped = record.means.ndim == 2 and (sensor is None or sensor.ndim == 1)
     if not shaped or sizes != record.means.shape[:1] * 2 or not record.means.size:
-        raise ModelError("the sizes of a record do not fit one another")
+        raise ModelError("the sizes of a record are inconsistent")
     if not 0 <= record.states <= (0 if sensor is None else MAX_FILTER_STATES):
         raise ModelError(f"a record with {record.states} states of its sensor filter")
     check_initial(record.initial)
@@ -205,7 +205,7 @@ class Section:
     def add_frame(self, frame: Frame) -> None:
         """Add a frame; raise ModelError for a duplicate, an empty block, or another kind of search."""
         if self.table is not None or (isinstance(frame, CoupledTable) and not self.law):
-            raise ModelError("a table stands where none belongs")
+            raise ModelError("it has an unexpected final table")
         if isinstance(frame, CoupledTable):
             self.table = frame
             return
@@ -213,13 +213,13 @@ class Section:
             raise ModelError(f"rounds {frame.first} to {frame.last} are not a valid range")
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.frames[self._firsts[place - 1]].last > frame.first:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
+            raise ModelError(f"rounds {frame.first} to {frame.last} are stored twice")
         if isinstance(frame, PartialRounds):
             self._add_partial_rounds(frame)
             return
         count = frame.last - frame.first
         if isinstance(frame, Verdicts) and (len(frame.values), len(frame.kinds)) != (8 * count, count):
-            raise ModelError(f"candidates {frame.first} to {frame.last} have other verdicts")
+            raise ModelError(f"candidates {frame.first} to {frame.last} have a wrong number of verdicts")
         self.open.pop(frame.first, None)
         self.frames[frame.first] = frame
         self._firsts.insert(place, frame.first)
@@ -227,10 +227,10 @@ class Section:
     def _add_partial_rounds(self, frame: PartialRounds) -> None:
         half = self.open.get(frame.first)
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
-            raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
+            raise ModelError(f"rounds {frame.first} to {frame.last} do not continue their block")
         _, followed, end, size, limit = frame.place
         if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
-            raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
+            raise ModelError(f"rounds {frame.first} to {frame.last} have an invalid position")
         if half is None or frame.anew:
             half = self.open[frame.first] = PartialBlock(frame.last, frame.place, frame.order, [], frame.counts, ())
         half.place, half.order, half.counts = frame.place, frame.order, frame.counts

@@ -321,7 +321,7 @@ def _products(
     places: Sequence[int],
     point: tuple[float, ...],
 ) -> Floats | None:
-    """Inner products by run of the responses to the columns and of the residual; None if a response diverges."""
+    """Return, for each run, the inner products of the column responses and the residual; None if one diverges."""
     values = ground.coefficients(point)
     coefficients = [values.get(n, 0.0) for n in problem.coefficients]
     try:

@@ -250,11 +250,11 @@ fn inverse_correlation(columns: &[usize], product: impl Fn(usize, usize) -> f64)
 pub struct BoxBound {
     /// The candidates `first + i·stride + j`, i below `rows` and j below `values`.
     pub first: u64,
-    /// See `first`.
+    /// Number of rows i.
     pub rows: u64,
-    /// See `first`.
+    /// Number of candidates j in a row.
     pub values: u64,
-    /// See `first`.
+    /// Difference of the indices of two rows.
     pub stride: u64,
     /// Lower bound of the raw errors Σ|e| or Σe² of all candidates. Initial conditions are zero.
     pub bound: f64,
