@@ -128,7 +128,7 @@ fn first_problem() -> (Record, OrderGrid) {
         signals(1, &[(1, 0.1, -863.247), (0, 1.05, 62.956), (1, 0.85, -9.1007), (2, 0.0, -140.47)]),
     ];
     let current: Vec<f64> = (0..m).map(|k| if (k as f64 + 0.5) * step % 2.0 < 1.0 { 0.3 } else { -0.3 }).collect();
-    let make = |signals| Record::new(step, PulseMeans::from_rows(signals), None);
+    let make = |signals| Record::new(step, PulseMeans::from_signals(signals), None);
     let Ok(driven) = make(vec![vec![0.0; m], vec![0.0; m], current.clone()]) else { unreachable!() };
     let Ok(mut angles) = simulate::respond(&stage, &driven, &[]) else { unreachable!() };
     for (angle, seed) in angles.iter_mut().zip(4..) {

@@ -194,13 +194,14 @@ fn problem(m: usize, step: f64) -> Option<(Record, OrderGrid)> {
         equation(1, &[(1, 0.1, -863.247), (0, 1.05, 62.956), (1, 0.85, -9.1007), (2, 0.0, -140.47)]),
     ];
     let current: Vec<f64> = (0..m).map(|k| if (k as f64 + 0.5) * h % 2.0 < 1.0 { 0.3 } else { -0.3 }).collect();
-    let driven = Record::new(h, PulseMeans::from_rows(vec![vec![0.0; m], vec![0.0; m], current.clone()]), None).ok()?;
+    let driven =
+        Record::new(h, PulseMeans::from_signals(vec![vec![0.0; m], vec![0.0; m], current.clone()]), None).ok()?;
     let mut signals = simulate::respond(&stage, &driven, &[]).ok()?;
     for (signal, seed) in signals.iter_mut().zip(4..) {
         signal.iter_mut().zip(noise(m, seed)).for_each(|(y, e)| *y += 1.7e-4 * e);
     }
     signals.push(current);
-    let record = Record::new(h, PulseMeans::from_rows(signals), None).ok()?;
+    let record = Record::new(h, PulseMeans::from_signals(signals), None).ok()?;
     #[allow(clippy::cast_possible_truncation)]
     let all: Vec<f64> = (0..=(2.0 / step).round() as i32).map(|i| step * f64::from(i)).collect();
     let axis = |signal: usize, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: true };
@@ -296,7 +297,7 @@ fn joint_fit(m: usize) -> Option<f64> {
         },
         coefficients: terms.iter().map(|t| t.2).collect(),
     };
-    let driven = Record::new(h, PulseMeans::from_rows(vec![vec![0.0; m], u.clone()]), None).ok()?;
+    let driven = Record::new(h, PulseMeans::from_signals(vec![vec![0.0; m], u.clone()]), None).ok()?;
     let mut y = simulate::respond(&[plant], &driven, &[]).ok()?.remove(0);
     y.iter_mut().zip(noise(m, 3)).for_each(|(y, e)| *y += 1e-3 * e);
     let sizes = [OutputScale::from_runs(&[y.clone()])];

@@ -27,7 +27,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 import ftlm
 from arm_measured import arm_run
 from ftlm.structure_selection.candidates import NestedStructures, Variant, describe_structure, signature
-from ftlm.structure_selection.cross_validation import Folds, fit, scatter_factor, schwarz_criterion, validate_fit
+from ftlm.structure_selection.cross_validation import (
+    Folds,
+    fit,
+    residual_variance_inflation,
+    schwarz_criterion,
+    validate_fit,
+)
 from oracles import held_response
 from results import Kept, heading, save
 
@@ -148,7 +154,7 @@ def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
 
 def scatter_of(found: ftlm.Selection) -> float:
     """How many samples told as much as one, when a choice compared criteria."""
-    return min(scatter_factor(t.joint) for t in found.trials if t.joint is not None)
+    return min(residual_variance_inflation(t.joint) for t in found.trials if t.joint is not None)
 
 
 def failure(seed: int, row: dict[str, Any]) -> Iterator[str]:

@@ -50,11 +50,11 @@ fn free(place: usize, count: usize) -> AffineOrder {
 fn main() -> Result<()> {
     // A run: the free response to a square wave of current, with noise of one percent.
     let input: Vec<f64> = (0..PULSES).map(|k| if k % 200 < 100 { 1.0 } else { -1.0 }).collect();
-    let driven = Record::new(STEP, PulseMeans::from_rows(vec![vec![0.0; PULSES], input.clone()]), None)?;
+    let driven = Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; PULSES], input.clone()]), None)?;
     let clean = simulate::respond(&[plant()?], &driven, &[])?.remove(0);
     let size = clean.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     let measured: Vec<f64> = clean.iter().zip(noise(PULSES)).map(|(y, e)| y + 0.01 * size * e).collect();
-    let record = Record::new(STEP, PulseMeans::from_rows(vec![measured.clone(), input]), None)?;
+    let record = Record::new(STEP, PulseMeans::from_signals(vec![measured.clone(), input]), None)?;
 
     // Orders by exhaustive search: alpha from 1.5 to 2, the damping's from 0 to 1.4, in steps of 0.1.
     let tenths = |range: std::ops::RangeInclusive<u8>| range.map(|i| 0.1 * f64::from(i)).collect::<Vec<_>>();

@@ -141,7 +141,7 @@ impl Record {
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0, 2.0, 3.0]]), None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_signals(vec![vec![1.0, 2.0, 3.0]]), None)?;
     /// assert_eq!(record.with_filter(&[0.0, 1.0, 0.0])?.signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
@@ -172,7 +172,7 @@ impl Record {
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0, 2.0, 3.0]]), None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_signals(vec![vec![1.0, 2.0, 3.0]]), None)?;
     /// let record = record.with_initial_state(vec![false], &[1.0], Vec::new())?;
     /// assert_eq!(record.deviation_signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
@@ -270,7 +270,7 @@ impl Record {
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0; 4]]), None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_signals(vec![vec![1.0; 4]]), None)?;
     /// let ramp = record.integral(0, 1.0);
     /// assert!(ramp.iter().zip([0.25, 0.75, 1.25, 1.75]).all(|(a, b)| (a - b).abs() < 1e-12));
     /// # Ok::<(), ftlm::error::Error>(())
@@ -290,7 +290,7 @@ impl Record {
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0; 4]]), None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_signals(vec![vec![1.0; 4]]), None)?;
     /// assert!(record.initial_term(0.0).iter().all(|v| (v - 1.0).abs() < 1e-12));
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
@@ -451,7 +451,7 @@ impl Bank {
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
     /// # use ftlm::regressors::{Bank, Index, Key, Record};
-    /// let record = Record::new(0.5, PulseMeans::from_rows(vec![vec![1.0; 4], vec![2.0; 4]]), None)?;
+    /// let record = Record::new(0.5, PulseMeans::from_signals(vec![vec![1.0; 4], vec![2.0; 4]]), None)?;
     /// let mut index = Index::default();
     /// let input = index.insert(Key::integral(1, 0.0));
     /// let own = index.insert(Key::integral(0, 0.8));
@@ -535,7 +535,7 @@ impl Bank {
         &self.columns
     }
 
-    /// Column at a position, one value a pulse.
+    /// Column at a position, one value per pulse.
     ///
     /// # Panics
     /// If the column does not exist.
@@ -544,7 +544,7 @@ impl Bank {
         &self.columns[position * self.m..(position + 1) * self.m]
     }
 
-    /// Kernel of an own-output column, one value a pulse. Empty for any other column.
+    /// Kernel of an own-output column, one value per pulse. Empty for any other column.
     ///
     /// # Panics
     /// If the column does not exist.

@@ -49,7 +49,7 @@ pub struct OutputFilter<'a> {
 /// // y′ = −y + u.
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
-/// let run = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 300], vec![1.0; 300]]), None)?;
+/// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 300], vec![1.0; 300]]), None)?;
 /// let response = ftlm::simulate::respond(&[model], &run, &[])?;
 /// assert!((response[0][299] - (1.0 - (-2.995_f64).exp())).abs() < 1e-4);
 /// # Ok(())
@@ -119,7 +119,7 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// # fn main() -> ftlm::error::Result<()> {
 /// // D y = -2 y from y(0) = 1, and from a constant on its right-hand side, which is t^1.
 /// let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 0, order: 0.0 }] };
-/// let record = Record::new(0.001, PulseMeans::from_rows(vec![vec![0.0; 1000]]), None)?;
+/// let record = Record::new(0.001, PulseMeans::from_signals(vec![vec![0.0; 1000]]), None)?;
 /// let decay = Equation { structure, coefficients: vec![-2.0] };
 /// let units = simulate::unit_responses(&[decay], &record, &[(0, 0.0), (0, 1.0)])?;
 /// assert!((units[0][0][999] - (-1.999_f64).exp()).abs() < 1e-6);
@@ -251,7 +251,7 @@ fn weight(y: &[f64]) -> f64 {
 /// // y′ = −y + u.
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
-/// let run = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 100], vec![0.0; 100]]), None)?;
+/// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 100], vec![0.0; 100]]), None)?;
 /// assert_eq!(ftlm::simulate::equation_error(&model, &run, &Initial::Rest)?, vec![0.0; 100]);
 /// # Ok(())
 /// # }
@@ -273,7 +273,7 @@ pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -
 ///
 /// `signals` are point samples of the record's signals at intervals of `step`. Those of the equations' outputs are
 /// ignored. Every α must be an integer, every order of an output an integer below its α, every other order 0. Returns
-/// one sample a row for each equation, not finite if the step is unstable.
+/// one sample per row for each equation, not finite if the step is unstable.
 ///
 /// # Errors
 /// [`Error::Structure`] naming the equation whose orders are not integers, and as [`respond`] for equations, signals,

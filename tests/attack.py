@@ -54,21 +54,21 @@ def call_batch(seed, count, only, show):
 
     With `show`, the announcement has the arguments.
     """
-    import hostile
+    import extension_calls
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    sound = hostile.Sound(seed)
-    names = only or hostile.entries()
+    sound = extension_calls.Sound(seed)
+    names = only or extension_calls.entries()
     if show:
-        hostile.np.set_printoptions(threshold=20)
+        extension_calls.np.set_printoptions(threshold=20)
     for _ in range(count):
         for name in names:
             call, given, named = sound.call(name)
-            kept = sound.random.random() < hostile.SOUND
+            kept = sound.random.random() < extension_calls.SOUND
             if not kept:
                 try:
-                    given, named = hostile.attacked(name, given, named, sound.random)
+                    given, named = extension_calls.attacked(name, given, named, sound.random)
                 except (MemoryError, ValueError):
                     # The attacker's own: no memory, or a shape that NumPy cannot iterate over.
                     continue
@@ -437,7 +437,7 @@ def way_out(table):
     import pytest
 
     sys.path.insert(0, str(HERE / "python"))
-    import test_way_out as rig
+    import test_shutdown as rig
 
     for failing in (*rig.PAIRS, *rig.TRIPLES):
         for raises in (False, True):
@@ -460,9 +460,9 @@ def way_out(table):
 
 def loops(table, count):
     """Controllers, shapers and a rig's loop with bad arguments."""
-    import strange
+    import unchecked_calls
 
-    for name, wrong in strange.calls(random.Random(2), count):
+    for name, wrong in unchecked_calls.calls(random.Random(2), count):
         if wrong is not None:
             table.broken("calls of control and a rig's loop", f"{name}: {wrong}")
     table.tried("calls of control and a rig's loop", count)
@@ -473,10 +473,10 @@ def odd_arguments(table):
     import matplotlib as mpl
 
     mpl.use("agg")
-    import odd
+    import public_calls
 
     tried = 0
-    for name, parameter, word, wrong in odd.calls():
+    for name, parameter, word, wrong in public_calls.calls():
         tried += 1
         if wrong is not None:
             table.broken("odd arguments of public functions", f"{name}({parameter}={word}): {wrong}")

@@ -1,4 +1,4 @@
-"""Findings: records of what is said about data, fits and models, and the catalogue that renders their sentences."""
+"""Findings about data, fits and models: their records, and the catalogue of their sentences."""
 
 from __future__ import annotations
 
@@ -66,47 +66,53 @@ FINDING_TOPICS: dict[str, Topic] = {
         "the motion is chaotic",
         "fit parts of the run that are shorter than that, or use {ask[method is least-squares]}",
     ),
-    "range": Topic("the simulation overflows", "choose other orders, or fewer terms"),
-    "unseen": Topic(
+    "overflow": Topic("the simulation overflows", "choose other orders, or fewer terms"),
+    "not_separable": Topic(
         "some parameters are not separately identifiable from the runs",
         "leave a term out, fix one of them, or record a richer input",
     ),
-    "identity": Topic(
+    "near_identity": Topic(
         "its equation nearly says that an output equals itself", "keep own orders well below the highest one"
     ),
-    "useless": Topic(
+    "poor_fit": Topic(
         "the simulation explains little of an output",
         "add a missing input, a delay or a term",
         "or use {ask[method is output-error]}",
         "output-error",
     ),
-    "lost": Topic(
+    "validation_loss": Topic(
         "the model predicts other runs worse than its own", "use fewer free parameters, or more runs in one fit"
     ),
     "offset": Topic("a constant is missing, or not identifiable", "{ask[offset is constant]} or {ask[offset is auto]}"),
-    "loop": Topic(
+    "closed_loop": Topic(
         "the runs were recorded in a closed loop", "name the reference signal with {ask[reference]}, or open the loop"
     ),
-    "instrument": Topic("the reference explains little of the input", "record a stronger reference"),
-    "untold": Topic("a parameter is not identifiable from the runs", "fix it, leave it out, or record a richer input"),
+    "weak_instrument": Topic("the reference explains little of the input", "record a stronger reference"),
+    "not_identifiable": Topic(
+        "a parameter is not identifiable from the runs", "fix it, leave it out, or record a richer input"
+    ),
     "residuals": Topic("the model is incomplete", "add a term, a delay or a free order; ftlm select compares them"),
     "provisional": Topic("the fit is provisional", "give {ask[start]} another result, or free fewer parameters"),
-    "vague": Topic(
+    "imprecise": Topic(
         "some parameters are poorly determined", "fix a parameter, leave a term out, or record a richer input"
     ),
-    "rough": Topic("some intervals are approximate", "{ask[intervals is profile]} computes them"),
-    "step": Topic("the sampling is coarse for this model", "sample faster, raise m, or trust its fast poles less"),
+    "approximate_intervals": Topic("some intervals are approximate", "{ask[intervals is profile]} computes them"),
+    "sampling": Topic("the sampling is coarse for this model", "sample faster, raise m, or trust its fast poles less"),
     "prior": Topic(
         "the prior shifts the coefficients",
         "raise {ask[prior_covariance]}, or use {ask[method is least-squares]}",
     ),
-    "law": Topic("the coefficient law is violated", "", "use {ask[method is output-error]}", "output-error"),
-    "edge": Topic("an order or another parameter is on its bound", "widen the bound"),
-    "search": Topic("the table of orders", "record a longer run, or fix an order"),
-    "history": Topic("the result depends on initial conditions", "begin the run at rest"),
-    "samples": Topic("some samples are unreliable", "see the warning"),
-    "same": Topic("a validation run is an estimation run", "give another run"),
-    "errors": Topic("the parameters have no standard errors", "", "use {ask[method is output-error]}", "output-error"),
+    "coefficient_law": Topic(
+        "the coefficient law is violated", "", "use {ask[method is output-error]}", "output-error"
+    ),
+    "bound": Topic("an order or another parameter is on its bound", "widen the bound"),
+    "order_table": Topic("the table of orders", "record a longer run, or fix an order"),
+    "initial_conditions": Topic("the result depends on initial conditions", "begin the run at rest"),
+    "data": Topic("some samples are unreliable", "see the warning"),
+    "repeated_run": Topic("a validation run is an estimation run", "give another run"),
+    "no_standard_errors": Topic(
+        "the parameters have no standard errors", "", "use {ask[method is output-error]}", "output-error"
+    ),
     "validation": Topic("the prediction of other data is not known"),
     "noise": Topic("the noise is colored"),
     "other": Topic("note"),
@@ -131,14 +137,14 @@ class FindingKind:
     level
         ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``.
     template
-        Template of the sentence behind the prefix. A bar ends its first clause. ``{remedy}`` stands for
-        the remedy.
+        Template of the sentence after the prefix. A bar marks the end of its first clause. ``{remedy}`` is replaced
+        by the remedy.
     reason
         Template of the reason in a verdict; empty for the topic and the first clause of the text.
     remedy
         Template of the remedy; empty for that of the topic.
     prefix
-        Template of what the sentence begins with outside of a page of that run.
+        Template of the beginning that names the run; a page about that run omits it.
     """
 
     topic: str
@@ -182,32 +188,33 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "into {pieces} pieces of {seconds:.2g} s, each with its own initial values; {ask[initial]} overrules it",
     ),
     "plant_unstable_in_pieces": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_WITH_CARE,
         "the model is unstable, and so is the plant, which a controller stabilizes: simulations restarted "
-        "every {seconds:.2g} s explain {fit:.3g} % of the outputs, while that of a whole run grows; noise in "
-        "the feedback biases this method",
-        "the plant is unstable, as the model is: simulations restarted every {seconds:.2g} s explain {fit:.3g} %",
+        "every {seconds:.2g} s explain {fit:.3g} % of the outputs, while a simulation of the whole run grows; noise "
+        "in the feedback biases this method",
+        "the plant is unstable, as the model is: simulations restarted every {seconds:.2g} s explain {fit:.3g} % of "
+        "the outputs",
         "identify the pieces of run.split({seconds:.2g}) together by output error with {ask[initial is caputo]}, which "
         "noise does not bias",
     ),
     "plant_needs_pieces": FindingKind(
         "unstable",
         LEVEL_DO_NOT_USE,
-        "no simulation of a whole run follows this plant, which is unstable and stabilized by a controller: "
+        "the plant is unstable and stabilized by a controller, so no simulation of a whole run fits the outputs: "
         "least squares at these orders gives an unstable model whose simulations, restarted every "
         "{seconds:.2g} s, explain {fit:.3g} %",
-        "the plant is unstable and stabilized by a controller, and no simulation of a whole run follows it",
+        "the plant is unstable and stabilized by a controller, so no simulation of a whole run fits the outputs",
         "identify the pieces of run.split({seconds:.2g}) together with {ask[initial is caputo]}, or use "
         "{ask[method is least-squares]}, which noise in the loop biases",
     ),
     "growth_not_told": FindingKind(
         "unstable",
         LEVEL_FACT,
-        "the model is {stability}, but not significantly: stability is within its standard errors",
+        "the model is {stability}, but not significantly: within its standard errors it may be stable",
         remedy="leave the unstable term out, or record a longer run",
     ),
-    "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether the simulation grows is unknown"),
+    "growth_untold": _rule("unstable", LEVEL_WITH_CARE, "whether the model is stable is unknown"),
     "unstable_optimum_kept": FindingKind(
         "unstable",
         LEVEL_WITH_CARE,
@@ -223,14 +230,14 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "other",
         LEVEL_FACT,
         "an optimum that is not stable has residuals {smaller:.2g} % smaller, which is not significant: the "
-        "free initial conditions cancel its growing mode until the end of the run; the stable one was kept",
+        "free initial conditions cancel its growing mode until the end of the run; the stable optimum was kept",
     ),
     "damping_not_told": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "an optimum that is not stable has residuals {smaller:.2g} % smaller, which is not significant: the "
-        "free initial conditions cancel its growing mode until the end of the run|; the stable one was kept, "
-        "which is on the limit of stability: its damping is not identifiable from the runs",
+        "free initial conditions cancel its growing mode until the end of the run|; the stable optimum was kept, "
+        "which is at the stability limit: its damping is not identifiable from the runs",
     ),
     "instruments_unstable": FindingKind(
         "unstable",
@@ -238,19 +245,19 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{output}: the simulation with these coefficients is unstable|; do not use them",
     ),
     "swing_may_not_decay": _rule(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "an oscillation at {frequency:.4g} rad/s may not decay (damping {damping:.2g}{spread})",
         "add the term that damps it, or record until it has decayed",
     ),
     "out_of_range": FindingKind(
-        "range",
+        "overflow",
         LEVEL_DO_NOT_USE,
         "{output}: the simulation overflows, so its residuals cannot be tested",
         "the simulation overflows",
     ),
     "equation_says_identity": FindingKind(
-        "identity",
+        "near_identity",
         LEVEL_DO_NOT_USE,
         "{output}: {orders} close to alpha = {alpha:g}, so the equation nearly says that {output} equals "
         "itself|; its simulation has NR {nr:.3g} against {equation_nr:.3g} for the equation error. Do not "
@@ -258,24 +265,24 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "its equation nearly says that an output equals itself",
     ),
     "flattered_by_equation_error": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "{output}: the simulation| (NR {nr:.3g}) is far worse than the equation error ({equation_nr:.3g}), "
         "which does not measure the quality of this model",
     ),
     "explains_little": FindingKind(
-        "useless", LEVEL_DO_NOT_USE, "{output}: the simulation explains little of the output| (NR {nr:.3g})"
+        "poor_fit", LEVEL_DO_NOT_USE, "{output}: the simulation explains little of the output| (NR {nr:.3g})"
     ),
     "buried_in_noise": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_WITH_CARE,
         "{output}: the noise exceeds the response to the input (NR {nr:.3g}), and the residuals are not "
-        "correlated with the input: this run shows nothing that the model lacks",
+        "correlated with the input: this run gives no evidence that the model is incomplete",
         "{output} is buried in noise (NR {nr:.3g}), and its residuals are not correlated with the input",
         "excite the input more, record longer, or average repeated runs",
     ),
     "end_row_far_off": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_WITH_CARE,
         "{output}: its first or last row is an outlier: with it the simulation explains little of the output "
         "(NR {nr:.3g}), without it {inner:.3g} %",
@@ -283,9 +290,9 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "rows is explained)",
         "cut that row away, or mark it as missing",
     ),
-    "poor_fit": _rule("useless", LEVEL_DO_NOT_USE, "the simulation explains little of {where}{shown}"),
+    "poor_fit": _rule("poor_fit", LEVEL_DO_NOT_USE, "the simulation explains little of {where}{shown}"),
     "fit_falls": FindingKind(
-        "lost",
+        "validation_loss",
         LEVEL_WITH_CARE,
         "the fit of {output} falls from {before:.3g} % on the estimation data to {after:.3g} %|: the model "
         "is overfitted to the estimation data",
@@ -293,71 +300,71 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         prefix="{run}: ",
     ),
     "sampling_coarse": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
         "the simulation on {run} still depends on the step at the finest grid: the model is too stiff for "
         "this sampling interval, and its output error is provisional",
     ),
     "mode_sampled_coarsely": FindingKind(
-        "step",
+        "sampling",
         LEVEL_FACT,
         "a mode of {frequency:.4g} rad/s has {samples:.2g} samples per period|: its parameters depend on the "
-        "inputs between samples; zero- and first-order hold differ there by half a sample, {phase:.0f} "
-        "degrees, and by {loss:.1g} % of gain",
+        "inputs between samples; zero- and first-order hold differ there by half a sample ({phase:.0f} "
+        "degrees) and by {loss:.1g} % in gain",
         remedy="take at least eight samples per period, or state the behavior between samples with {ask[intersample]}",
     ),
     "other_intersample_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{input} was taken as {taken} between samples, but {other} fits better|: the sum of squared residuals is "
+        "{input} was assumed {taken} between samples, but {other} fits better|: the sum of squared residuals is "
         "{ratio:.3g} times as large, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
-        "{input} fits better as {other} between samples than as {taken}: {parameter} is {other_value:.4g}, not "
+        "{input} was assumed {taken} between samples, but {other} fits better: {parameter} is {other_value:.4g}, not "
         "{value:.4g}",
         "state {input}={kind} in {ask[intersample]} if that is true",
         prefix="{run}: ",
     ),
     "scheme_unstable": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
         "{output}: with {m} pulses the discretization itself is unstable| (margin {margin:.2g}), whether or "
         "not the model is; raise m",
     ),
     # Parameters
     "not_told_apart": FindingKind(
-        "unseen",
+        "not_separable",
         LEVEL_DO_NOT_USE,
         "not separately identifiable from these runs: {parameter}; changed together they leave the outputs unchanged, "
         "so their intervals are infinite; {remedy}",
         "not separately identifiable from the runs: {shown}",
     ),
     "errors_undefined": FindingKind(
-        "unseen",
+        "not_separable",
         LEVEL_DO_NOT_USE,
         "the standard errors of {parameter} are not defined: the covariance of the fit is not finite",
     ),
     "numbers_correlated": FindingKind(
-        "vague", LEVEL_FACT, "hardly separately identifiable from these runs: {parameter}| ({why})"
+        "imprecise", LEVEL_FACT, "barely separately identifiable from these runs: {parameter}| ({why})"
     ),
     "order_not_told": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "order {parameter} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
     "input_number_not_told": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "the {words} is not identifiable from these runs: its standard error exceeds its bounds",
     ),
-    "on_bound": FindingKind("edge", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
+    "on_bound": FindingKind("bound", LEVEL_WITH_CARE, "{what} = {value} is on its bound|; widen it"),
     "coefficient_on_bound": FindingKind(
-        "edge",
+        "bound",
         LEVEL_WITH_CARE,
         "{parameter} = {value:.4g} is on its bound; without the bound the estimate is {outside:.4g}|. {parameter} has "
         "no interval, and the intervals of the other parameters hold for this value",
         "{parameter} = {value:.4g} is on its bound; without the bound the estimate is {outside:.4g}",
     ),
     "genetic_on_bound": FindingKind(
-        "edge", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
+        "bound", LEVEL_WITH_CARE, "{parameter} = {value:.4g} is on its bound for the genetic algorithm|; widen it"
     ),
     "nonlinear_range": FindingKind(
         "other",
@@ -367,31 +374,31 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "run_forgets": FindingKind(
         "chaos",
         LEVEL_DO_NOT_USE,
-        "a small change of a parameter moves the free run {growth:.2g} times as much in its second half as in its "
-        "first|: the motion is chaotic or nearly so. After {seconds:.3g} s the run depends on its parameters too "
-        "strongly for a fit, and a fit to all of it has no intervals; {remedy}",
+        "a small change of a parameter changes the second half of the simulation {growth:.2g} times as much as its "
+        "first half|: the motion is chaotic or nearly so. After {seconds:.3g} s the simulation depends on the "
+        "parameters too strongly for a fit, and a fit to the whole run has no intervals; {remedy}",
     ),
     "free_runs_of_some": FindingKind(
-        "search",
+        "order_table",
         LEVEL_FACT,
-        "the best {count} of {candidates} candidates by equation error were ranked by free runs: with non-linear terms "
-        "no bound says that none of the others is better|; narrow the intervals of the orders, or identify by output "
-        "error from here",
+        "the best {count} of {candidates} candidates by equation error were ranked by simulation: with non-linear "
+        "terms no bound excludes the other candidates, so one of them may be better|; narrow the intervals of the "
+        "orders, or identify by output error from here",
     ),
     "rows_repeat": FindingKind(
-        "search",
+        "order_table",
         LEVEL_FACT,
-        "{rows} rows hold {models} distinct model{plural}: adding a constant to all free orders does not "
+        "{rows} rows contain {models} distinct model{plural}: adding a constant to all free orders does not "
         "change an equation from rest; give one order as a number, such as the lowest as 0",
         remedy="give one order as a number, such as the lowest as 0",
     ),
     "ranks_alike": FindingKind(
-        "search",
+        "order_table",
         LEVEL_FACT,
         "ranks 1 to {last}{every} are equal within noise at 99 % ({shown})",
     ),
     "noise_decides": FindingKind(
-        "search",
+        "order_table",
         LEVEL_WITH_CARE,
         "noise decides the ranking: ranks 1 to {last}{every} are equal within noise at 99 % ({shown}), so "
         "these orders are not identifiable from the run",
@@ -405,67 +412,69 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         remedy="use {ask[method is output-error]}",
     ),
     "certified_run_fails": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "the simulation with these orders explains little of the output (NR {nr:.3g}): the certificate "
         "bounds the equation error, not the error of a simulation",
         remedy="use {ask[method is output-error]}",
     ),
     "rank_not_judged": FindingKind(
-        "search",
+        "order_table",
         LEVEL_WITH_CARE,
         "rank 1 could not be validated: {text}",
         "rank 1 could not be validated: {text}",
         "identify at these orders",
     ),
     "on_edge": FindingKind(
-        "edge", LEVEL_WITH_CARE, "order {parameter} = {value:g} is on the edge of its interval|; widen it"
+        "bound", LEVEL_WITH_CARE, "order {parameter} = {value:g} is on the edge of its interval|; widen it"
     ),
     "not_different_from_0": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_FACT,
         "coefficient {parameter} = {value:.4g} does not differ significantly from 0| (standard error {error:.3g})",
     ),
     "interval_open": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "unbounded intervals ({sides}): with all other parameters refitted the cost never rises significantly; "
         "{remedy}",
         "unbounded intervals: {parameter}",
     ),
-    "number_vague": _rule("vague", LEVEL_WITH_CARE, "poorly identifiable from the runs: {shown}"),
+    "number_vague": _rule("imprecise", LEVEL_WITH_CARE, "poorly identifiable from the runs: {shown}"),
     "coefficient_law_broken": FindingKind(
-        "law",
+        "coefficient_law",
         LEVEL_WITH_CARE,
         "coefficient law: {parameter} = {value:.4g}, but the other equation gives {wanted:.4g}|; the equation-error "
         "estimators do not impose the law",
     ),
     "inertia_ratio_broken": FindingKind(
-        "law", LEVEL_WITH_CARE, "coefficient law: the inertia ratio {parameter} must exceed 1, but is {listed}"
+        "coefficient_law",
+        LEVEL_WITH_CARE,
+        "coefficient law: the inertia ratio {parameter} must exceed 1, but is {listed}",
     ),
     "prior_pulls": FindingKind(
         "prior",
         LEVEL_WITH_CARE,
         "{output}: the prior| (K0 = {prior:g}, coefficients near 0) shifts a coefficient by {share:.0f} % "
-        "from the estimate without it; p = {length} only weighs the data against it. Raise prior_covariance "
-        "or use {ask[method is least-squares]}",
+        "from the estimate without it; p = {length} only sets the weight of the data relative to the prior. Raise "
+        "{ask[prior_covariance]}, or use {ask[method is least-squares]}",
     ),
     "prior_ranks": FindingKind(
         "prior",
         LEVEL_WITH_CARE,
         "{output}: the prior dominates the ranking of orders|: with K0 = {prior:g} the error of the best candidate is "
-        "{share:.2g} of that of a zero output. Raise prior_covariance, or leave it out",
+        "{share:.2g} of that of a zero output. Raise {ask[prior_covariance]}, or leave it out",
     ),
     "no_standard_errors": _rule(
-        "errors",
+        "no_standard_errors",
         LEVEL_WITH_CARE,
         "{method} gives no standard errors, so the uncertainty of the parameters is unknown",
     ),
     "intervals_rough": FindingKind(
-        "rough",
+        "approximate_intervals",
         LEVEL_FACT,
-        "the cost is not quadratic along {parameter}, and its profile would take long: these intervals are "
-        "approximate|; {remedy}",
+        "the cost is not quadratic along {parameter}, and a profile likelihood would take long: these intervals "
+        "are approximate|; {remedy}",
     ),
     # Fit
     "not_converged": FindingKind(
@@ -477,8 +486,8 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "instruments_not_converged": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "{output}: instrumental variables did not converge in {iterations} steps|; the coefficients are "
-        "those of the smallest output error found. Too much noise for these terms: {remedy}",
+        "{output}: instrumental variables did not converge in {iterations} iterations|; the coefficients are "
+        "those of the smallest output error found. The noise is too large for these terms: {remedy}",
         remedy="use {ask[method is output-error]}",
     ),
     "lower_optimum_found": FindingKind(
@@ -497,20 +506,21 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "seeds_disagree": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "{output}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}|; not every "
-        "seed has found the optimum",
+        "{output}: the genetic algorithm ends at errors from {low:.4g} to {high:.4g}, depending on its seed|; not "
+        "every seed has found the optimum",
     ),
     "step_moves_estimate": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
-        "at {pulses} pulses per sample the step still changes estimates by over a tenth of their standard "
-        "errors: the model is too stiff for the sampling|; sample faster or trust its fast poles less",
+        "at {pulses} pulses per sample the discretization still changes estimates by over a tenth of their "
+        "standard errors: the model is too stiff for this sampling interval|; sample faster, or trust its fast poles "
+        "less",
     ),
     "step_bias": FindingKind(
-        "step",
+        "sampling",
         LEVEL_WITH_CARE,
-        "with {m} pulses the step alone changes coefficient {parameter} by {amount} standard errors, which "
-        "do not include it|; {finer}use {ask[method is output-error]}, which refines the step",
+        "with {m} pulses the discretization alone changes coefficient {parameter} by {amount} standard errors, "
+        "which do not include it|; {finer}use {ask[method is output-error]}, which refines the discretization",
     ),
     # Residuals
     "residuals_not_white": FindingKind(
@@ -665,22 +675,22 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "run in which it changes",
     ),
     "loop_found": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_WITH_CARE,
-        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or "
-        "was measured with noise: a closed loop, whose noise in {input} biases estimates{effect} beyond "
-        "their intervals; record the reference signal and name it with {ask[reference]}, or open the loop",
+        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
+        "loop, or was measured with noise: the noise in {input} biases estimates{effect}, which their intervals do "
+        "not include; record the reference signal and name it with {ask[reference]}, or open the loop",
         "{input} depends on past values of {output}: a closed loop, which biases the estimates",
     ),
     "loop_harmless": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
-        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or "
-        "was measured with noise: a closed loop, which changes output-error estimates{effect} only; "
-        "equation-error estimates are biased",
+        "{output}: {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
+        "loop, or was measured with noise: output-error estimates are biased{effect}, and equation-error estimates "
+        "may be biased more",
     ),
     "moves_within_row": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
         "{output}: residuals are correlated with {input} of the same row only (correlation {value:.2g}): "
         "{input} depends on {output} within a row, or has direct feedthrough to it; then add that term",
@@ -689,9 +699,9 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "residuals", LEVEL_WITH_CARE, "the runs are too short for residual tests", "record a longer run"
     ),
     "reference_weak": FindingKind(
-        "instrument",
+        "weak_instrument",
         LEVEL_WITH_CARE,
-        "{reference} explains little of {input} beside the noise in it| (F = {f:.2g}, {needed:g} are "
+        "{reference} explains little of {input} compared with the noise in it| (F = {f:.2g}, at least {needed:g} is "
         "needed): a weak instrument, with which estimates are biased and their intervals too narrow; excite "
         "the reference more, or longer",
     ),
@@ -700,46 +710,46 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "offset",
         LEVEL_WITH_CARE,
         "an unknown constant in the equation of {output} explains {share:.2g} % of the residuals| ({test}): "
-        "a sensor's zero, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
+        "a sensor offset, a load, a voltage at rest; use {ask[offset is constant]} or {ask[offset is auto]}",
     ),
     "drift_fits": FindingKind(
         "offset",
         LEVEL_WITH_CARE,
-        "the level of {output} drifts: with a line in time the sum of squared residuals is {ratio:.3g} times as "
+        "the level of {output} drifts: with a linear trend the sum of squared residuals is {ratio:.3g} times as "
         "large, and {parameter} is {other_value:.4g}, not {value:.4g} ± {error:.2g}",
-        "the level of {output} drifts: with a line in time {parameter} is {other_value:.4g}, not {value:.4g}",
-        "let the sensor settle, or estimate the line with the model: {ask[offset is ramp]}",
+        "the level of {output} drifts: with a linear trend {parameter} is {other_value:.4g}, not {value:.4g}",
+        "let the sensor settle, or estimate the trend with the model: {ask[offset is ramp]}",
         prefix="{run}: ",
     ),
     "constant_instead_of_past": FindingKind(
         "offset",
         LEVEL_FACT,
         "the initial conditions of {output} are estimated with {terms} powers of time|; an unknown constant "
-        "in the equation explains as much with {fewer} parameters fewer: if a sensor's zero, a load or a "
-        "mean may be there, {ask[offset is auto]} estimates it",
+        "in the equation explains as much with {fewer} parameters fewer: if there may be a sensor offset, a load or "
+        "a mean, {ask[offset is auto]} estimates it",
     ),
     "offset_hidden": _rule(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
         "the offset of {shown} is not separately identifiable from the initial conditions",
     ),
     "rests_at_level": FindingKind(
         "other",
         LEVEL_FACT,
-        "{shown} ({rows} quiet rows before an input moves)|; the run starts from rest there, and the level is "
-        "estimated with the model: {ask[initial]} overrules it",
+        "{shown} ({rows} quiet rows before an input moves)|; the simulation starts from rest there, and the level is "
+        "estimated with the model: {ask[initial]} overrides this",
         prefix="{run}: ",
     ),
     "level_estimated": FindingKind(
         "other",
         LEVEL_FACT,
         "{output} does not start at zero, and a level of the output explains the runs better than initial "
-        "terms alone|: the plant {was} about a level of its own before the start; {ask[offset]} and "
-        "{ask[initial]} overrule it",
+        "terms alone|: the plant {was} about a level other than zero before the start; {ask[offset]} and "
+        "{ask[initial]} override this",
         prefix="{run}: ",
     ),
     "rest_assumed": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
         "{input} is constant from row {row} on, so the state of the plant before the run is unknown|: the "
         "gain assumes that it rested at {shown}; if it was moving, the gain is not determined",
@@ -748,7 +758,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         prefix="{run}: ",
     ),
     "start_not_told": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
         "the initial state is not identifiable|: if the run begins {taken}, the gain of {output} from "
         "{input} is {gain:.4g} ± {error:.2g}; if it begins {other}, it is {other_gain:.4g} ± "
@@ -762,74 +772,75 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "residuals",
         LEVEL_WITH_CARE,
         "{output} moves before its input: in row {row}, in which {input} first changes, it is already {size:.3g} "
-        "standard deviations from where it rested, about {rows:.2g} rows early|; the input was logged after it acted, "
+        "standard deviations from its value at rest, about {rows:.2g} rows early|; the input was logged after it "
+        "acted, "
         "or one of the two signals is late",
         "{output} moves before its input {input}, by about {rows:.2g} rows",
         "log the input before it acts, shift its rows, or allow a {ask[delay]} down to minus one sampling interval",
         prefix="{run}: ",
     ),
     "looked_like_rest": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_FACT,
         "{run}: the first values look like rest, but the residuals of a fit from rest show nonzero initial "
         "conditions|, which are estimated with the model",
     ),
     "simulated_from_rest": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_WITH_CARE,
-        "{run} starts at zero and is simulated from rest, but the residuals decay like motion from before "
-        "the start|; give the model's structure {ask[initial is history]} to estimate it",
+        "{run} starts at zero and is simulated from rest, but the residuals decay like the response to inputs before "
+        "the start|; give the structure of the model {ask[initial is history]} to estimate it",
     ),
     # Data
     "outliers": FindingKind(
-        "samples",
+        "data",
         LEVEL_FACT,
-        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one, {first}: "
-        "{noun}, or events that are not modeled|; least squares lose precision by them: {ask[loss is huber]} "
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual deviation, {first}: "
+        "{noun}, or events that are not modeled|; they make least squares less precise: {ask[loss is huber]} "
         "reduces their weight",
     ),
     "outliers_dominate": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
-        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual one and "
-        "{holds} {power:.0f} % of their squares, {first}: {noun}, or events that are not modeled|; least "
-        "squares lose precision by them: {ask[loss is huber]} reduces their weight",
+        "{count} of {total} residuals of {output} {verb} beyond {deviations:g} times the usual deviation and "
+        "{holds} {power:.0f} % of the sum of squares, {first}: {noun}, or events that are not modeled|; they make "
+        "least squares less precise: {ask[loss is huber]} reduces their weight",
     ),
     "quantised": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "{output} is quantized in steps of {step:.3g} in {run}, and its residuals are {noise:.3g}: rounding "
         "errors, which repeat with the signal and are not noise|; intervals do not include them; use a finer "
         "converter or scale",
     ),
     "times_not_honoured": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "{run}: outputs have sample times of their own, but a free delay, or signals behind a sensor filter, "
         "require a regular grid: outputs were interpolated linearly, and the intervals do not include that "
         "error",
     ),
     "friction_unsigned": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "the velocity of {output} never changes its sign in a run: while it slides, friction is a constant "
         "like the offset, and only phases at rest distinguish them|; add a run that moves both ways, or use "
         "{ask[offset is none]}",
     ),
     "stribeck_slow_untold": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_WITH_CARE,
         "{output} moves at less than {ratio:g} vs = {speed:.3g} per s in {slow} of {total} intervals: fs and "
         "vs are not identifiable, only fc|; add a run that creeps, or leave the Stribeck term out",
     ),
     "stribeck_fast_untold": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "{output} never moves faster than vs = {speed:.3g} per s: fc and fs are not separately "
         "identifiable|; add a run that slides faster, or leave the Stribeck term out",
     ),
     "rig_stopped": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "the rig stopped the run before its end|: {cause}",
         remedy="record it again without the fault",
@@ -838,127 +849,127 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "data_note": FindingKind("other", LEVEL_NOTE, "{text}", prefix="run {run}: "),
     # Advice on a run
     "twin": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "{other} and {signal} have equal values in every row: one of them is the wrong column",
     ),
     "constant_input": FindingKind(
-        "samples",
+        "data",
         LEVEL_FACT,
         "input {input} is {level} in all {rows} rows: it excites only one transient at the start; record its "
         "command, or a run in which it changes",
     ),
     "constant_output": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} is {level} in all {rows} rows: a dead channel, or the wrong column; check the sensor",
     ),
     "channel_off": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} is exactly {level} from {begin:.4g} s to {end:.4g} s ({rows} rows) and changes from row to "
         "row elsewhere: a channel that was off or was being zeroed|; {after}",
         prefix="run {run}: ",
     ),
     "saturation": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} stays at its {extreme} value {level} for {rows} rows ({share:.2g} %), cut off while moving: "
         "saturated; the true value is not known there: lower the amplitude or widen the range",
     ),
     "saturation_input": FindingKind(
-        "samples",
+        "data",
         LEVEL_FACT,
         "input {input} stays at its {extreme} value {level} for {rows} rows ({share:.2g} %), cut off while moving: "
         "saturated; harmless if this is what the machine received, else record the measured input",
     ),
     "spikes": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} has {count} spike{plural}, first at row {first} ({time:.4g} s), the largest of {height} at "
-        "row {worst}: single wrong samples; replace them by their neighbours' mean",
+        "row {worst}: single wrong samples; replace them by the mean of their neighbors",
     ),
     "wrap": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} jumps by {size}{turn} {times} while moving the other way, first at row {first}: an encoder "
         "that wraps; unwrap it (numpy.unwrap) before loading",
     ),
     "one_sine": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "input {input} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it determines "
         "two parameters of an equation; add frequencies (square, PRBS, multisine, chirp), or use this run "
         "for validation",
     ),
     "inputs_collinear": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "inputs {other} and {input} are collinear (correlation {correlation:.4f}): their effects are not "
         "separately identifiable; excite them one after the other, or by different signals",
     ),
     "excitation_short": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "the equation of {output} has {free} free parameters, but {listed} determines {known} in steady "
         "state: the others depend on its transient at the start|; add frequencies to the input, or fix "
         "orders or coefficients",
     ),
     "few_rows": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "the run has {rows} rows: too few for orders and coefficients; record at least {needed}, better thousands",
     ),
     "short": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
-        "output {output} passes its mean {times} in {duration:.4g} s and is still moving at the end: the run "
+        "output {output} crosses its mean {times} in {duration:.4g} s and is still moving at the end: the run "
         "is shorter than the dominant period; record several times its slowest period",
     ),
     "loop_in_data": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
-        "input {input} depends on past values of {output} (statistic {ratio:.3g} times its limit), or was "
-        "measured with noise: a closed loop, in which equation-error estimates are biased; use the output "
-        "error, and if possible a reference that excites the machine well",
+        "input {input} depends on past values of {output} (statistic {ratio:.3g} times its limit) as in a closed "
+        "loop, or was measured with noise: equation-error estimates are biased; use the output error, and if "
+        "possible a reference that excites the machine well",
     ),
     "loop_not_told": FindingKind(
-        "loop",
+        "closed_loop",
         LEVEL_FACT,
         "whether input {input} depends on past values of output {output} is undecided: {reason}; if a "
         "controller generated it, name the reference signal with {ask[reference]}",
     ),
     "drift": FindingKind(
-        "samples",
+        "data",
         LEVEL_WITH_CARE,
         "output {output} drifts by about {slope} over the run ({share:.0f} % of its deviation), which the "
-        "inputs do not explain; let the sensor settle, or estimate the line with the model: {ask[offset is "
+        "inputs do not explain; let the sensor settle, or estimate the trend with the model: {ask[offset is "
         "ramp]}",
         remedy="{ask[offset is ramp]} estimates a linear trend with the model",
     ),
     "starts_off_zero": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_FACT,
-        "output {output} starts at {level}, not at rest: initial terms will be estimated; if this is only the sensor's "
-        "zero, subtract it, and start the run before the input moves",
+        "output {output} starts at {level}, not at rest: initial terms will be estimated; if this is only a sensor "
+        "offset, subtract it, and start the run before the input moves",
     ),
     "signal_constant": FindingKind(
-        "samples", LEVEL_FACT, "{signal} is constant ({level:g}): a dead channel, or nothing happened"
+        "data", LEVEL_FACT, "{signal} is constant ({level:g}): a dead channel, or nothing happened"
     ),
     "signal_in_motion": FindingKind(
-        "history",
+        "initial_conditions",
         LEVEL_FACT,
-        "{output} does not start at rest (first value {level:.4g}): initial terms will be used",
+        "{output} does not start at rest (first value {level:.4g}): initial terms will be estimated",
     ),
     # Validation
     "validates_itself": FindingKind(
-        "same",
+        "repeated_run",
         LEVEL_FACT,
-        "its outputs are those of {other}, which the model was identified from, so it is no validation",
+        "its outputs are those of {other}, from which the model was identified, so it does not validate the model",
         prefix="{run}: ",
     ),
     "run_of_its_own": FindingKind(
-        "same",
+        "repeated_run",
         LEVEL_FACT,
         "it has the name of a run from which the model was identified",
         prefix="{run}: ",
@@ -978,13 +989,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "sentences_alone": _rule(
         "validation",
         LEVEL_WITH_CARE,
-        "the model file is of an earlier version, whose warnings have no levels",
+        "the model file was written by an earlier version, whose warnings have no levels",
         "identify it again",
     ),
     "earlier_sentence": FindingKind("other", LEVEL_NOTE, "{text}"),
     # Frequency responses
     "response_missed": _rule(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "the residuals are {rms:.3g} % of {output} from {input} ({run})",
         "add a term, a delay or a free order",
@@ -996,7 +1007,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "measure a wider band, bound the coefficient that makes it unstable, or use fewer terms",
     ),
     "response_lost": _rule(
-        "lost",
+        "validation_loss",
         LEVEL_WITH_CARE,
         "the residuals are {own:.3g} % of the estimation data and {rms:.3g} % of {run}",
         "use fewer free parameters, or both records in one fit",
@@ -1023,15 +1034,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "add an element or a term, and compare the errors",
     ),
     "response_not_converged": _rule("provisional", LEVEL_WITH_CARE, "the fit has not converged"),
-    "response_on_bound": _rule("edge", LEVEL_WITH_CARE, "a parameter is on its bound: {bound}"),
+    "response_on_bound": _rule("bound", LEVEL_WITH_CARE, "a parameter is on its bound: {bound}"),
     "response_not_told_apart": FindingKind(
-        "unseen",
+        "not_separable",
         LEVEL_DO_NOT_USE,
         "not separately identifiable from the data: {parameter}; leave a term out, or fix one of them",
         "not separately identifiable from the data: {parameter}",
     ),
     "response_number_vague": FindingKind(
-        "vague",
+        "imprecise",
         LEVEL_WITH_CARE,
         "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}; fix it, or leave it out",
         "poorly identifiable from the data: {parameter} = {value:.4g} ± {error:.2g}",
@@ -1040,16 +1051,16 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "other_optimum": FindingKind(
         "provisional",
         LEVEL_WITH_CARE,
-        "from automatic initial guesses the chosen structure fits {output} better than in the "
-        "cross-validation: another optimum, which is .best",
+        "automatic initial guesses lead the chosen structure to an optimum that fits {output} better than in the "
+        "cross-validation; .best is that optimum",
     ),
     "none_is_the_machine": FindingKind(
-        "useless",
+        "poor_fit",
         LEVEL_DO_NOT_USE,
         "the best candidate predicts validation data with {fit} %: no candidate describes the machine",
     ),
     "worse_than_mean": FindingKind(
-        "lost",
+        "validation_loss",
         LEVEL_WITH_CARE,
         "the chosen structure predicts worse than the mean of the validation data on {parts}",
     ),
@@ -1057,13 +1068,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "other",
         LEVEL_FACT,
         "fractional orders improve the prediction significantly ({parameter}): on {parts} of validation data "
-        "they gain {gain:.2g} points of fit over {other}, and no part loses",
+        "they gain {gain:.2g} percentage points of fit over {other}, and no part loses",
     ),
     "fractional_orders_gain_nothing": FindingKind(
         "other",
         LEVEL_FACT,
-        "fractional orders do not improve the prediction significantly ({parameter}): {gain:.2g} points of "
-        "fit over {other}, on {parts} of validation data",
+        "fractional orders do not improve the prediction significantly ({parameter}): {gain:.2g} percentage points "
+        "of fit over {other}, on {parts} of validation data",
     ),
     "fractional_orders_not_told": FindingKind(
         "other",
@@ -1071,7 +1082,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "whether fractional orders improve the prediction ({parameter}) is undecided: {reason}",
     ),
     "not_told_by_part": FindingKind(
-        "untold",
+        "not_identifiable",
         LEVEL_FACT,
         "{parameter}: not identifiable from some part, so it agrees with every value of the others",
     ),
@@ -1086,18 +1097,18 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "parts_not_white": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "residuals are not white: the structure is incomplete, and parts with other excitation may give "
-        "other parameters; then the structure is wrong, and the machine has not changed",
+        "residuals are not white: the structure is incomplete, so parts with different excitation may give "
+        "different parameters although the machine has not changed",
     ),
     "prediction_in_doubt": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "the predicted standard errors assume a right model, and a finding on this one says: {text}",
+        "the predicted standard errors assume a complete model, but a finding on this one says: {text}",
         "the predicted standard errors assume a complete model, and this one is incomplete",
-        "add what it leaves out, identify again, and design on that model",
+        "add the missing terms, identify again, and design the input on that model",
     ),
     "designed_for_white_noise": FindingKind(
-        "residuals", LEVEL_FACT, "predicted for white noise, and a finding on the model says: {text}"
+        "residuals", LEVEL_FACT, "the predictions assume white noise, but a finding on the model says: {text}"
     ),
 }
 
@@ -1111,14 +1122,14 @@ class _Reference:
 
 
 class _Choice:
-    """Texts of the interface in use in templates: ``{choose[validate]}``."""
+    """Texts in templates that differ between Python and the command line: ``{choose[validate]}``."""
 
     def __getitem__(self, key: str) -> str:
         return choose_text(*INTERFACE_TEXTS[key])
 
 
 class _Sentence(string.Formatter):
-    """Formatter of templates. A number that a file keeps as text, such as inf, is shown as it is."""
+    """Formatter of templates. A number that was stored as text, such as inf, is inserted unchanged."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         return value if isinstance(value, str) else str(format(value, format_spec))
@@ -1132,13 +1143,13 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     code
         Code in the catalogue.
     run, output, input, parameter, method
-        What it is about, where it applies; several names are joined by commas.
+        Subject of the finding, where it applies; several names are joined by commas.
     role
         ``"validation"`` for a run that the model was not identified from.
     numbers
-        Figures and words of its sentence, by name.
+        Numbers and texts that are inserted in its sentence, by name.
     written
-        Sentence as the file of a model keeps it, for versions that do not know the code.
+        Sentence as stored in the file of a model, for versions that do not know the code.
     """
 
     code: str
@@ -1153,7 +1164,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def kind(self) -> FindingKind:
-        """Entry in the catalogue. A code that this version does not know is to be read with care."""
+        """Entry in the catalogue. A code that this version does not know has the level "with care"."""
         return FINDING_CATALOGUE.get(self.code) or FindingKind("other", LEVEL_WITH_CARE, "{written}", "{written}")
 
     @property
@@ -1190,7 +1201,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def remedy(self) -> str:
-        """Remedy for the method that was used; empty if there is none beyond the sentence."""
+        """Remedy for the method that was used; empty if the catalogue has none."""
         if self.kind.remedy:
             return self._render(self.kind.remedy)
         topic = self.topic
@@ -1206,7 +1217,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
                 words["remedy"] = self.remedy
             return _Sentence().vformat(template, (), words)
         except (KeyError, ValueError, TypeError):
-            # A file may lack a number of its sentence.
+            # A file may lack a number of the sentence.
             return self.written or self.code
 
     def to_file(self) -> Finding:
@@ -1286,7 +1297,7 @@ class FindingGroup:
 
 
 def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
-    """Group findings by topic, most serious first; one of no topic is a group of its own."""
+    """Group findings by topic, most serious first; each finding of the topic "other" is a group of its own."""
     order = list(FINDING_TOPICS)
     by: dict[tuple[int, int, int], list[Finding]] = {}
     for place, item in enumerate(unique(findings)):
@@ -1297,6 +1308,6 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
 
 
 def hidden_findings_text(found: Sequence[FindingGroup]) -> str:
-    """Text on the number of findings that a summary omits; empty if it omits none."""
+    """Return the number of findings that a summary omits, as text; empty if it omits none."""
     count = sum(len(g.findings) for g in found) - len(found[:MAX_SUMMARY_FINDINGS])
     return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

@@ -138,7 +138,7 @@ def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     Raises
     ------
     ModelError
-        A length that is no power of two.
+        A length that is not a power of two.
     """
     return apply_along_axis("x", x, axis, _core.haar_transform)
 
@@ -162,7 +162,7 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     Raises
     ------
     ModelError
-        A length that is no power of two.
+        A length that is not a power of two.
     """
     return apply_along_axis("x", x, axis, _core.haar_inverse)
 

@@ -70,7 +70,7 @@ def pulse_means(samples: ArrayLike, m: int | None = None, *, hold: bool = False)
     DataError
         Fewer than two samples, or values that are not finite real numbers (with the first index and the count).
     ModelError
-        An m that is no positive whole number.
+        An m that is not a positive whole number.
 
     Notes
     -----
@@ -104,7 +104,7 @@ def block_pulse_kernel(order: ArrayLike, m: int, *, step: float, derivative: boo
     Raises
     ------
     ModelError
-        An order outside [0, 10], a step that is not positive, or an m that is no positive whole number.
+        An order outside [0, 10], a step that is not positive, or an m that is not a positive whole number.
 
     Notes
     -----
@@ -270,7 +270,7 @@ def multi_innovation(
         )
     length = whole_number(p)
     if length is None or length < 1:
-        raise ModelError(f"{setting('p')} {short_repr(p)} is no whole number from 1")
+        raise ModelError(f"{setting('p')} {short_repr(p)} is not a whole number of at least 1")
     count, width = regressors.shape[-2:]
     prior = as_floats("prior_covariance", prior_covariance)
     if prior.ndim > 1 or (prior.ndim and prior.size != width):
@@ -399,7 +399,7 @@ class Candidates:
         Raises
         ------
         DataError
-            Orders that are not finite, or of another shape; an M that is no power of two, for Haar rows.
+            Orders that are not finite, or of another shape; an M that is not a power of two, for Haar rows.
         ModelError
             An order of a term above alpha or below 0, an alpha above 10, or a p or prior covariance out of range.
 
@@ -410,7 +410,7 @@ class Candidates:
         table = self._orders(orders)
         length = whole_number(p)
         if length is None or length < 0:
-            raise ModelError(f"{setting('p')} {short_repr(p)} is no whole number from 0")
+            raise ModelError(f"{setting('p')} {short_repr(p)} is not a whole number of at least 0")
         check_choice("rows", rows, ("haar", "time"))
         prior = as_floats("prior_covariance", prior_covariance)
         if prior.ndim > 1 or (prior.ndim and prior.size != len(self._terms)) or not np.all(prior > 0):
@@ -537,7 +537,7 @@ class Candidates:
         """Return the coefficients of so many order tuples; raise for another shape."""
         if coefficients.shape != (count, len(self._terms)):
             raise DataError(
-                f"coefficients has shape {coefficients.shape}; give ({count}, {len(self._terms)}), one row a tuple"
+                f"coefficients has shape {coefficients.shape}; give ({count}, {len(self._terms)}), one row per tuple"
             )
         return coefficients
 
@@ -656,10 +656,12 @@ class Recursion:
         rows = _signal_rows(terms, output, len(hold))
         numbers = _finite("orders", orders)
         if numbers.shape != (1 + len(rows),):
-            raise DataError(f"orders has shape {numbers.shape}; give ({1 + len(rows)},): alpha, then one order a term")
+            raise DataError(
+                f"orders has shape {numbers.shape}; give ({1 + len(rows)},): alpha, then one order per term"
+            )
         length = whole_number(p)
         if length is None or not 1 <= length < 1 << 31:
-            raise ModelError(f"{setting('p')} {short_repr(p)} is no whole number from 1")
+            raise ModelError(f"{setting('p')} {short_repr(p)} is not a whole number of at least 1")
         if isinstance(initial, str):
             check_choice("initial", initial, ("caputo",))
         exponents = [] if isinstance(initial, str) else [real_number("initial", e) for e in initial]
@@ -701,7 +703,7 @@ class Recursion:
         """
         table = _finite("samples", samples)
         if table.ndim != 2 or table.shape[1] != self._count:
-            raise DataError(f"samples has shape {table.shape}; give (n, {self._count}), one column a signal")
+            raise DataError(f"samples has shape {table.shape}; give (n, {self._count}), one column per signal")
         return self._core.push(table)
 
     @property
@@ -722,7 +724,7 @@ def _signal_rows(terms: Sequence[int], output: int, count: int) -> list[int]:
     for name, row in [("output", output), *(("terms", term) for term in terms)]:
         index = whole_number(row)
         if index is None or not 0 <= index < count:
-            raise ModelError(f"{setting(name)} {short_repr(row)} is no row of {count} signals; count from 0")
+            raise ModelError(f"{setting(name)} {short_repr(row)} is not a row of {count} signals; count from 0")
     return [int(term) for term in terms]
 
 

@@ -44,7 +44,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
     method
         Name of a method, or a method with its options, such as :class:`ftlm.OutputError`; see :func:`ftlm.identify`.
     offset
-        As of :func:`ftlm.identify`; it belongs to the fitted rows and is no part of a prediction.
+        As of :func:`ftlm.identify`; it belongs to the fitted rows and is not part of a prediction.
     continues
         Rows that are predicted follow the fitted ones without a gap, as those of ``TimeSeriesSplit`` do without
         ``gap``: the simulation goes through the fitted inputs first. Rows that are the fitted ones themselves are

@@ -123,10 +123,10 @@ impl Regression {
 /// use ftlm::estimation::least_squares;
 /// use ftlm::regressors::Record;
 /// let input: Vec<f64> = (0..64).map(|k| f64::from(k % 7)).collect();
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![vec![0.0; 64], input.clone()]), None)?;
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![vec![0.0; 64], input.clone()]), None)?;
 /// // y = 3 I^0.5 u.
 /// let output = record.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
-/// let run = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// let run = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// let found = least_squares::fit(&[run], &structure, &[None], &Initial::Rest)?;
 /// assert!((found.coefficients[0] - 3.0).abs() < 1e-12);

@@ -52,9 +52,9 @@ struct RecordSpectra {
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let plant = Equation::new(Structure { output: 0, order: 2.0, terms }, vec![-9.0, 2.0])?;
 /// let input: Vec<f64> = (0..300).map(|k| f64::from(k % 40 / 20)).collect();
-/// let rest = Record::new(0.02, PulseMeans::from_rows(vec![vec![0.0; 300], input.clone()]), None)?;
+/// let rest = Record::new(0.02, PulseMeans::from_signals(vec![vec![0.0; 300], input.clone()]), None)?;
 /// let y = ftlm::simulate::respond(&[plant], &rest, &[])?.remove(0);
-/// let run = Record::new(0.02, PulseMeans::from_rows(vec![y, input]), None)?;
+/// let run = Record::new(0.02, PulseMeans::from_signals(vec![y, input]), None)?;
 /// let driven = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// let points = [vec![-4.0], vec![-9.0]];
 /// let found = resonance_scan::fit_with_fixed_poles(&[run], &driven, &[None], &Initial::Rest, &[2.0], &points)?;

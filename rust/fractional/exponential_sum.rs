@@ -2,7 +2,7 @@
 //!
 //! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. For such integrands the trapezoidal rule in x
 //! converges like e^{−π²/Δx}. A few dozen rates e^x therefore represent the whole history at any requested accuracy,
-//! and each rate needs one state a signal. Nodes below the lowest rate form a geometric series. Four rates near zero
+//! and each rate needs one state per signal. Nodes below the lowest rate form a geometric series. Four rates near zero
 //! replace them and match its first four moments. Rates do not depend on q, so all orders of one signal share its
 //! states.
 
@@ -13,7 +13,7 @@ const LOWEST_RATE_TIMES_LAG: f64 = 1e-3;
 /// Rates below those of the rule, relative to its lowest one.
 const TAIL_RATE_RATIOS: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
 
-/// Decay rates for all kernels t^{q−1}/Γ(q), 0 < q ≤ 1, and lags between two limits.
+/// Decay rates of exponential sums that approximate t^{q−1}/Γ(q) for all 0 < q ≤ 1, at lags between two limits.
 #[derive(Debug, Clone)]
 pub struct Rates {
     rates: Vec<f64>,

@@ -46,7 +46,7 @@ pub struct OnlineConvolution<'a> {
 }
 
 impl<'a> OnlineConvolution<'a> {
-    /// Convolution before its first value.
+    /// Convolution of a signal without values yet; [`OnlineConvolution::push`] appends them.
     #[must_use]
     pub fn new(heads: &'a Heads) -> Self {
         let m = heads.kernel.len();

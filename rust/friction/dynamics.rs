@@ -163,7 +163,7 @@ impl Body {
     /// // A block slides at 1 m/s with friction of 2 m/s²: it stops after half a second and 0.25 m.
     /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
     /// let block = Body::single(Equation::new(structure, vec![1.0])?, FrictionLaw::coulomb(2.0));
-    /// let run = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 100], vec![0.0; 100]]), None)?;
+    /// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 100], vec![0.0; 100]]), None)?;
     /// let motion = block.run(&run, &[vec![(1.0, 1.0)]])?;
     /// let velocity = &motion.bodies[0].edges;
     /// assert!((velocity[25] - 0.5).abs() < 1e-12 && velocity[50..].iter().all(|v| v.abs() < 1e-12));

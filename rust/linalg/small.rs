@@ -153,7 +153,7 @@ impl EquilibratedLu {
         Ok(Self { rows, columns, factor })
     }
 
-    /// Solution for this right-hand side, one value a row.
+    /// Solution for this right-hand side, one value per row.
     #[must_use]
     pub fn solve(&self, rhs: &[f64]) -> Vec<f64> {
         let mut x = DVector::from_iterator(rhs.len(), rhs.iter().zip(&self.rows).map(|(v, scale)| v / scale));

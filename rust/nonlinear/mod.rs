@@ -39,7 +39,7 @@ impl NonlinearSystem {
     /// let equation = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![1.0, -1.0])?;
     /// let derived = vec![DerivedSignal::new(square, vec![(0, 0.0)])?];
     /// let system = NonlinearSystem { equations: vec![equation], derived, recorded: 2, coupled: true };
-    /// let run = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 200], vec![1.0; 200]]), None)?;
+    /// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 200], vec![1.0; 200]]), None)?;
     /// let y = &system.run(&run, &[vec![]])?[0];
     /// assert!((0.5 * (y[99] + y[100]) - 1.0_f64.tanh()).abs() < 1e-4);
     /// # Ok::<(), ftlm::error::Error>(())

@@ -89,8 +89,8 @@ impl Points {
     /// # use ftlm::order_search::given_points::{Point, Points};
     /// # use ftlm::regressors::Record;
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-    /// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
-    /// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+    /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
+    /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
     /// // D^α y = c u: α = 0.8 and c = 1 made y; an order of u above α is left out.
     /// let mut points = Points::new(vec![record], 0, vec![1], vec![false, true], Norm::L1)?;
     /// let point = |order: f64, of_input: f64| Point { order, orders: vec![of_input], coefficients: vec![1.0] };

@@ -202,7 +202,7 @@ impl Experiment {
         run_attached(|| Ok(self.inner.compared_count()))
     }
 
-    /// Weight of each compared sample, a row an output; None if all weights are 1.
+    /// Weights of the compared samples, one row per output; None if all weights are 1.
     #[getter]
     fn robust_weights<'py>(&self, py: Python<'py>) -> PyResult<Option<Table<'py>>> {
         let weights = run_attached(|| Ok(&self.inner.sample_weights))?;

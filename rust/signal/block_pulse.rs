@@ -50,8 +50,8 @@ impl PulseMeans {
 
     /// Pulse means of several signals.
     #[must_use]
-    pub fn from_rows(rows: Vec<Vec<f64>>) -> Vec<Self> {
-        rows.into_iter().map(Self).collect()
+    pub fn from_signals(signals: Vec<Vec<f64>>) -> Vec<Self> {
+        signals.into_iter().map(Self).collect()
     }
 
     /// Mean of every pulse.

@@ -9,7 +9,7 @@ use crate::fft;
 pub struct Metrics {
     /// Σ|y − ŷ| (paper (45)), in the unit of the output.
     pub error: f64,
-    /// √(Σ(y − ŷ)²/M) (paper (46), with its sum).
+    /// Root mean square error √(Σ(y − ŷ)²/M), equation (46) of the paper.
     pub rmse: f64,
     /// RMSE / σ(y), σ over M (paper (47) as its tables use it).
     pub nr: f64,

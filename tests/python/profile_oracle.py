@@ -319,7 +319,7 @@ class ProfileLikelihood:
         return self._minimize(i, values, 1, REFIT_TOLERANCE)
 
     def _minimize(self, i: int, values: Floats, evaluations: int, tolerance: float) -> Iterate:
-        return self.grid.minimize(_attempt(self.grid, values), evaluations, plain=True, held=i, tolerance=tolerance)
+        return self.grid.minimize(_attempt(self.grid, values), evaluations, plain=True, fixed=i, tolerance=tolerance)
 
 
 #: A search for an end: it yields the free runs it took, is sent how many it may have taken, and returns the end.
@@ -517,7 +517,7 @@ def _slope(attempt: Iterate, i: int) -> float:
 def _other_sensitivities(attempt: Iterate, i: int) -> tuple[Any, Floats]:
     """Return the SVD of the other parameters' sensitivities (unit rows), and the row norms."""
     others = np.delete(np.asarray(attempt.outcome["jacobian"]), i, axis=0)
-    # Far out, sensitivities may be so large that their squares are no numbers.
+    # Far out, sensitivities may be so large that their squares are not numbers.
     length = np.abs(others).max(axis=1, initial=0.0)
     length = np.where(length > 0, length, 1.0)
     length = length * np.maximum(np.linalg.norm(others / length[:, None], axis=1), 1.0)

@@ -358,7 +358,7 @@ def test_a_file_that_is_being_read_is_not_yet_fitted_and_says_so(page):
     assert "still being read" in told(page.own("POST", "models", wanted)[2])
     page.desk.files["key-large"].task = None
     page.desk.files["key-large"].preview["problem"] = "no output is named"
-    assert "is no run yet: no output is named" in told(page.own("POST", "models", wanted)[2])
+    assert "is not a run yet: no output is named" in told(page.own("POST", "models", wanted)[2])
     assert page.desk.models == {}
 
 
@@ -610,7 +610,7 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
         ({"share": True}, "is not a number"),
         ({"estimation": "nobody"}, "no file is chosen"),
         ({"validation": "nobody"}, "no file is chosen"),
-        ({"structure": ["D y = a0 y + b0 u"] * 30}, "no equation"),
+        ({"structure": ["D y = a0 y + b0 u"] * 30}, "not an equation"),
         ({"structure": ["x" * 5000]}, "4000 letters"),
     ],
 )
@@ -708,13 +708,13 @@ def test_fields_become_arguments():
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        ({"step": "fast"}, "step: 'fast' is no number"),
+        ({"step": "fast"}, "step: 'fast' is not a number"),
         ({"skip": "1.5"}, "skip: '1.5'"),
-        ({"skip": "9" * 40}, "no number of lines"),
-        ({"skip": "²"}, "no number of lines"),
-        ({"decimal": []}, "decimal is no text"),
-        ({"columns": "x"}, "no list"),
-        ({"columns": [3]}, "no object"),
+        ({"skip": "9" * 40}, "not a number of lines"),
+        ({"skip": "²"}, "not a number of lines"),
+        ({"decimal": []}, "decimal must be text"),
+        ({"columns": "x"}, "not a list"),
+        ({"columns": [3]}, "not an object"),
         ({"columns": [{"name": "a", "role": "boss"}]}, "'boss' of column 'a'"),
         ({"columns": [{"name": n, "role": "time"} for n in "ab"]}, "both the time"),
         (

@@ -17,10 +17,10 @@ from ftlm import _core
 
 TESTS = Path(__file__).resolve().parents[1]
 ATTACK = runpy.run_path(str(TESTS / "attack.py"))
-HOSTILE = runpy.run_path(str(TESTS / "hostile.py"))
+HOSTILE = runpy.run_path(str(TESTS / "extension_calls.py"))
 sys.path.insert(0, str(TESTS))
-import odd  # noqa: E402
-import strange  # noqa: E402
+import public_calls  # noqa: E402
+import unchecked_calls  # noqa: E402
 
 
 def test_every_entry_of_the_bindings_is_attacked():
@@ -66,13 +66,17 @@ def test_a_fit_is_not_asked_for_more_time_than_an_attack_waits():
 
 
 def test_calls_of_controllers_and_loops_end_in_an_answer_or_in_words():
-    assert [told for _, told in strange.calls(random.Random(7), 60) if told is not None] == []
-    assert all(strange.outcome(function, given) is None for function, given in strange.recipes().values())
+    assert [told for _, told in unchecked_calls.calls(random.Random(7), 60) if told is not None] == []
+    assert all(
+        unchecked_calls.outcome(function, given) is None for function, given in unchecked_calls.recipes().values()
+    )
 
 
 @pytest.mark.slow
 def test_odd_arguments_of_public_functions_end_in_an_answer_or_in_words():
-    tried = [(name, word, parameter, wrong) for name, parameter, word, wrong in odd.calls(("ftlm.", "analysis."))]
+    tried = [
+        (name, word, parameter, wrong) for name, parameter, word, wrong in public_calls.calls(("ftlm.", "analysis."))
+    ]
     assert [call for call in tried if call[-1] is not None] == []
     assert len(tried) > 10_000
 
@@ -94,8 +98,8 @@ def test_what_is_no_answer_of_a_controller_is_seen():
         raise given["error"]
 
     for error in (TypeError("x"), ftlm.ModelError(""), ftlm.ModelError("x" * 9999), ftlm.InternalError("a fault")):
-        assert strange.outcome(call, {"error": error}).startswith(type(error).__name__)
-    warns = strange.outcome(lambda: warnings.warn("overflow", RuntimeWarning, stacklevel=1), {})
+        assert unchecked_calls.outcome(call, {"error": error}).startswith(type(error).__name__)
+    warns = unchecked_calls.outcome(lambda: warnings.warn("overflow", RuntimeWarning, stacklevel=1), {})
     assert warns == "RuntimeWarning: overflow"
 
 

@@ -161,7 +161,7 @@ def test_identify_and_select_find_the_same_model_by_auto(tmp_path: Path) -> None
     assert one.output.splitlines()[0] == fitted.output.splitlines()[0]
     wrong = CliRunner().invoke(app, ["identify", *words, "--orders", "alpha=1"])
     assert wrong.exit_code == 2
-    assert "--orders: of a structure that is given, not used with --structure auto" in wrong.output
+    assert "--orders: options of a given structure, not used with --structure auto" in wrong.output
 
 
 def controlled_record(seed: int, rows: int, time_constant: float, gain: float) -> ftlm.Run:

@@ -159,9 +159,9 @@ def test_the_command_line_proves_it_for_each_equation(csv, proved):
     for options, said in [
         (["--tolerance", "5"], "--tolerance 5.0 is outside"),
         (["--min-separation", "0"], "--min-separation 0.0 is outside"),
-        (["--max-cells", "0"], "--max-cells 0 is no whole number"),
+        (["--max-cells", "0"], "--max-cells 0 is not a whole number"),
         (["--initial", "caputo"], "--initial rest"),
-        (["--order-grid", "gamma=1:2:0.1"], "--order-grid 'gamma' is no free order"),
+        (["--order-grid", "gamma=1:2:0.1"], "--order-grid 'gamma' is not a free order"),
     ]:
         refused = CliRunner().invoke(app, [*words, *options])
         assert refused.exit_code == 2, options

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.structure.circuit import impedance_with_slopes
+from ftlm.structure.circuit import impedance_and_derivatives
 
 F = np.geomspace(1e5, 5e-3, 70)
 W = 2 * np.pi * F
@@ -95,7 +95,7 @@ def test_impedance_and_its_slopes_are_those_of_the_formulas(text):
     circuit = ftlm.Circuit(text)
     known = circuit.with_values(dict(zip(circuit.names, true, strict=True)))
     assert known.impedance(W) == pytest.approx(formula(*true), rel=1e-12)
-    _, slopes = impedance_with_slopes(known, W, {})
+    _, slopes = impedance_and_derivatives(known, W, {})
     for k, name in enumerate(circuit.names):
         ends = []
         for step in (1e-6, -1e-6):
@@ -187,7 +187,7 @@ def test_an_exponent_ends_at_1_and_bounds_are_kept():
         ("R0+C1", {}, "is not understood; write it as in"),
         ("R0-C1", {"fixed": {"R1": 1.0}}, "fixed parameter 'R1' does not occur"),
         ("R0-C1", {"fixed": {"R0": 1.0, "C1": 1.0}}, "no parameter of R0-C1 is free"),
-        ("R0-C1", {"bounds": {"R0": (2, 1)}}, "are no interval"),
+        ("R0-C1", {"bounds": {"R0": (2, 1)}}, "are not an interval"),
         ("R0-C1", {"start": {"R0": -1.0}}, "start= is out of the bounds"),
         ("R0-CPE1", {"orders": {"CPE1_alpha": 0.5}}, "orders= and delay= are of equations"),
     ],

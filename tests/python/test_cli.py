@@ -177,7 +177,7 @@ def test_a_report_of_a_saved_model(folder: Path) -> None:
     assert alone.returncode == 0, alone.stderr
     assert "No validation run was given" in (folder / "alone.html").read_text("utf-8")
     missing = ftlm_command("report", "given.json", "-o", "nowhere/x.html", cwd=folder)
-    assert (missing.returncode, "is no folder; make it first" in missing.stderr) == (3, True)
+    assert (missing.returncode, "is not a folder; make it first" in missing.stderr) == (3, True)
     np.savetxt(folder / "other.csv", np.ones((60, 2)).cumsum(axis=0), delimiter=",", header="t,w", comments="")
     refused = ftlm_command(
         "report", "given.json", "--validation", "other.csv", "--time", "t", "-y", "w", "-o", "x.html", cwd=folder
@@ -239,7 +239,7 @@ BAD = [
     (("identify", "square.csv", *SEARCH, "-o", "."), 3, ". is a folder; name a file in it"),
     (("search", "square.csv", "--structure", "D^1.5 y = a0 y + b0 u"), 2, "nothing to search"),
     (("compare", "none.json", "square.csv"), 3, "none.json"),
-    (("compare", "square.csv", "square.csv"), 3, "no ftlm model"),
+    (("compare", "square.csv", "square.csv"), 3, "not an ftlm model"),
     (("simulate", "none.json", "square.csv", "-o", "x.csv"), 3, "none.json"),
     (("simulate", "none.json", "square.csv"), 2, "Missing"),
     (("demo", "-o", "square.csv"), 3, "square.csv"),
@@ -638,6 +638,6 @@ def test_a_file_to_write_is_checked_before_the_work(tmp_path):
     for words in (["-o", str(path)], ["--out", str(tmp_path / "no" / "a.csv")]):
         refused = CliRunner().invoke(commands, words)
         assert refused.exit_code == 3
-        assert "overwrite it with --force" in refused.stderr or "is no folder; make it first" in refused.stderr
+        assert "overwrite it with --force" in refused.stderr or "is not a folder; make it first" in refused.stderr
     assert CliRunner().invoke(commands, ["-o", str(path), "--force"]).exit_code == 0
     assert done == [(str(path), False), (str(path), True)]

@@ -1,4 +1,4 @@
-"""Controllers as files, the commands control and shape: what they write runs, what is no input is refused in words."""
+"""Controllers as files, commands control and shape: what they write runs, invalid input is refused with a message."""
 
 import json
 
@@ -10,7 +10,7 @@ import ftlm
 from ftlm import control
 from ftlm.cli.main import app
 from test_control import PID
-from test_quadratic import BROKEN, designed, model
+from test_lqg import BROKEN, designed, model
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +118,8 @@ def broken_files():
         "direct": 0.0,
         "lags": [],
     }
-    yield b"", "no ftlm controller"
-    yield b"[" * 100_000, "no ftlm controller"
+    yield b"", "not an ftlm controller"
+    yield b"[" * 100_000, "not an ftlm controller"
     yield json.dumps(good).encode(), "missing required field"
     yield json.dumps(good | {"controller": pid | {"kp": "1"}}).encode(), "Expected `float`"
     yield json.dumps(good | {"controller": pid | {"type": "bang"}}).encode(), "Invalid value 'bang'"
@@ -160,7 +160,7 @@ def test_a_damaged_lqg_is_refused_by_what_is_wrong(tmp_path):
         ("tracked", "h" * 9999, "damaged: h{500}"),
         ("deviations", [1.0], "its errors"),
         ("b", [1.0], "Expected `array`"),
-        ("feedback", [[1e999] * len(whole["controller"]["a"])], "is no ftlm controller|not finite"),
+        ("feedback", [[1e999] * len(whole["controller"]["a"])], "is not an ftlm controller|not finite"),
     ):
         told = whole | {"controller": whole["controller"] | {key: value}}
         (tmp_path / "c.json").write_text(json.dumps(told), encoding="utf-8")
@@ -200,7 +200,7 @@ def test_shape_writes_what_a_reference_is_convolved_with(saved, tmp_path):
 
 
 REFUSED = [
-    (("control", "MODEL", "--crossover", 40), "several outputs: say which, --output"),
+    (("control", "MODEL", "--crossover", 40), "several outputs; name one with --output"),
     (("control", "MODEL", "--output", "hub"), "--crossover is missing"),
     (("control", "MODEL", "--output", "hub", "--crossover", 40, "--max-input", 1), "--max-input: of --design lqg"),
     (("control", "MODEL", "--design", "lqg"), "--max-deviation OUTPUT=A and --max-input A are missing"),
@@ -208,7 +208,7 @@ REFUSED = [
     ((*WORDS, "MODEL", "--max-deviation", "hob=1"), "did you mean 'hub'"),
     ((*WORDS, "MODEL", "--noise", "hub"), "names 'hub' twice"),
     ((*WORDS, "MODEL", "--band", "1"), "--band '1' is not 2 numbers"),
-    ((*WORDS, "MODEL", "--band", "9:1"), "is no interval"),
+    ((*WORDS, "MODEL", "--band", "9:1"), "is not an interval"),
     ((*WORDS, "MODEL", "--path", "0.3"), "--path '0.3' is not 2 numbers"),
     ((*WORDS, "MODEL", "--path", "0.3:0.5", "--output", "hub+tip"), "is not a sum of outputs"),
     ((*WORDS, "MODEL", "--path", "9:0.5", "--output", "hub+bend", "--limit", "0.9"), "over the limit of 0.9"),
@@ -222,7 +222,7 @@ REFUSED = [
     ((*WORDS, "MODEL", "--input", "U"), "input = 'U' is not one"),
     ((*WORDS, "no.json"), "cannot be read"),
     (("input-shaper", "MODEL", "--modes", 0), "--modes 0"),
-    (("input-shaper", "MODEL", "--modes", 9), "modes that swing, and 9 are to be shaped"),
+    (("input-shaper", "MODEL", "--modes", 9), "oscillatory modes, and 9 are to be shaped"),
     (("input-shaper", "MODEL", "--rate", 1), "fewer than four samples"),
     (("input-shaper", "MODEL", "--kind", "zw"), "is not one of"),
     (("input-shaper", "MODEL", "-o", "s.json"), "does not end in .csv"),

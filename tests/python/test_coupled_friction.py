@@ -304,7 +304,7 @@ def test_friction_is_named() -> None:
     [
         ({"friction": "colomb"}, "friction = 'colomb' is not known; use False, 'coulomb' or 'stribeck'"),
         ({"friction": 2}, "friction = 2 is not known"),
-        ({"friction": "stribeck"}, "of the velocity that the model gives; use coupling='simulated'"),
+        ({"friction": "stribeck"}, "needs the simulated velocity; use coupling='simulated'"),
         ({"hub": "no"}, "hub = 'no' is neither True nor False"),
         ({"cross_damping": 1}, "cross_damping = 1 is neither True nor False"),
         ({"cross_sensitivity": "inertial"}, "cross_sensitivity = 'inertial' is neither True nor False"),

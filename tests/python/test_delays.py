@@ -157,10 +157,10 @@ def test_other_methods_refuse_a_free_delay(method):
 @pytest.mark.parametrize(
     ("delay", "words"),
     [
-        ({"u": (0.2, 0.1)}, "from 0.2 to 0.1 s is no interval"),
+        ({"u": (0.2, 0.1)}, "from 0.2 to 0.1 s is not an interval"),
         ({"u": (0.1, 0.1)}, "two rising times"),
-        ({"u": (0.0, np.inf)}, "is no interval"),
-        ({"u": (0.0, np.nan)}, "is no interval"),
+        ({"u": (0.0, np.inf)}, "is not an interval"),
+        ({"u": (0.0, np.nan)}, "is not an interval"),
         ({"u": (0.0,)}, "neither a number nor"),
         ({"u": ("a", 0.1)}, "least delay of u"),
         ({"y": (0.0, 0.1)}, "delayed input"),

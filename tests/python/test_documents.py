@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+import ftlm
+
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.md")])
@@ -80,6 +82,13 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path) -> None:
         )
         assert ran.returncode == 0, command + ran.stdout + ran.stderr
     assert (tmp_path / "model.html").exists()
+
+
+def test_the_parameter_file_of_the_rig_page_is_read(tmp_path: Path) -> None:
+    (text,) = blocks(ROOT / "docs" / "rig.md", "toml")
+    path = tmp_path / "arm.toml"
+    path.write_text(text, encoding="utf-8")
+    assert ftlm.rig.ArmParameters.of(path).stage1.coulomb == 0.08
 
 
 def commands_of(text: str) -> list[str]:
@@ -184,8 +193,6 @@ def issubclass_of_error(value: object) -> bool:
 
 
 def test_the_reference_names_every_public_name() -> None:
-    import ftlm
-
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     for name in ftlm.__all__:
         value = getattr(ftlm, name)

@@ -101,7 +101,7 @@ BAD = {
     ),
     "lattice of an unknown order": (
         MODEL,
-        "order 'betta' of order_grid= is no free order; free are alpha, beta",
+        "order 'betta' of order_grid= is not a free order; free are alpha, beta",
         lambda: search(order_grid=ftlm.order_grid(betta=1.0)),
     ),
     "lattice upside down": (
@@ -124,12 +124,12 @@ BAD = {
     ),
     "m no power of two with Haar rows": (
         MODEL,
-        "m = 60 is no power of two, which Haar rows need; take m = 32 or 64",
+        "m = 60 is not a power of two, which Haar rows need; take m = 32 or 64",
         lambda: search(m=60),
     ),
-    "m of 0": (MODEL, "m = 0 is no number of pulses", lambda: identify(m=0)),
-    "m in words": (MODEL, "m = 'many' is no number of pulses", lambda: identify(m="many")),
-    "m not finite": (MODEL, "m = inf is no number of pulses", lambda: model().compare(run(), m=math.inf)),
+    "m of 0": (MODEL, "m = 0 is not a number of pulses", lambda: identify(m=0)),
+    "m in words": (MODEL, "m = 'many' is not a number of pulses", lambda: identify(m="many")),
+    "m not finite": (MODEL, "m = inf is not a number of pulses", lambda: model().compare(run(), m=math.inf)),
     "length no power of two": (
         MODEL,
         "need m to be a power of two, not 65; take m = 64 or 128",
@@ -169,7 +169,7 @@ BAD = {
     # Runs
     "no run": (DATA, "no run is given", lambda: identify([])),
     "no run to compare": (DATA, "no run is given", lambda: model().compare([])),
-    "something that is no run": (DATA, "runs[0] is str, not a Run", lambda: identify(["psf.csv"])),
+    "something that is not a run": (DATA, "runs[0] is str, not a Run", lambda: identify(["psf.csv"])),
     "runs with different outputs": (
         DATA,
         "have different outputs: 'z' and 'y'",
@@ -238,7 +238,7 @@ BAD = {
     "array of text": (DATA, "x holds <U1 values; give real numbers", lambda: ftlm.haar_inverse(["a", "b"])),
     "array of objects": (DATA, "x holds object values; give real numbers", lambda: ftlm.haar_inverse([None, 1.0])),
     "array of complex numbers": (DATA, "x holds complex128 values", lambda: ftlm.haar_transform(Y[:64] * 1j)),
-    "rows of different length": (DATA, "x is no array", lambda: ftlm.haar_transform([[1.0, 2.0], [1.0]])),
+    "rows of different length": (DATA, "x is not an array", lambda: ftlm.haar_transform([[1.0, 2.0], [1.0]])),
     "single number": (DATA, "x has 0 dimensions and no axis -1", lambda: ftlm.haar_transform(1.0)),
     "axis that is not there": (DATA, "x has 1 dimensions and no axis 1", lambda: ftlm.haar_transform(Y, axis=1)),
     "too short to differentiate": (
@@ -271,16 +271,16 @@ BAD = {
     "step in words": (MODEL, "step = None is not a number", lambda: ftlm.fractional_derivative(Y, 0.5, step=None)),
     "step of a matrix": (MODEL, "step = 0 is outside", lambda: ftlm.block_pulse_matrix(0.5, 4, step=0)),
     "step infinite": (MODEL, "step = inf is outside", lambda: ftlm.operational_matrix(0.5, 4, step=math.inf)),
-    "matrix of 0 pulses": (MODEL, "m = 0 is no number of pulses", lambda: ftlm.haar_matrix(0)),
+    "matrix of 0 pulses": (MODEL, "m = 0 is not a number of pulses", lambda: ftlm.haar_matrix(0)),
     "matrix of half a pulse": (
         MODEL,
-        "m = 2.5 is no number of pulses",
+        "m = 2.5 is not a number of pulses",
         lambda: ftlm.block_pulse_matrix(0.5, 2.5, step=1),
     ),
     "matrix beyond memory": (MODEL, "m = 32768 is outside [1, 16384]", lambda: ftlm.haar_matrix(1 << 15)),
     "matrix beyond all machines": (
         MODEL,
-        "m = 1e+300 is no number of pulses",
+        "m = 1e+300 is not a number of pulses",
         lambda: ftlm.block_pulse_matrix(0.5, 1e300, step=1),
     ),
     "Haar matrix of three": (

@@ -287,7 +287,9 @@ def test_a_cluster_gives_the_same_bytes_of_a_stage(stage_run, stage_expected, tm
     with cluster(tmp_path) as (client, _):
         assert bytes_of(search_stage(stage_run, client.get_executor())) == stage_expected
         # The client itself is none, whose futures have other methods.
-        with pytest.raises(ftlm.ModelError, match=r"Client.*is no executor .*; pass .*Client\(…\)\.get_executor\(\)"):
+        with pytest.raises(
+            ftlm.ModelError, match=r"Client.*is not an executor .*; pass .*Client\(…\)\.get_executor\(\)"
+        ):
             search_stage(stage_run, client)
 
 

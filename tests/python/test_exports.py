@@ -158,7 +158,7 @@ def test_a_state_space_carries_the_sensor_filter_and_refuses_what_it_is_not():
     seen = model("D^2 y = -D y - 4 y + u", sensor_filter=ftlm.SensorFilter.low_pass(["y"]))
     np.testing.assert_allclose(seen.to_ss()(1j * w), seen.frequency_response(w)[0, 0], rtol=1e-10)
     for text, options, words in (
-        ("D^1.5 y = -y + u", {}, r"order 1\.5 is no whole number"),
+        ("D^1.5 y = -y + u", {}, r"order 1\.5 is not a whole number"),
         ("D^2 y = -D y + u - sign(D y)", {}, "has friction"),
         ("D y = -y + u", {"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "the input u passes a sensor filter"),
     ):
@@ -172,7 +172,7 @@ def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_no
     w = np.geomspace(0.1, 100, 9)
     seen = model("D^2 y = -D y - 4 y + u", sensor_filter=ftlm.SensorFilter.low_pass(["y"]))
     np.testing.assert_allclose(seen.to_tf()(1j * w), seen.frequency_response(w)[0, 0], rtol=1e-12)
-    with pytest.raises(ftlm.ModelError, match=r"order 1\.5 is no whole number .*to_control with band="):
+    with pytest.raises(ftlm.ModelError, match=r"order 1\.5 is not a whole number .*to_control with band="):
         model("D^1.5 y = -y + u").to_tf()
     with pytest.raises(ftlm.ModelError, match="the input u passes a sensor filter"):
         model("D y = -y + u", sensor_filter=ftlm.SensorFilter.low_pass(["u"])).to_tf()
@@ -183,7 +183,7 @@ def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_no
     [
         (control.tf([1], [1, 0.5], 0.1), {}, "sampled"),
         (control.tf([3], [1]), {}, "order 0"),
-        (3.0, {}, "float is no system"),
+        (3.0, {}, "float is not a system"),
         (control.tf([1, 0, 0], [1, 1]), {}, "more zeros than poles"),
         (control.tf([0], [1, 1]), {}, "order 0"),
         (control.tf([1], [1, 1]), {"inputs": ["a", "b"]}, "2 given"),
@@ -208,13 +208,13 @@ def test_a_poor_approximation_warns_about_margins():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"band": (0, 1)}, "is no interval"),
-        ({"band": (2, 1)}, "is no interval"),
-        ({"band": 3}, "no pair"),
-        ({"band": (1, np.inf)}, "is no interval"),
-        ({"band": (1, 2, 3)}, "no pair"),
-        ({"band": (1, 2), "order": 0}, "no whole number from 1 to 50"),
-        ({"band": (1, 2), "order": 51}, "no whole number from 1 to 50"),
+        ({"band": (0, 1)}, "is not an interval"),
+        ({"band": (2, 1)}, "is not an interval"),
+        ({"band": 3}, "not a pair"),
+        ({"band": (1, np.inf)}, "is not an interval"),
+        ({"band": (1, 2, 3)}, "not a pair"),
+        ({"band": (1, 2), "order": 0}, "not a whole number from 1 to 50"),
+        ({"band": (1, 2), "order": 51}, "not a whole number from 1 to 50"),
     ],
 )
 def test_bands_and_orders_that_are_none_are_refused(options, words):

@@ -91,7 +91,7 @@ def test_a_dead_time_at_the_end_of_a_rest_is_no_channel_that_was_off():
 
 
 def test_a_step_within_noise_of_its_size_is_not_early():
-    # The noise of the quiet rows is none, or colored: a row beyond it is no row of the signal.
+    # The noise of the quiet rows is none, or colored: a row beyond it is not a row of the signal.
     early = Counter()
     for kind in ("of motion", "coloured"):
         for plant in ("lag", "fractional", "swing"):

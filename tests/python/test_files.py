@@ -147,7 +147,7 @@ def test_header_of_ftlm_tells_what_is_not_told(tmp_path):
     assert load(path, units={"y": "rad", "z": "deg"})["z"][1] == pytest.approx(np.pi / 180)
     assert load(path, window=(0.05, None)).start == 0.05
     messages(["'deg'", "'y'", "'rad'", "leave the unit out"], lambda: load(path, units={"y": "deg"}))
-    messages(["whole run"], lambda: load([path, write(tmp_path, rows())]))
+    messages(["complete run"], lambda: load([path, write(tmp_path, rows())]))
     # Rows may be cut off by hand; the step stays.
     lines = path.read_text().splitlines(keepends=True)
     cut = load(write(tmp_path, "".join(lines[:2] + lines[5:])))

@@ -470,9 +470,9 @@ def test_the_arm_of_real_files_is_its_deflections():
     assert (arm.coupling, arm.coefficient_law) == ("measured", ())
     assert arm.sensor_filter == ftlm.SensorFilter.low_pass(["theta12", "theta22"])
     assert StructureOptions().structure("arm:2").outputs == ("theta22",)
-    with pytest.raises(ftlm.ModelError, match="cross_damping=True follows the other deflection as it was measured"):
+    with pytest.raises(ftlm.ModelError, match="cross_damping=True needs the measured other deflection"):
         ftlm.flexible_link(cross_damping=True)
-    with pytest.raises(ftlm.ModelError, match="hub=False leaves the deflection to the measured hub"):
+    with pytest.raises(ftlm.ModelError, match="hub=False drives the deflection by the measured hub"):
         ftlm.flexible_link(hub=False, form="published")
 
 

@@ -92,7 +92,7 @@ def test_slopes_are_those_of_differences(name):
     seconds = 1.1 * np.array([truth[n.replace("delay_i", "delay_u")] for n in problem.names])
     values = problem.in_problem_units(seconds)
     _, slopes = problem.residuals(values)
-    own = problem.slopes_in_seconds(values, slopes)
+    own = problem.jacobian_in_seconds(values, slopes)
     np.testing.assert_allclose(problem.in_seconds(values), seconds, rtol=1e-12)
     for k, at in enumerate(seconds):
         step = 1e-6 * max(abs(at), 1e-3)
@@ -100,7 +100,7 @@ def test_slopes_are_those_of_differences(name):
         for side in (step, -step):
             moved = seconds.copy()
             moved[k] += side
-            ends.append(problem.residuals(problem.in_problem_units(moved), slopes=False)[0])
+            ends.append(problem.residuals(problem.in_problem_units(moved), jacobian=False)[0])
         naive = (ends[0] - ends[1]) / (2 * step)
         assert np.max(np.abs(own[:, k] - naive)) < 1e-5 * np.max(np.abs(naive)), problem.names[k]
 
@@ -518,7 +518,7 @@ def test_the_command_says_what_python_says(tmp_path):
     for words, code, text in (
         (["--structure", ARC, "--weights", "deviation"], 3, "states no standard deviation; use --weights relative"),
         (["--structure", "arm:1"], 2, "a frequency response takes an equation in words"),
-        (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is no part"),
+        (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is not part"),
         (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is asked for"),
         (["--structure", ARC, "--start", "alfa=1"], 2, "did you mean alpha?"),
         (["--equation", ARC], 2, "--structure takes equations in words, too"),
@@ -575,7 +575,11 @@ def test_data_are_never_changed():
         ({"structure": "D U = a U + b sat(I, 3)"}, ftlm.ModelError, r"I saturates or has a dead zone, which a frequ"),
         ({"structure": "D U = a U + b I + c"}, ftlm.ModelError, r"have an offset, which a frequency response does not"),
         ({"structure": "D U = a U"}, ftlm.ModelError, r"the equations of U have no input"),
-        ({"structure": "D y = a y + b I"}, ftlm.DataError, r"cell has the output 'U', which is no output of the equa"),
+        (
+            {"structure": "D y = a y + b I"},
+            ftlm.DataError,
+            r"cell has the output 'U', which is not an output of the equa",
+        ),
         ({"structure": "D U = a U + b I + d J"}, ftlm.DataError, r"no record is from J, an input of the equations"),
         ({"orders": {"alpa": 1.0}}, ftlm.ModelError, r"alpa"),
         ({"fixed": {"q": 1.0}}, ftlm.ModelError, r"fixed coefficient 'q' does not occur"),
@@ -616,7 +620,7 @@ def test_too_few_frequencies_and_responses_of_size_0_are_refused():
             ("f", "Hz", "dB"),
             r"the columns 'f' and 'Hz' may both be the frequency; name one with columns=\{part",
         ),
-        (("freq [parsec]", "re", "im"), r"states the unit 'parsec', which is no unit of frequency"),
+        (("freq [parsec]", "re", "im"), r"states the unit 'parsec', which is not a unit of frequency"),
         (("Hz", "Re (Ohm)", "Im (mOhm)"), r"have the units 'Ohm' and 'mOhm'; give both in one unit"),
     ],
 )
@@ -634,7 +638,7 @@ def test_what_is_said_of_a_file_is_checked(tmp_path):
         ({"magnitude_unit": "dB", "phase_unit": "turns"}, r"phase_unit='turns' is unknown"),
         (
             {"columns": {"frequncy": "f"}},
-            r"'frequncy' is no part of a frequency response \(did you mean 'freq",
+            r"'frequncy' is not part of a frequency response \(did you mean 'freq",
         ),
         ({"columns": {"frequency": "g"}}, r"column 'g' \(frequency\) is not in 'x.csv'"),
         ({"columns": 3}, r"columns is a int; pass a dict of part: column"),

@@ -236,7 +236,7 @@ def test_words_are_read_and_written() -> None:
     ("words", "said"),
     [
         ("D^2 y = u + fc*sign(D y)", "it is subtracted"),
-        ("D^2 y = u - fc*sign(D u)", "own output"),
+        ("D^2 y = u - fc*sign(D u)", "velocity of the output of the equation"),
         ("D^2 y = u - fc*sign(y)", "of a measured speed .*fc.tanh"),
         ("D^2 y = u - fc*sign(D y) - fs*sign(D y)", "twice"),
         ("D^0.8 y = u - fc*sign(D y)", r"outside \(1, 2\]"),
@@ -250,7 +250,7 @@ def test_words_that_mean_nothing_are_refused(words: str, said: str) -> None:
 
 
 def test_a_negative_coefficient_is_refused() -> None:
-    with pytest.raises(ModelError, match="not negative"):
+    with pytest.raises(ModelError, match="at least 0"):
         model_of(BLOCK, fc=-0.1)
 
 
@@ -330,7 +330,7 @@ def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
     page = found.report(tmp_path / "cart.html").read_text()
     assert "sgn" in page
     assert "Coulomb friction" in page
-    # What is not known is no row of four times "undefined": the reason stands there.
+    # What is not known is not a row of four times "undefined": the reason stands there.
     reason = "y has no equation error: friction acts on it, and the sign of a measured velocity is that of its noise"
     assert reason in page
     assert '<data value="nan">' not in page

@@ -149,7 +149,7 @@ def test_what_is_printed_is_read(structure):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("D y = a y^2.5 + u", "at character 9: the power 2.5 of y is no whole number; write abs(y)^2.5"),
+        ("D y = a y^2.5 + u", "at character 9: the power 2.5 of y is not a whole number; write abs(y)^2.5"),
         ("D y = a y^-1 + u", "at character 9: the power -1 of y is not in [1, 100]; a quotient of signals is a signal"),
         ("D y = a y/u", "'u' at character 11 divides"),
         ("D y = a sin(y/u)", "'u' at character 15 divides inside a non-linear term"),
@@ -176,7 +176,7 @@ def test_what_is_printed_is_read(structure):
         ("y = (a s + b)/((s + 1) (c s + 2)) u", "c stands in several terms once multiplied out"),
         ("y = 1/(s + a) u + 1/(s + b) v", "a*b is a product of two coefficients"),
         ("y = (s + 1) (a s + 1)/(s + 2) u", "a stands in several terms once multiplied out"),
-        (f"y = 1/(s + 1)^{MAX_POLYNOMIAL_POWER + 1} u", "no whole number from 1 to 10"),
+        (f"y = 1/(s + 1)^{MAX_POLYNOMIAL_POWER + 1} u", "not a whole number from 1 to 10"),
         ("y = 1/(s + 1", "expected ')' at character 13"),
         ("D y - D y = u", "D^1 y cancels out"),
         ("u = D y", "its left-hand side has no derivative"),

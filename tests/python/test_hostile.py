@@ -247,9 +247,9 @@ def test_a_small_file_is_a_regular_file_of_little_size(kind, written, tmp_path):
         stream.truncate(60 << 30)
     closed.write_bytes(b"\xff\x00" * 100)
     for path, words in (
-        (pipe, "is no regular file"),
-        (device, "is no regular file"),
-        (folder, "is no regular file"),
+        (pipe, "is not a regular file"),
+        (device, "is not a regular file"),
+        (folder, "is not a regular file"),
         (large, "has 64424509440 bytes"),
         (absent, "No such file"),
         (closed, "c.toml"),
@@ -336,7 +336,7 @@ def test_an_executor_that_returns_nothing_ends(small_run, result):
 
 
 def test_what_is_no_executor_is_refused(small_run):
-    with pytest.raises(ftlm.ModelError, match="is no executor"):
+    with pytest.raises(ftlm.ModelError, match="is not an executor"):
         ftlm.search_orders(
             small_run,
             ftlm.equation("D^a y = c D^b y + d u"),

@@ -333,8 +333,8 @@ def test_a_prior_that_pulls_is_named(small_run, structure):
     found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=0.01))
     (warning,) = (w for w in found.warnings if "the prior" in w)
     assert "y: the prior (K0 = 0.01, coefficients near 0) shifts a coefficient by" in warning
-    assert "Raise prior_covariance or use method='least-squares'" in warning
-    assert "p = 7 only weighs the data against it" in warning
+    assert "Raise prior_covariance=, or use method='least-squares'" in warning
+    assert "p = 7 only sets the weight of the data relative to the prior" in warning
     weak = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=1e6))
     assert not any("the prior" in w for w in weak.warnings)
     # As weak as numbers go.
@@ -482,11 +482,11 @@ def test_a_trace_that_diverges_is_infinite_there():
     [
         ("D^alpha y = a y + b u", {}, "a trace needs one equation whose orders are numbers"),
         ("D y = a y; D z = b z", {}, "a trace needs one equation whose orders are numbers"),
-        (WORDS, {"every": 0}, "every = 0 is no whole number from 1"),
-        (WORDS, {"every": "x"}, "every = 'x' is no whole number from 1"),
+        (WORDS, {"every": 0}, "every = 0 is not a whole number of at least 1"),
+        (WORDS, {"every": "x"}, "every = 'x' is not a whole number of at least 1"),
         (WORDS, {"innovation_length": 0}, "innovation_length = 0"),
         (WORDS, {"prior_covariance": 0}, "prior_covariance = 0 is not positive"),
-        (WORDS, {"m": 300}, "m = 300 is no power of two"),
+        (WORDS, {"m": 300}, "m = 300 is not a power of two"),
         (WORDS, {"row_basis": "x"}, "row_basis = 'x' is not known"),
     ],
 )

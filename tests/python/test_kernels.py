@@ -271,11 +271,11 @@ def test_candidates_without_an_estimate_are_marked():
         (lambda: kernels.errors(np.ones(3), np.ones(4)), r"\(3,\), predicted \(4,\)"),
         (lambda: kernels.block_pulse_kernel(0.5, 0, step=STEP), "m"),
         (lambda: kernels.Candidates(np.ones(4), [0], step=STEP), r"signals has shape \(4,\)"),
-        (lambda: kernels.Candidates(np.ones((2, 4)), [2], step=STEP), "terms = 2 is no row of 2 signals"),
+        (lambda: kernels.Candidates(np.ones((2, 4)), [2], step=STEP), "terms = 2 is not a row of 2 signals"),
         (lambda: kernels.Candidates(np.ones((2, 4)), [], step=STEP), "terms is empty|terms. is empty"),
         (lambda: PAIR.coefficients([0.5, 0.1]), r"orders has shape \(2,\); give \(N, 2\)"),
         (lambda: PAIR.coefficients([[0.5, 0.1], [0.5, 0.6]]), r"orders 1 of 2 are \[0.5, 0.6\] \(1 such"),
-        (lambda: PAIR.coefficients([[0.5, 0.1]], p=-1), "p = -1 is no whole number from 0"),
+        (lambda: PAIR.coefficients([[0.5, 0.1]], p=-1), "p = -1 is not a whole number of at least 0"),
         (lambda: PAIR.coefficients([[0.5, 0.1]], prior_covariance=0.0), "prior_covariance is not positive"),
         (lambda: PAIR.coefficients([[0.5, 0.1]], rows="fourier"), "rows = 'fourier' is not known"),
         (lambda: SHORT.coefficients([[0.5, 0.1]], p=7), "power of two"),
@@ -328,7 +328,10 @@ def test_a_start_in_motion_is_a_term_of_a_recursion():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: kernels.Recursion([1.0, 0.0], [2], step=STEP, hold=[False, True]), "terms = 2 is no row of 2 signals"),
+        (
+            lambda: kernels.Recursion([1.0, 0.0], [2], step=STEP, hold=[False, True]),
+            "terms = 2 is not a row of 2 signals",
+        ),
         (lambda: kernels.Recursion([1.0], [1], step=STEP, hold=[False, True]), r"orders has shape \(1,\); give \(2,\)"),
         (lambda: kernels.Recursion([2.5, 0.0], [1], step=STEP, hold=[False, True]), r"outside \[0, 2\]"),
         (
@@ -337,7 +340,10 @@ def test_a_start_in_motion_is_a_term_of_a_recursion():
         ),
         (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], initial=[-1.0]), r"exponent"),
         (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], initial="rest"), "initial = 'rest'"),
-        (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], p=0), "p = 0 is no whole number from 1"),
+        (
+            lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], p=0),
+            "p = 0 is not a whole number of at least 1",
+        ),
         (lambda: STREAM.push(np.ones(3)), r"samples has shape \(3,\); give \(n, 2\)"),
         (lambda: STREAM.push([[0.0, np.nan]]), r"samples is not finite at index \[0, 1\]"),
     ],

@@ -68,7 +68,7 @@ def test_units_and_settings_of_an_oscilloscope_are_no_row(tmp_path):
     opened = ftlm.open_file(write(tmp_path, text), step=1e-3, inputs={"u": "CH1"}, outputs={"y": "CH2"})
     assert [c.unit for c in opened.columns] == ["Sequence", "Volt", "Volt", "-1.2e-03", "1.0e-03"]
     np.testing.assert_array_equal(opened.load()["y"], np.arange(9))
-    # Words that are no units stay a damaged row.
+    # Words that are not units stay a damaged row.
     messages(
         ["line 2", "'open'"], lambda: ftlm.load(write(tmp_path, text.replace("Volt", "open")), outputs=["CH1"], step=1)
     )

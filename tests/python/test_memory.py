@@ -92,7 +92,7 @@ def test_a_limit_that_is_given_counts(monkeypatch, text):
 @pytest.mark.parametrize("text", ["0", "-1", "2 GiB", "much", "1e9", "nan", "٣", "9" * 18 + "T", "0x10"])
 def test_a_limit_that_is_none_is_refused(monkeypatch, text):
     monkeypatch.setenv(MEMORY_VARIABLE, text)
-    with pytest.raises(ModelError, match=r"FTLM_MEMORY=.* is no size of memory"):
+    with pytest.raises(ModelError, match=r"FTLM_MEMORY=.* is not a memory size"):
         memory_limit()
 
 

@@ -29,14 +29,14 @@ BAD_VALUES = {
     "norm": ("l0", "norm = 'l0' is not known; use 'l1' or 'l2'"),
     "top": (0, "top = 0 is outside [1, 100000]"),
     "store": (3, "store is int; give the path of a file"),
-    "executor": (object(), "is no executor of concurrent.futures"),
-    "innovation_length": (0, "innovation_length = 0 is no whole number from 1; the paper's is 7"),
+    "executor": (object(), "is not an executor of concurrent.futures"),
+    "innovation_length": (0, "innovation_length = 0 is not a whole number of at least 1; the paper's is 7"),
     "prior_covariance": (-1, "prior_covariance = -1 is not positive; a large one is a weak prior"),
     "row_basis": ("columns", "row_basis = 'columns' is not known"),
     "seeds": ("12", "seeds = '12': give 1 to 1000 whole numbers"),
     "evaluations": (100, "evaluations = 100 is less than two generations of 200"),
     "population": (4, "population = 4 is outside [8, 100000]"),
-    "bounds": ({"a": (1.0, 0.0)}, "bounds of a = (1.0, 0.0) are no interval"),
+    "bounds": ({"a": (1.0, 0.0)}, "bounds of a = (1.0, 0.0) are not an interval"),
 }
 
 
@@ -139,7 +139,7 @@ def test_options_of_a_search_need_a_free_order(option, value, noisy, tmp_path, m
 
 def test_an_order_grid_names_free_orders(noisy):
     for kind in (*OrderSearchMethod.__subclasses__(), ftlm.GeneticAlgorithm):
-        with pytest.raises(ftlm.ModelError, match="'beta' of order_grid= is no free order; free are"):
+        with pytest.raises(ftlm.ModelError, match="'beta' of order_grid= is not a free order; free are"):
             ftlm.identify(noisy, ftlm.equation(FREE), method=kind(order_grid=ftlm.order_grid(beta=0.1)))
 
 

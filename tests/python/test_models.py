@@ -339,9 +339,9 @@ def test_values_of_an_order(spec, values):
     ("spec", "message"),
     [
         ("1:2", "'1:2' has 2 parts; write LOW:HIGH:STEP"),
-        ("a", "'a' is no interval; write LOW:HIGH:STEP"),
-        ("1:2:b", "'1:2:b' is no interval"),
-        ("", "'' is no interval"),
+        ("a", "'a' is not an interval; write LOW:HIGH:STEP"),
+        ("1:2:b", "'1:2:b' is not an interval"),
+        ("", "'' is not an interval"),
         ("1:2:0", "increment 0 is not positive"),
         ("1:2:-0.1", "increment -0.1 is not positive"),
         ("1:2:nan", "increment nan is not positive"),
@@ -360,7 +360,7 @@ def test_values_of_an_order(spec, values):
         ([], "has no value; give at least one"),
         ([1, "x"], "= 'x' is not a number"),
         ([1, math.nan], "= nan is outside [-3, 10]"),
-        (None, "None is no list of numbers"),
+        (None, "None is not a list of numbers"),
         ((1.0, 2.0), "(1.0, 2.0) has no step; write (low, high, step)"),
         (True, "= True is not a number"),
     ],
@@ -492,9 +492,9 @@ def test_initial_terms_that_are_none_are_refused(initial, message):
         (((1.0, 3.0),), ((1.0, 2.0), (1.0, 0.0)), "order 3 of its numerator is above 2"),
         (((1.0, 0.0),), (), "its denominator has no term"),
         (((1.0, 0.0),), ((0.0, 1.0),), "its denominator has no term"),
-        (((math.nan, 0.0),), ((1.0, 1.0),), "nan D^0 in its numerator is no term"),
-        (((1.0, 0.0),), ((1.0, 11.0),), "1 D^11 in its denominator is no term"),
-        (((1.0, 0.0),), ((1.0, -1.0),), "1 D^-1 in its denominator is no term"),
+        (((math.nan, 0.0),), ((1.0, 1.0),), "nan D^0 in its numerator is not a term"),
+        (((1.0, 0.0),), ((1.0, 11.0),), "1 D^11 in its denominator is not a term"),
+        (((1.0, 0.0),), ((1.0, -1.0),), "1 D^-1 in its denominator is not a term"),
     ],
 )
 def test_filters_that_are_none_are_refused(numerator, denominator, message):
@@ -647,9 +647,9 @@ FORCED = "exists; {} with force=True"
 @pytest.mark.parametrize(
     ("words", "exists", "folder", "missing"),
     [
-        (DEFAULT_MESSAGES, f"{{}} {FORCED}", f"{{}} {FORCED}", "{} is no folder"),
-        (RUN_MESSAGES, f"'{{}}' {FORCED}", "'{}' is a folder; give the name of a file in it", "'{}' is no folder"),
-        (COMMAND_MESSAGES, f"{{}} {FORCED}", "{} is a folder; name a file in it", "{} is no folder"),
+        (DEFAULT_MESSAGES, f"{{}} {FORCED}", f"{{}} {FORCED}", "{} is not a folder"),
+        (RUN_MESSAGES, f"'{{}}' {FORCED}", "'{}' is a folder; give the name of a file in it", "'{}' is not a folder"),
+        (COMMAND_MESSAGES, f"{{}} {FORCED}", "{} is a folder; name a file in it", "{} is not a folder"),
     ],
 )
 def test_whether_a_file_may_be_written_is_said_in_the_words_of_who_asks(tmp_path, words, exists, folder, missing):
@@ -773,7 +773,7 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
         "later schema with what is in it": later,
         "later schema, and who wrote it": f"is a model of a later version of ftlm, 'ftlm 7.1': it has schema {10**30}",
         "schema of more than it holds": "says that it has schema 3, and what it holds has schema 2; give a file",
-        "unknown key": "is no ftlm model: Object contains unknown field `extra`",
+        "unknown key": "is not an ftlm model: Object contains unknown field `extra`",
     }
     assert expected.get(kind, "") in message
 
@@ -781,9 +781,9 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
 @pytest.mark.parametrize("load", [ftlm.load_model, ftlm.control.load_controller])
 def test_what_is_no_path_of_a_file_is_refused(load, tmp_path):
     for wrong in (5, None, b"model.json", ["model.json"], 10**5000):
-        with pytest.raises(ftlm.DataError, match=r"^path = .* is no path of a file; give a file "):
+        with pytest.raises(ftlm.DataError, match=r"^path = .* is not the path of a file; give a file "):
             load(wrong)
-    with pytest.raises(ftlm.DataError, match="is no regular file; give a file "):
+    with pytest.raises(ftlm.DataError, match="is not a regular file; give a file "):
         load(tmp_path)
     for absent in (tmp_path / "none.json", "a\0b", "\ud800.json", "x" * 5000):
         with pytest.raises(ftlm.DataError, match=r"cannot be read: .*; check the path$") as refused:
@@ -820,8 +820,8 @@ def test_a_model_file_flipped_anywhere_never_is_another_kind_of_error(tmp_path):
 def test_paths_that_hold_no_model_are_refused(tmp_path):
     for path, message in (
         (tmp_path / "missing.json", "missing.json cannot be read: No such file or directory; check the path"),
-        (tmp_path, "is no regular file"),
-        ("/dev/null", "is no regular file"),
+        (tmp_path, "is not a regular file"),
+        ("/dev/null", "is not a regular file"),
         (f"{tmp_path}/nul\0", "nul"),
     ):
         with pytest.raises(ftlm.DataError) as refused:

@@ -95,7 +95,7 @@ def test_order_search_ranks_by_free_runs(runs, tmp_path, monkeypatch):
     monkeypatch.setattr("ftlm.order_search.search.FREE_RUN_CANDIDATES", 30)
     few = ftlm.search_orders(runs["duffing"], structure, GRID, store=tmp_path / "search.store")
     assert few.free_runs == 30
-    assert "the best 30 of 99 candidates by equation error were ranked by free runs" in str(few)
+    assert "the best 30 of 99 candidates by equation error were ranked by simulation" in str(few)
     assert few.table[0].orders == result.table[0].orders
     again = ftlm.resume_search(tmp_path / "search.store")["y"]
     assert again.table == few.table

@@ -211,13 +211,15 @@ def test_the_choice_of_an_optimum_is_given_in_words() -> None:
     joint = found.joint
     level = joint.starts[0][0]
     same = sum(v <= 1.001 * level for v, _ in joint.starts)
-    assert joint.choice.startswith(f"{same} of {len(joint.starts)} starts ended in the lowest optimum, first that of: ")
-    assert joint.choice in found.details()
-    assert found.to_dict()["choice"] == joint.choice
+    assert joint.origin_text.startswith(
+        f"{same} of {len(joint.starts)} starts ended in the lowest optimum, first that of: "
+    )
+    assert joint.origin_text in found.details()
+    assert found.to_dict()["choice"] == joint.origin_text
     given = fit_output_error([three_terms(40, 0)], structure(), start=THREE_TERMS)
-    assert given.choice == "from the start that was given"
+    assert given.origin_text == "from the start that was given"
     behind = replace(joint, starts=[(1.0, "a"), (1.0005, "b"), (3.0, "c")])
-    assert behind.choice == (
+    assert behind.origin_text == (
         "2 of 3 starts ended in the lowest optimum, first that of: a; the next costs 3 times as much"
     )
 

@@ -194,7 +194,7 @@ def test_warnings_come_before_details(tmp_path, identified):
 
 def test_a_validation_that_validates_nothing_is_said(tmp_path, identified, square):
     text = report.identification_page(identified, tmp_path / "p.html", validation=[square]).read_text("utf-8")
-    assert "so it is no validation" in text
+    assert "so it does not validate the model" in text
 
 
 def test_a_lost_fit_is_said(tmp_path, identified, sine):
@@ -238,7 +238,7 @@ def test_existing_files_are_kept(tmp_path, identified):
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_any_work(tmp_path, identified, monkeypatch):
-    with pytest.raises(ftlm.DataError, match="is no folder; make it first"):
+    with pytest.raises(ftlm.DataError, match="is not a folder; make it first"):
         identified.report(tmp_path / "nowhere" / "p.html")
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(ftlm.DataError, match="is read-only; choose another folder"):
@@ -746,7 +746,7 @@ def test_a_pole_map_has_every_pole_and_its_sector():
     with pytest.raises(ftlm.errors.DataError, match="point 1 of 2 is not finite"):
         plane_chart([1j, complex("nan")], title="t", x_label="x", y_label="y")
     for bad in (0.0, 4.0, -1.0):
-        with pytest.raises(ftlm.errors.DataError, match="no angle"):
+        with pytest.raises(ftlm.errors.DataError, match="not an angle"):
             plane_chart([1j], title="t", x_label="x", y_label="y", sector=bad)
 
 

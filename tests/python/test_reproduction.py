@@ -545,7 +545,7 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
     ("words", "code", "message"),
     [
         (["-o", "there.html"], 3, "there.html exists; choose another name"),
-        (["-o", "no/folder.html"], 3, "no is no folder; make it first"),
+        (["-o", "no/folder.html"], 3, "no is not a folder; make it first"),
         (["--save", "full"], 3, "full/square.csv exists (1 such files); choose another folder, or --force"),
         (["--save", "there.html"], 3, "there.html cannot be made"),
         (["--sine", "strange.csv"], 2, "--sine is given without --square"),

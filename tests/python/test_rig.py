@@ -214,7 +214,7 @@ def test_numbers_of_numpy_are_numbers(tmp_path):
     assert type(with_numpy.metadata["seed"]) is int
     assert with_numpy.metadata["input"] == plain.metadata["input"]
     assert VirtualBoard(seed=np.uint8(3)).seed == 3
-    with pytest.raises(ftlm.ModelError, match=r"seed = 0\.5 is not a whole number from 0"):
+    with pytest.raises(ftlm.ModelError, match=r"seed = 0\.5 is not a whole number of at least 0"):
         VirtualBoard(seed=0.5)
 
 
@@ -369,12 +369,12 @@ def test_the_stock_filter_of_a_record_is_that_of_a_model():
         ({"watchdog": 5.0}, "outside [0.01, 1]"),
         ({"rig": "q9"}, "'q9' is not known"),
         ({"parameters": "effectiv"}, "did you mean 'effective'?"),
-        ({"seed": -1}, "seed = -1 is not a whole number from 0"),
-        ({"seed": True}, "seed = True is not a whole number from 0"),
-        ({"seed": np.True_}, "is not a whole number from 0"),
-        ({"seed": 3.0}, "seed = 3.0 is not a whole number from 0"),
-        ({"seed": np.float64(3)}, "is not a whole number from 0"),
-        ({"seed": "3"}, "seed = '3' is not a whole number from 0"),
+        ({"seed": -1}, "seed = -1 is not a whole number of at least 0"),
+        ({"seed": True}, "seed = True is not a whole number of at least 0"),
+        ({"seed": np.True_}, "is not a whole number of at least 0"),
+        ({"seed": 3.0}, "seed = 3.0 is not a whole number of at least 0"),
+        ({"seed": np.float64(3)}, "is not a whole number of at least 0"),
+        ({"seed": "3"}, "seed = '3' is not a whole number of at least 0"),
         ({"amplitude": True}, "not a current in A"),
         ({"amplitude": (0.1, 0.1, 0.1)}, "not a current in A"),
         ({"amplitude": (0.1, "x", 0.1)}, "not a current in A"),

@@ -263,12 +263,12 @@ def test_a_controller_is_reset_and_told_of():
 
 REFUSED = [
     ({"controller": 3, "reference": HOLD}, ftlm.ModelError, "controller is a int"),
-    ({"reference": "text"}, ftlm.DataError, "no array of numbers"),
-    ({"reference": None}, ftlm.DataError, "no array of numbers"),
-    ({"reference": []}, ftlm.DataError, "no array of numbers"),
-    ({"reference": [[0.1], [0.1]]}, ftlm.DataError, "no array of numbers"),
-    ({"reference": [(0.1, 0.1j)] * 200}, ftlm.DataError, "no array of numbers"),
-    ({"reference": [(0, 1), (0,)]}, ftlm.DataError, "no array of numbers"),
+    ({"reference": "text"}, ftlm.DataError, "not an array of numbers"),
+    ({"reference": None}, ftlm.DataError, "not an array of numbers"),
+    ({"reference": []}, ftlm.DataError, "not an array of numbers"),
+    ({"reference": [[0.1], [0.1]]}, ftlm.DataError, "not an array of numbers"),
+    ({"reference": [(0.1, 0.1j)] * 200}, ftlm.DataError, "not an array of numbers"),
+    ({"reference": [(0, 1), (0,)]}, ftlm.DataError, "not an array of numbers"),
     ({"reference": (0.1, 0.1)}, ftlm.ModelError, "needs duration"),
     ({"reference": np.zeros((2, 2))}, ftlm.ModelError, "fewer than three samples"),
     ({"reference": np.zeros((50, 2)), "duration": 0.2}, ftlm.DataError, "has 50 rows, .* has 101"),
@@ -327,9 +327,9 @@ def nested(depth):
 @pytest.mark.parametrize(
     ("told", "words"),
     [
-        ({"x": np.nan}, "no JSON"),
-        ({"x": 10**5000}, "no JSON"),
-        (nested(10**5), "no JSON"),
+        ({"x": np.nan}, "not valid JSON"),
+        ({"x": 10**5000}, "not valid JSON"),
+        (nested(10**5), "not valid JSON"),
         # What stands in a file must be read again: the line that holds it has its limit.
         ({"x": "x" * 10**6}, "1000042 characters long, more than the 100000"),
     ],

@@ -63,7 +63,7 @@ BAD_ARRAYS = {
     "scalar": ({"inputs": {"u": 3.0}}, ["'u'", "()"]),
     "none": ({"inputs": {"u": None}}, ["'u'", "None"]),
     "one word": ({"inputs": {"u": "fast"}}, ["'u'", "fast"]),
-    "ragged": ({"inputs": {"u": [[1.0], [1.0, 2.0]]}}, ["'u'", "no array of numbers"]),
+    "ragged": ({"inputs": {"u": [[1.0], [1.0, 2.0]]}}, ["'u'", "not an array of numbers"]),
     "complex": (
         {"inputs": {"u": put(ramp(), [], 0) + 1j * (np.arange(N) >= 40)}},
         ["'u'", "row 40", "10 in all", ".real"],
@@ -485,7 +485,7 @@ def test_resample_of_a_run():
         "resampled from 0.01 s to 0.005 s (held: u, by means over the new intervals; outputs keep their own times"
         in finer.warnings[0]
     )
-    # Values between the rows are no measurements; every second row is.
+    # Values between the rows are not measurements; every second row is.
     np.testing.assert_array_equal(finer.sample_times.data["y"], run["y"])
     assert run.resample(0.02).sample_times is None
     assert run.resample(0.015).sample_times is not None

@@ -289,8 +289,8 @@ def test_auto_is_of_outputs_that_something_drives(runs):
     # An output is measured when it acts.
     assert str(IntegerOrderForm(1, 0, delayed=True).structure(second)) == "D^1 z = a0_z z + b0_z y"
     for asked, words in (
-        ({"x": ["u"]}, "'x' is no output"),
-        ({"z": ["z"]}, "'z' does not drive z"),
+        ({"x": ["u"]}, "'x' is not an output"),
+        ({"z": ["z"]}, "'z' cannot drive z"),
     ):
         with pytest.raises(ftlm.ModelError, match=words):
             automatic_problems(pair, driven_by=asked)
@@ -339,7 +339,7 @@ def test_masked_runs_keep_what_was_read(runs):
 
 def test_words_where_nothing_can_be_chosen(runs):
     second = ftlm.equation("D^2 y = d D y + a y + b u")
-    with pytest.raises(ftlm.ModelError, match="there is one; give two or more"):
+    with pytest.raises(ftlm.ModelError, match="there is only one; give several runs"):
         ftlm.select(runs[0], second, validation="runs")
     with pytest.raises(ftlm.ModelError, match="'halves' is not known; use 'runs', 'blocks', or a run"):
         ftlm.select(runs, second, validation="halves")
@@ -350,11 +350,11 @@ def test_words_where_nothing_can_be_chosen(runs):
     with pytest.raises(ftlm.ModelError, match="are the same structure; leave one out"):
         name_candidates({"one": second, "two": ftlm.equation("D^2 y = d D y + a y + b u")})
     renamed = ftlm.equation("D^2 y = k y + c D y + g u")
-    with pytest.raises(ftlm.ModelError, match="the same structure but for the names of their numbers; leave one out"):
+    with pytest.raises(ftlm.ModelError, match="the same structure except for parameter names; leave one out"):
         ftlm.select(runs, {"one": second, "two": renamed})
     with pytest.raises(ftlm.ModelError, match="candidates 'any, offset' and 'constant' are the same structure; leave"):
         ftlm.select(runs, {"any": replace(second, offset="auto"), "constant": replace(second, offset="constant")})
-    with pytest.raises(ftlm.ModelError, match=r"validation = \[\] has no run to validate on"):
+    with pytest.raises(ftlm.ModelError, match=r"validation = \[\] has no run; give a run that is not"):
         ftlm.select(runs, second, validation=[])
     with pytest.raises(ftlm.ModelError, match="candidates = 'D y = u'; use 'auto'"):
         ftlm.select(runs, "D y = u")
@@ -504,16 +504,15 @@ def test_none_wins_that_fails_where_another_does_not():
     said = _reason(steady, steady, [steady, failing])
     assert "steady (5 parameters, validation fit 75.00 %), which predicts best" in said
     assert said.endswith(
-        "failing has 25 % smaller residuals on the mean and is not chosen: it fails on y of run 3, with < -1000 "
-        "% where the "
-        "chosen one has 60.00."
+        "failing has 25 % smaller residuals on average and is not chosen: it fails on y of run 3, with a fit of < "
+        "-1000 % where the chosen one has 60.00 %."
     )
     # It is none of the best with more numbers either.
     assert "more (6)" not in said
     # Where each fails somewhere the mean decides, and the reason tells where.
     other = stretches("other", (-50, 80, 80, 60))
     assert _rank_trials([other, failing]) == [failing, other]
-    assert "It fails on y of run 3, with < -1000 % where other has 60.00, which fails elsewhere." in _reason(
+    assert "It fails on y of run 3, with a fit of < -1000 %; other has 60.00 % there, but fails elsewhere." in _reason(
         failing, failing, [failing, other]
     )
     # One that grows without bound fails nobody, nor do stretches that nobody predicts, of noise alone.
@@ -580,14 +579,14 @@ def test_the_command(tmp_path):
     first = ["--structure", "D y = a y + b u"]
     asked = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", "runs"])
     assert asked.exit_code == 2
-    assert "--validation runs leaves one run out at a time, and there is one" in asked.output
+    assert "--validation runs leaves one run out at a time, but there is only one" in asked.output
     assert "or use --validation blocks" in asked.output
     by_file = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", files[1]])
     assert by_file.exit_code == 0, by_file.output
     assert "1, not fitted to" in by_file.output
     wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--orders", "alpha=1"])
     assert wrong.exit_code == 2
-    assert "--orders: of a structure that is given, not used with --structure auto" in wrong.output
+    assert "--orders: options of a given structure, not used with --structure auto" in wrong.output
 
 
 def test_a_fit_below_all_measure_keeps_its_column():

@@ -136,13 +136,13 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
     for words, other in {
         "of other candidates": lambda: ftlm.select(runs, [SECOND], store=place),
         "of other runs": lambda: ftlm.select([runs[0], motor(3, rows=200)], [SECOND, FIRST], store=place),
-        "by another validation": lambda: ftlm.select(runs, [SECOND, FIRST], validation="blocks", store=place),
+        "with other validation data": lambda: ftlm.select(runs, [SECOND, FIRST], validation="blocks", store=place),
     }.items():
         with pytest.raises(ftlm.DataError, match=f"holds a selection {words}; choose another file"):
             other()
     judged = ftlm.select(runs[0], [FIRST], validation=runs[1], store=tmp_path / "judged.ftlm")
     assert judged.winner.failed is None
-    with pytest.raises(ftlm.DataError, match="another validation"):
+    with pytest.raises(ftlm.DataError, match="with other validation data"):
         ftlm.select(runs[0], [FIRST], validation=motor(3, rows=200), store=tmp_path / "judged.ftlm")
     request = Request.of(*_asked(runs))
     with Store(place, request), pytest.raises(ftlm.DataError, match="in use by another selection; wait for it"):
@@ -150,21 +150,21 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
     older = Request(request.algorithm + 1, "0.0.1", request.runs, request.candidates, request.validation)
     with Store(tmp_path / "older.ftlm", older):
         pass
-    with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
+    with pytest.raises(ftlm.DataError, match=r"was written by ftlm 0\.0\.1, algorithm .* finish the selection"):
         ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "older.ftlm")
     # Digests of another version tell nothing of what it was asked.
     strange = Request(request.algorithm, "0.0.1", b"other", b"others", b"another")
     with Store(tmp_path / "strange.ftlm", strange):
         pass
-    with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
+    with pytest.raises(ftlm.DataError, match=r"was written by ftlm 0\.0\.1, algorithm .* finish the selection"):
         ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "strange.ftlm")
     assert place.read_bytes() == before
     text = tmp_path / "notes.txt"
     text.write_text("to do\n")
-    with pytest.raises(ftlm.DataError, match="is no ftlm selection store; give a file written with store="):
+    with pytest.raises(ftlm.DataError, match="is not an ftlm selection store; give a file written with store="):
         ftlm.select(runs, [FIRST], store=text)
     assert text.read_text() == "to do\n"
-    with pytest.raises(ftlm.DataError, match="is no regular file"):
+    with pytest.raises(ftlm.DataError, match="is not a regular file"):
         ftlm.select(runs, [FIRST], store=tmp_path)
     with pytest.raises(ftlm.DataError, match="cannot be opened: No such file"):
         ftlm.select(runs, [FIRST], store=tmp_path / "no" / "such.ftlm")
@@ -177,7 +177,7 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
     forged = tmp_path / "forged.ftlm"
     with Store(forged, request) as kept:
         kept._file.append([RECORD_ENCODER.encode(request)])
-    with pytest.raises(ftlm.DataError, match="holds something else in record"):
+    with pytest.raises(ftlm.DataError, match="has an unexpected entry in record"):
         Store(forged, request)
 
 
@@ -218,18 +218,18 @@ def test_wrong_contents_under_valid_digests_are_refused_in_words(runs, tmp_path)
         return StoredFit(dataclasses.replace(joint, **changes), plain.history)
 
     fits = {
-        r"a covariance or values of other than its \d numbers": [
+        r"a covariance or values of another size than its \d parameters": [
             but(covariance=joint.covariance[:-1]),
             but(covariance=joint.covariance.ravel()),
             but(finest_grid_values=np.tile(joint.finest_grid_values, 2)),
             but(coefficients=joint.coefficients | {"c": 1.0}),
         ],
-        "residuals that are no series": [but(residuals=[{"y": np.zeros((2, 2))}])],
-        "a history that is no powers of t but 'auto'": [history],
+        "residuals that are not one-dimensional": [but(residuals=[{"y": np.zeros((2, 2))}])],
+        "the initial terms 'auto' instead of powers of t": [history],
     }
-    wrong = [("holds something else in record .*choose another file", unknown)]
+    wrong = [("has an unexpected entry in record .*choose another file", unknown)]
     wrong += [
-        ("holds something else in record .*choose another file", RECORD_ENCODER.encode(StoredAnswer(b"0", one)))
+        ("has an unexpected entry in record .*choose another file", RECORD_ENCODER.encode(StoredAnswer(b"0", one)))
         for one in (
             but(initial="nowhere"),
             but(unstable_optimum=(True, "x", False)),
@@ -257,11 +257,11 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
     def ask(kept, what):
         if what == "a fit":
             return kept.fit(FIRST, [], True, lambda: joint)
-        if what == "a judgement":
+        if what == "a validation":
             return kept.validation("first", FIRST, joint, False, lambda: trial.Trial("first", FIRST, 2, failed="x"))
         return kept.subsets(FIRST, list)
 
-    questions, answers = ("a fit", "a judgement", "subsets"), {}
+    questions, answers = ("a fit", "a validation", "subsets"), {}
     for what in questions:
         with Store(tmp_path / f"{what}.ftlm", request) as kept:
             ask(kept, what)
@@ -274,7 +274,7 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
             place = _forged(tmp_path / f"{what} {held}.ftlm", request, RECORD_ENCODER.encode(StoredAnswer(key, answer)))
             with (
                 Store(place, request) as kept,
-                pytest.raises(ftlm.DataError, match=f"holds {held} where {what} was asked for; choose another file"),
+                pytest.raises(ftlm.DataError, match=f"holds {held} where {what} is expected; choose another file"),
             ):
                 ask(kept, what)
 

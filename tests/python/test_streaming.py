@@ -131,7 +131,11 @@ def test_an_estimate_that_fails_does_not_stop_the_run(stage):
         (ftlm.flexible_link(form="published", stage=1), {}, "are free; a stream needs numbers"),
         (ftlm.equation("D^1.5 y = b u", initial="caputo"), {}, "cannot be followed in a stream"),
         (ftlm.equation("D^2.5 y = b u"), {}, "outside [0, 2]"),
-        (ftlm.equation("D^1.5 y = b u"), {"innovation_length": 0}, "innovation_length = 0 is no whole number from 1"),
+        (
+            ftlm.equation("D^1.5 y = b u"),
+            {"innovation_length": 0},
+            "innovation_length = 0 is not a whole number of at least 1",
+        ),
         (ftlm.equation("D^1.5 y = b u"), {"prior_covariance": 0.0}, "prior covariance"),
     ],
 )

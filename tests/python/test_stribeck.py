@@ -213,17 +213,17 @@ def test_words_are_read_and_written() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (f"D^2 y = u {NEAR}", r"write '- fc\*sign\(D y\)' beside it"),
+        (f"D^2 y = u {NEAR}", r"add '- fc\*sign\(D y\)'"),
         (f"{BLOCK} {NEAR.replace('fs', 'fs2')}", "Stribeck friction of D y stands there twice"),
         ("D^2 y = u - fc*sign(D y) + fs*exp(-(D y/vs)^2)*sign(D y)", "it is subtracted"),
-        ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D u)", "own output"),
+        ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D u)", "velocity of the output of the equation"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D y)", "follows one velocity"),
         ("D^2 y = u - fc*sign(D y) - fs*exp((D y/vs)^2)*sign(D y)", r"expected -\(D y/vs\)\^2"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^3)*sign(D y)", "expected '2'"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(y/vs)^2)*sign(D y)", "D and the name of a signal"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/-1)^2)*sign(D y)", "a speed"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)", "'vs' at character 41 divides inside a non-linear term"),
-        ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/0)^2)*sign(D y)", "vs = 0; a speed is positive"),
+        ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/0)^2)*sign(D y)", "vs = 0; give a positive one"),
         ("D^2 y = u - fc*sign(D y) - fc*exp(-(D y/vs)^2)*sign(D y)", "fc stands twice"),
         ("D^0.8 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)", r"outside \(1, 2\]"),
     ],
@@ -236,7 +236,7 @@ def test_words_that_mean_nothing_are_refused(words: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"fs": -0.1}, "not negative"),
+        ({"fs": -0.1}, "at least 0"),
         ({"vs": 0.0}, "positive"),
         ({"vs": -1.0}, "positive"),
         ({"vs": np.nan}, "finite"),
@@ -272,7 +272,7 @@ def test_a_file_keeps_it(tmp_path) -> None:
     assert "stribeck" not in plain.read_text()
     text = path.read_text()
     path.write_text(text.replace('"speed": 0.2', '"speed": -0.2'))
-    with pytest.raises(DataError, match="a speed is positive"):
+    with pytest.raises(DataError, match="give a positive one"):
         ftlm.load_model(path)
     path.write_text(text.replace('"schema": 7', '"schema": 8'))
     with pytest.raises(DataError, match="what it holds has schema 7"):

@@ -145,7 +145,7 @@ def test_two_terms_that_are_one_are_told_apart_by_nothing(twice: ftlm.Identifica
     assert read.estimate.standard_errors["a"] == errors["a"]
     page = twice.report(tmp_path / "report.html").read_text(encoding="utf-8")
     assert "−∞" in page
-    assert "The runs leave directions unseen, so there are no bands" in page
+    assert "The runs do not identify all parameters, so there are no bands" in page
     model_page(read, tmp_path / "model.html")
 
 

@@ -229,8 +229,8 @@ def test_rough_intervals_are_a_fact(found, checked):
     doubted = worse(found, findings=(ROUGH,))
     assert verdict(doubted, checked).trusted
     assert doubted.warnings == (
-        "the cost is not quadratic along a0, and its profile would take long: these intervals are approximate; "
-        "intervals='profile' computes them",
+        "the cost is not quadratic along a0, and a profile likelihood would take long: these intervals are "
+        "approximate; intervals='profile' computes them",
     )
 
 
@@ -309,7 +309,7 @@ def test_a_saved_model_keeps_the_records(found, tmp_path):
     for bad in ([{"level": "trust", "reason": "x"}], [{"numbers": {}}], ["x"], {}, [{"code": 3}]):
         document["estimate"]["against"] = bad
         path.write_text(json.dumps(document), encoding="utf-8")
-        with pytest.raises(ftlm.DataError, match="is no ftlm model"):
+        with pytest.raises(ftlm.DataError, match="is not an ftlm model"):
             ftlm.load_model(path)
     # A code of a later version is shown as its text, and one that lacks its numbers by the text of its file.
     for code, level, reason in (("later", "with care", "<script>x</script>"), ("poor_fit", "do not use", "poor_fit")):
@@ -468,7 +468,7 @@ def test_findings_are_grouped_the_most_serious_first():
         make_finding("data_note", run="r", text="time read in ms, as the header 'time [ms]' says"),
     ]
     found = group_findings([*said, said[0]])
-    assert [g.first_finding.kind.topic for g in found] == ["unstable", "residuals", "edge", "other"]
+    assert [g.first_finding.kind.topic for g in found] == ["unstable", "residuals", "bound", "other"]
     assert found[1].findings == (said[0], said[2])
     assert found[1].count == " (and 1 more alike)"
     assert sum(len(g.findings) for g in found) == len(said)

@@ -196,12 +196,12 @@ pub fn equation(output: usize, order: f64, terms: &[(usize, f64, f64)]) -> Equat
 }
 
 pub fn record(step: f64, signals: Vec<Vec<f64>>) -> Record {
-    Record::new(step, PulseMeans::from_rows(signals), None).unwrap()
+    Record::new(step, PulseMeans::from_signals(signals), None).unwrap()
 }
 
 /// A record like `record` with one signal replaced.
 pub fn with_signal(record: &Record, index: usize, values: Vec<f64>) -> Record {
     let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
     signals[index] = values;
-    Record::new(record.step(), PulseMeans::from_rows(signals), None).unwrap()
+    Record::new(record.step(), PulseMeans::from_signals(signals), None).unwrap()
 }

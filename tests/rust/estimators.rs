@@ -110,7 +110,7 @@ fn a_record_through_a_sensor_filter_keeps_its_equation() {
     let plain = obeying(&model, m, 0.01, &initial, 0.0, 65);
     let filter: Vec<f64> = (0..m).map(|k| 0.2 * 0.8_f64.powi(i32::try_from(k).unwrap())).collect();
     let signals = (0..3).map(|s| series::multiply_naive(&filter, plain.signal(s), m)).collect();
-    let filtered = Record::new(0.01, PulseMeans::from_rows(signals), Some(filter.clone())).unwrap();
+    let filtered = Record::new(0.01, PulseMeans::from_signals(signals), Some(filter.clone())).unwrap();
     for (exponent, _) in initial {
         let oracle = series::multiply_naive(&filter, &plain.initial_term(exponent), m);
         assert!(relative_distance(&filtered.initial_term(exponent), &oracle) < 1e-13);
@@ -383,7 +383,7 @@ fn banks_hold_the_integrals() {
         let base = obeying(&model, 200, 0.02, &[], 0.1, 62);
         let series: Vec<f64> = (0..200).map(|k| 0.5_f64.powi(k + 1)).collect();
         let signals = (0..3).map(|s| base.signal(s).to_vec()).collect();
-        let record = Record::new(0.02, PulseMeans::from_rows(signals), filter.then_some(series)).unwrap();
+        let record = Record::new(0.02, PulseMeans::from_signals(signals), filter.then_some(series)).unwrap();
         let mut index = Index::default();
         assert_eq!(index.insert(Key::integral(0, 0.9)), 0);
         assert_eq!(index.insert(Key::integral(1, 0.0)), 1);
@@ -438,7 +438,7 @@ fn a_bank_beyond_memory_is_refused_before_it_is_made() {
 
 #[test]
 fn records_are_checked_once() {
-    let bad = |step, signals, filter| Record::new(step, PulseMeans::from_rows(signals), filter).err().unwrap();
+    let bad = |step, signals, filter| Record::new(step, PulseMeans::from_signals(signals), filter).err().unwrap();
     assert!(matches!(bad(0.0, vec![vec![1.0]], None), Error::OutOfRange { .. }));
     assert!(matches!(bad(0.1, vec![], None), Error::Length { .. }));
     assert!(matches!(bad(0.1, vec![vec![]], None), Error::Length { .. }));

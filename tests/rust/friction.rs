@@ -138,7 +138,7 @@ fn slopes_of_a_pulse_are_those_of_differences() {
 
 #[test]
 fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
-    let record = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 50], vec![1.0; 50]]), None)?;
+    let record = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 50], vec![1.0; 50]]), None)?;
     for (stribeck, speed) in [(-0.1, 0.2), (0.1, 0.0), (0.1, -0.2)] {
         let mut wrong = body(1.8, 0.5);
         wrong.frictions[0].1 = FrictionLaw { stribeck, speed, ..wrong.frictions[0].1 };
@@ -152,7 +152,7 @@ fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
 
 #[test]
 fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
-    let record = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 400], force(400)]), None)?;
+    let record = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 400], force(400)]), None)?;
     let motion = body(2.0, 2.5).run(&record, &[vec![(0.0, 0.7), (1.0, 0.7)]])?;
     assert!(motion.bodies[0].is_always_at_rest());
     assert!(motion.outputs[0].iter().all(|y| (y - 0.7).abs() < 1e-15));
@@ -162,7 +162,7 @@ fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
 #[test]
 fn its_numbers_are_found_again() -> Result<(), Error> {
     let m = 600;
-    let record = Record::new(0.02, PulseMeans::from_rows(vec![vec![0.0; m], force(m)]), None)?;
+    let record = Record::new(0.02, PulseMeans::from_signals(vec![vec![0.0; m], force(m)]), None)?;
     let truth = body(1.9, 0.8);
     let output = truth.run(&record, &[vec![]])?.outputs.swap_remove(0);
     let experiment = Experiment::new(record, 1, vec![ftlm::signal::block_pulse::point_samples(&output)], vec![1.0])?;
@@ -217,7 +217,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
 
 #[test]
 fn what_has_no_velocity_is_refused() -> Result<(), Error> {
-    let record = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 50], vec![1.0; 50]]), None)?;
+    let record = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 50], vec![1.0; 50]]), None)?;
     for wrong in [body(1.0, 0.5), body(2.3, 0.5), body(2.0, -0.5)] {
         assert!(matches!(wrong.run(&record, &[vec![]]), Err(Error::OutOfRange { .. })));
     }
@@ -232,10 +232,10 @@ fn what_has_no_velocity_is_refused() -> Result<(), Error> {
     tipping.equations[0].structure.terms[0].order = 0.0;
     tipping.equations[0].coefficients[0] = 400.0;
     for m in [100, 200, 300, 400] {
-        let long = Record::new(0.05, PulseMeans::from_rows(vec![vec![0.0; m], vec![1.0; m]]), None)?;
+        let long = Record::new(0.05, PulseMeans::from_signals(vec![vec![0.0; m], vec![1.0; m]]), None)?;
         assert!(matches!(tipping.run(&long, &[vec![]]), Err(Error::Diverged { .. })));
     }
-    let short = Record::new(0.05, PulseMeans::from_rows(vec![vec![0.0; 15], vec![1.0; 15]]), None)?;
+    let short = Record::new(0.05, PulseMeans::from_signals(vec![vec![0.0; 15], vec![1.0; 15]]), None)?;
     assert!(tipping.run(&short, &[vec![]])?.bodies[0].edges.iter().all(|v| *v == 0.0));
     Ok(())
 }

@@ -463,11 +463,11 @@ fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
         for filter in [None, Some(filter.clone())] {
             let driven = Record::new(
                 0.01,
-                PulseMeans::from_rows(vec![vec![0.3; 500], vec![0.1; 500], vec![1.0; 500]]),
+                PulseMeans::from_signals(vec![vec![0.3; 500], vec![0.1; 500], vec![1.0; 500]]),
                 filter.clone(),
             )
             .unwrap();
-            let still = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 500]; 3]), filter).unwrap();
+            let still = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 500]; 3]), filter).unwrap();
             let found = unit_responses(&model, &driven, &units).unwrap();
             let (rest, same) = respond_and_units(&model, &driven, &units).unwrap();
             assert_eq!(same, found);
@@ -486,7 +486,7 @@ fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
             }
         }
     }
-    let still = Record::new(0.01, PulseMeans::from_rows(vec![vec![0.0; 50]; 3]), None).unwrap();
+    let still = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 50]; 3]), None).unwrap();
     let model = [equation(0, [-9.0, -1.0, 0.5, 1.0])];
     assert!(matches!(unit_responses(&model, &still, &[(1, 0.0)]), Err(Error::Structure { .. })));
     assert!(unit_responses(&model, &still, &[(0, f64::NAN)]).is_err());
@@ -513,7 +513,7 @@ fn singular_powers_drive_filtered_equations_to_second_order() {
         let missed = |m: usize| {
             let step = 1.0 / m as f64;
             let still =
-                Record::new(step, PulseMeans::from_rows(vec![vec![0.0; m]]), Some(lag.series(m, step).unwrap()))
+                Record::new(step, PulseMeans::from_signals(vec![vec![0.0; m]]), Some(lag.series(m, step).unwrap()))
                     .unwrap();
             let found = unit_responses(&plant, &still, &[(0, exponent)]).unwrap();
             let truth = (integral(1.0) - integral(1.0 - step)) / step;

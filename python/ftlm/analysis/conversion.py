@@ -321,7 +321,7 @@ def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...]
     behind = next((name for name in inputs if name in sensor.signals), None)
     if behind is not None:
         raise ModelError(
-            f"the input {behind} passes a sensor filter, and its inverse is no transfer function; leave it out"
+            f"the input {behind} passes a sensor filter, and its inverse is not a transfer function; leave it out"
         )
     return tuple(sensor.signals), _coefficients(sensor.numerator), _coefficients(sensor.denominator)
 
@@ -384,7 +384,7 @@ def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
     broken = next((p for _, p in pairs if abs(p - round(p)) > POWER_TOLERANCE or p < -POWER_TOLERANCE), None)
     if broken is not None:
         raise ModelError(
-            f"order {broken:g} is no whole number from 0, so no system of python-control is exact; "
+            f"order {broken:g} is not a whole number of at least 0, so no system of python-control is exact; "
             f"to_control with {parameter('band')} approximates one"
         )
     values = np.zeros(1 + max((round(p) for _, p in pairs), default=0))
@@ -405,7 +405,7 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
         parts = _from_fractions(system.num, system.den)
     else:
         raise ModelError(
-            f"{type(system).__name__} is no system of python-control with equations; for a measured response use "
+            f"{type(system).__name__} is not a system of python-control with equations; for a measured response use "
             "ftlm.FrequencyData.from_arrays"
         )
     signals = _names("inputs", inputs, getattr(system, "input_labels", None), len(parts[0][1]))

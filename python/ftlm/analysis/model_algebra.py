@@ -151,7 +151,8 @@ def parallel(first: Model, second: Model) -> Model:
     (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
     if a.delay != b.delay:
         raise ModelError(
-            f"the delays are {a.delay:g} s and {b.delay:g} s, and the sum of both is no equation with one delay of its "
+            f"the delays are {a.delay:g} s and {b.delay:g} s, and the sum of both is not an equation with one delay "
+            "of its "
             "input; add the simulated outputs"
         )
     top = multiply_polynomials(a.top, b.bottom)
@@ -170,7 +171,7 @@ def feedback(forward: Model, back: Model | float, sign: int) -> Model:
         b = Ratio({0.0: float(back)}, {0.0: 1.0}, 0.0)
     if a.delay or b.delay:
         raise ModelError(
-            f"the loop has a delay of {a.delay + b.delay:g} s, and a closed loop with a delay is no equation; use "
+            f"the loop has a delay of {a.delay + b.delay:g} s, and a closed loop with a delay is not an equation; use "
             "frequency_response of both, or ftlm.control"
         )
     bottom = multiply_polynomials(a.bottom, b.bottom)
@@ -213,7 +214,7 @@ def _channel_of(name: str) -> Channel:
     """Return the channel that a text such as ``y`` or ``D^0.5 y`` names."""
     parsed = EquationParser(name).parse_expression()
     if parsed.operation != "channel":
-        raise ModelError(f"the operating point {name!r} is no signal or derivative of one; write 'y' or 'D y'")
+        raise ModelError(f"the operating point {name!r} is not a signal or derivative of one; write 'y' or 'D y'")
     return parsed.signal, parsed.value
 
 

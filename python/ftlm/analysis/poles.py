@@ -154,7 +154,7 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     -------
     ndarray of complex
         Values of s [rad/s], sorted by magnitude, without s = 0. With fractional orders ``|arg s| < pi``; with integer
-        orders the negative real axis is included. Roots on other sheets are no poles: they only shape how a response
+        orders the negative real axis is included. Roots on other sheets are not poles: they only shape how a response
         dies away.
 
     Raises

@@ -225,10 +225,10 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     """
     low, high = frequency_pair(band)
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
-        raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval; give 0 < low < high")
+        raise ModelError(f"band = ({low:g}, {high:g}) rad/s is not an interval; give 0 < low < high")
     count = whole_number(order)
     if count is None or not 1 <= count <= LARGEST_ORDER:
-        raise ModelError(f"{setting('order')} {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
+        raise ModelError(f"{setting('order')} {short_repr(order)} is not a whole number from 1 to {LARGEST_ORDER}")
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     delays = model.structure.delay

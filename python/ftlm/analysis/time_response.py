@@ -111,7 +111,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
                 step_response(with_parameter_vector(bare, numbers + side), time) for side in (shift, -shift)
             )
         except FtlmError:
-            # So vague that a tenth of a standard deviation is no model any more: there is no band to be drawn.
+            # So vague that a tenth of a standard deviation is not a model any more: there is no band to be drawn.
             return None
         change = (above - below) / (2 * DEVIATION_STEP_RATIO)
         total = total + (np.diff(change) / (time[1] - time[0]) if impulse else change) ** 2

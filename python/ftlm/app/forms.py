@@ -282,9 +282,9 @@ def parse_structures(recipe: FitRequest) -> list[Structure]:
         if value not in known:
             raise ModelError(f"{name} = {value!r} is not known; use {' or '.join(filter(None, known))}")
     if recipe.way == "offered" and len(recipe.structure) < 2:
-        raise ModelError("one structure is no choice; fit it, or choose what of it earns its place")
+        raise ModelError("one structure leaves no choice; fit it, or select its terms")
     if recipe.way in ("fit", "inside") and len(recipe.structure) != 1:
-        raise ModelError("no structure is given; write an equation, or take one that is offered")
+        raise ModelError("no structure is given; write an equation, or take a suggested one")
     if recipe.way != "fit" and recipe.settings():
         raise ModelError(
             f"{', '.join(recipe.settings())}: a choice of structures is by output error, with its own offset; leave it "
@@ -380,11 +380,11 @@ def _roles(columns: Any) -> dict[str, Any]:
     if columns is None:
         return {}
     if not isinstance(columns, list) or len(columns) > MAX_SIGNALS:
-        raise DataError(f"columns is no list of at most {MAX_SIGNALS} columns")
+        raise DataError(f"columns is not a list of at most {MAX_SIGNALS} columns")
     asked: dict[str, Any] = {}
     for entry in columns:
         if not isinstance(entry, Mapping):
-            raise DataError("a column is no object with name, role, signal and unit")
+            raise DataError("a column is not an object with name, role, signal and unit")
         name, role = _text(entry, "name"), _text(entry, "role")
         signal, unit = _text(entry, "signal") or name, _text(entry, "unit")
         if role not in COLUMN_ROLES:
@@ -408,13 +408,13 @@ def parse_number(name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise DataError(f"{name}: {text[:40]!r} is no number; write one such as 0.5") from None
+        raise DataError(f"{name}: {text[:40]!r} is not a number; write one such as 0.5") from None
 
 
 def _parse_line_count(name: str, text: str) -> int:
     """Return the number of lines in a form field."""
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise DataError(f"{name}: {text[:40]!r} is no number of lines; write one such as 2")
+        raise DataError(f"{name}: {text[:40]!r} is not a number of lines; write one such as 2")
     return int(text)
 
 
@@ -423,7 +423,7 @@ def _text(said: Mapping[str, Any], name: str) -> str:
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise DataError(f"{name} is no text; write one")
+        raise DataError(f"{name} must be text")
     return str(value).strip() if name not in ("name",) else str(value)
 
 

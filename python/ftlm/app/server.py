@@ -47,7 +47,7 @@ def open_socket(port: int | None) -> tuple[socket.socket, str]:
         A port that is taken or not allowed.
     """
     if port is not None and not 0 <= port <= 65535:
-        raise ModelError(f"{setting('port')} {port} is none; take one from 1024 to 65535, or 0 for any")
+        raise ModelError(f"{setting('port')} {port} is not a valid port; take one from 1024 to 65535, or 0 for any")
     wanted = DEFAULT_PORT if port is None else port
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     if sys.platform != "win32":
@@ -91,7 +91,7 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     paths = [Path(file) for file in files]
     for path in paths:
         if not path.is_file():
-            raise DataError(f"{str(path)!r} is no file; check the path")
+            raise DataError(f"{str(path)!r} is not a file; check the path")
     sock, note = open_socket(port)
     if note:
         print(f"ftlm: {note}", file=sys.stderr)

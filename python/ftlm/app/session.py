@@ -155,7 +155,7 @@ class Session:
     def check_room(self, name: str, size: int | None) -> str:
         """Return the name of a file on the page; refuse a file beyond the limits."""
         if len(self.files) >= MAX_FILES:
-            raise DataError(f"{MAX_FILES} files are open, as many as there may be; remove one")
+            raise DataError(f"{MAX_FILES} files are open, the maximum number; remove one")
         if size is not None:
             self._check_size(name, size)
         return self._free_name(safe_name(name))
@@ -262,7 +262,7 @@ class Session:
         texts = told.get("structure") or []
         texts = [texts] if isinstance(texts, str) else texts
         if not isinstance(texts, list) or len(texts) > 20 or not all(isinstance(t, str) for t in texts):
-            raise ModelError("structure is no equation; write one, such as D y = a0 y + b0 u")
+            raise ModelError("structure is not an equation; write one, such as D y = a0 y + b0 u")
         if sum(map(len, texts)) > 4000:
             raise ModelError("the equation has more than 4000 letters; write a shorter one")
         recipe = FitRequest(
@@ -287,7 +287,9 @@ class Session:
         if file.task is not None or (file.preview is None and not file.error):
             raise DataError(f"{file.name!r} is still being read; wait until its columns are shown")
         if not file.is_run:
-            raise DataError(f"{file.name!r} is no run yet: {file.preview['problem'] if file.preview else file.error}")
+            raise DataError(
+                f"{file.name!r} is not a run yet: {file.preview['problem'] if file.preview else file.error}"
+            )
         return file.run_source(self.folder)
 
     def start(self, recipe: FitRequest) -> Model:
@@ -299,7 +301,7 @@ class Session:
             Too many models, or too many in the queue.
         """
         if len(self.models) >= MAX_MODELS:
-            raise DataError(f"{MAX_MODELS} models are kept, as many as there may be; remove one")
+            raise DataError(f"{MAX_MODELS} models are kept, the maximum number; remove one")
         self._check_queue()
         self._count += 1
         model = Model(secrets.token_hex(8), self._count, recipe)

@@ -63,11 +63,12 @@ class Energies:
     hub_force, link_force
         Non-conservative generalized forces (10), (11) [N m].
     motor
-        Power of the motor's torque on its hub [W].
+        Power of the motor torque on the hub [W].
     inertia
         Power of the inertial terms of (14) and (15) [W]. For integer orders it is the time derivative of (9).
     elastic, hub_friction, link_friction
-        Of the link's elasticity K_s D^beta_2, of the friction B_1 D^gamma_1 of the hub, and B_2 D^mu_2 of the link.
+        Powers of the elasticity K_s D^beta_2 of the link, of the friction B_1 D^gamma_1 of the hub, and of the friction
+        B_2 D^mu_2 of the link.
     """
 
     time: Floats
@@ -97,28 +98,30 @@ class Energies:
 def energies(
     run: Run, *, stage: int = 1, parameters: LinkParameters | None = None, orders: Mapping[str, float] | None = None
 ) -> Energies:
-    """Return energies and generalized forces of one joint by (7)-(11), and their power balance.
+    """Return energies and generalized forces of one joint, and their power balance.
 
-    Equations (14) and (15), multiplied by the rates of their angles, split the power of the motor into inertia,
-    elasticity of the link, and both frictions. A force of fractional order stores a part of the power and dissipates
-    the rest: c D^nu theta is a sum of relaxing springs (its diffusive representation), whose energies add up.
+    Energies and forces are those of equations (7)-(11) of the paper. Its equations (14) and (15), multiplied by the
+    rates of their angles, split the power of the motor into inertia, elasticity of the link, and both frictions. A
+    force c D^nu theta of fractional order stores a part of the power and dissipates the rest. Its diffusive
+    representation is a sum of springs with dampers in series, whose energies are added.
 
     Parameters
     ----------
     run
-        I1, theta11, theta12 or I2, theta21, theta22, in A and rad, from rest, at least 4 rows. Angles are
-        differentiated: noise is not for this; use what :func:`ftlm.simulate` gives.
+        I1, theta11, theta12 or I2, theta21, theta22, in A and rad, from rest, at least 4 rows. The angles are
+        differentiated, so use a simulated run without noise (:func:`ftlm.simulate`).
     stage
         1 or 2.
     parameters
-        Of the stage; default the maker's effective ones.
+        Parameters of the stage; by default the manufacturer's effective ones.
     orders
-        alpha, gamma of the hub and alpha, beta, mu of the link by name; what is not given is the manual's whole one.
+        alpha, gamma of the hub and alpha, beta, mu of the link by name. Orders that are not given have the integer
+        values of the manufacturer's manual.
 
     Returns
     -------
     Energies
-        At the run's samples.
+        Energies and powers at the samples of the run.
 
     Raises
     ------

@@ -344,7 +344,7 @@ def flexible_link(
         coupling = "measured" if form == "lagrange" else "simulated"
     if friction == "stribeck" and coupling != "simulated":
         raise ModelError(
-            f"{parameter('friction', 'stribeck')} is of the velocity that the model gives; use "
+            f"{parameter('friction', 'stribeck')} needs the simulated velocity; use "
             f"{parameter('coupling', 'simulated')}, or {parameter('friction', 'coulomb')}"
         )
     if friction and coupling == "simulated" and form != "lagrange":
@@ -355,13 +355,13 @@ def flexible_link(
         )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(
-            f"{parameter('hub', False)} leaves the deflection to the measured hub: it needs "
-            f"{parameter('form', 'lagrange')} and {parameter('coupling', 'measured')}, and knows no "
+            f"{parameter('hub', False)} drives the deflection by the measured hub: use "
+            f"{parameter('form', 'lagrange')} and {parameter('coupling', 'measured')}, without "
             f"{parameter('friction', True)}"
         )
     if cross_damping and (cross_stage != "inertial" or coupling == "simulated"):
         raise ModelError(
-            f"{parameter('cross_damping', True)} follows the other deflection as it was measured; use it with "
+            f"{parameter('cross_damping', True)} needs the measured other deflection; use it with "
             f"{parameter('cross_stage', 'inertial')} and {parameter('coupling', 'measured')}"
         )
     stages: tuple[int, ...] = (1, 2) if stage == "both" else (stage,)

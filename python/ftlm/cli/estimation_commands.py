@@ -96,10 +96,10 @@ def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure
         parsed = [shape.structure(text) for text in texts]
         return parsed[0]
     if len(texts) > 1:
-        raise ModelError("--structure auto takes no other structure beside it; leave auto or the others out")
+        raise ModelError("--structure auto cannot be combined with another structure; leave one of them out")
     given = replace(shape, delay=None, only=None).given_options()
     if given:
-        raise ModelError(f"{', '.join(given)}: of a structure that is given, not used with --structure auto")
+        raise ModelError(f"{', '.join(given)}: options of a given structure, not used with --structure auto")
     return None
 
 
@@ -132,7 +132,7 @@ def select_structure(
             validation=validation,
             delay=ranges("--delay", shape.delay) if automatic else None,
             threads=threads,
-            # How many candidates come up turns with what earns its place.
+            # The number of candidates depends on which terms improve the prediction.
             progress=progress if listed else progress.so_far,
             store=store,
         )
@@ -332,7 +332,7 @@ def check_order_names(grid: OrderGrid, structure: Structure) -> None:
     for name in grid.orders:
         if name not in {"alpha", *structure.order_names}:
             free = ", ".join(structure.order_names) or "none"
-            raise ModelError(f"--order-grid {name!r} is no free order; free are {free}")
+            raise ModelError(f"--order-grid {name!r} is not a free order; free are {free}")
 
 
 def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:

@@ -54,7 +54,7 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
         try:
             values[name] = float(value)
         except ValueError:
-            raise ModelError(f"{option} {name}={value}: {value!r} is no number") from None
+            raise ModelError(f"{option} {name}={value}: {value!r} is not a number") from None
     return values
 
 
@@ -78,7 +78,7 @@ def interval(text: str, option: str, example: str) -> tuple[float | None, float 
             raise ValueError
         start, stop = (float(p) if p.strip() else None for p in parts)
     except ValueError:
-        raise ModelError(f"{option} {text!r} is no FROM:TO, such as {example}") from None
+        raise ModelError(f"{option} {text!r} is not FROM:TO, such as {example}") from None
     return start, stop
 
 

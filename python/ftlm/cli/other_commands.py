@@ -15,7 +15,7 @@ from ftlm.errors import ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.progress import Progress
 from ftlm.reproduction import reproduction
-from ftlm.reproduction.cross_validation import orders_on_unseen_runs, unseen_page, unseen_text
+from ftlm.reproduction.cross_validation import cross_validate_orders, cross_validation_page, cross_validation_text
 from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import ALWAYS_SAVED
@@ -132,13 +132,13 @@ def orders(
     """Compare integer and fractional orders of the arm's links by cross-validation over runs, as an HTML page."""
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
-        found = orders_on_unseen_runs(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
+        found = cross_validate_orders(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
         progress.say("writing the page")
-        page = unseen_page(found, out, force=force)
+        page = cross_validation_page(found, out, force=force)
     if as_json:
         show_json({**found.to_dict(), "files": [str(page)]})
     else:
-        print_text(f"{unseen_text(found)}\n\nwritten: {page}")
+        print_text(f"{cross_validation_text(found)}\n\nwritten: {page}")
 
 
 @command

@@ -79,7 +79,7 @@ class ReadingOptions:
     resample: Annotated[Number, Option(metavar="STEP", help="Resample irregular rows to this step [s].")] = None
     missing: Annotated[
         MissingPolicy | None,
-        Option(help="Missing outputs get no weight; hold: inputs are held, too."),
+        Option(help="Missing values; weight: outputs only, hold: inputs too."),
     ] = None
     encoding: Annotated[Text, Option(help="Text encoding, such as cp1252; default detected.")] = None
     separator: Separator = None

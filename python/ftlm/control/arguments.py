@@ -41,7 +41,7 @@ def select_outputs(what: str, given: Sequence[str] | None, outputs: tuple[str, .
     absent = [n for n in names if not (isinstance(n, str) and n in outputs)]
     if not names or (not absent and len(set(names)) < len(names)):
         raise ModelError(
-            f"{what} = {short_repr(given)} is no list of outputs, each once; the input reaches {', '.join(outputs)}"
+            f"{what} = {short_repr(given)} is not a list of outputs, each once; the input reaches {', '.join(outputs)}"
         )
     if absent:
         near = nearest(absent[0], outputs) if isinstance(absent[0], str) else ""
@@ -77,7 +77,7 @@ def check_samples(samples: object, seed: object) -> tuple[int, int]:
     """Return the number of parameter samples and their seed."""
     count = whole_number(samples)
     if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"{setting('samples')} {short_repr(samples)} is no whole number from 0 to 10000")
+        raise ModelError(f"{setting('samples')} {short_repr(samples)} is not a whole number from 0 to 10000")
     return count, check_seed(seed)
 
 

@@ -194,7 +194,7 @@ def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
     Raises
     ------
     DataError
-        A file that cannot be read, or is no controller of this version.
+        A file that cannot be read, or is not a controller of this version.
     """
     read = CONTROLLER_FORMAT.read(path)
     CONTROLLER_FORMAT.check_schema(path, read, CONTROLLER_SCHEMA)

@@ -68,7 +68,7 @@ class FractionalPid:
             if not math.isfinite(value):
                 raise ModelError(f"{name} = {value:g} is not a finite number; give one")
             if name in ("lam", "mu") and not 0 < value <= 2:
-                raise ModelError(f"{name} = {value:g} is no order of a fractional PID; give one above 0, at most 2")
+                raise ModelError(f"{name} = {value:g} is not an order of a fractional PID; give one above 0, at most 2")
             object.__setattr__(self, name, value)
 
     @check_arguments
@@ -151,12 +151,13 @@ class DiscretePid:
         low, high = frequency_pair(band)
         if not (0 < low < high <= half and high <= MAX_BAND_RATIO * low):
             raise ModelError(
-                f"band = ({low:g}, {high:g}) rad/s is no interval up to half the rate, {half:g} rad/s, whose upper end "
+                f"band = ({low:g}, {high:g}) rad/s is not an interval up to half the rate, {half:g} rad/s, whose "
+                "upper end "
                 f"is at most {MAX_BAND_RATIO:g} times the lower"
             )
         count = whole_number(order)
         if count is None or not 1 <= count <= LARGEST_ORDER:
-            raise ModelError(f"{setting('order')} {short_repr(order)} is no whole number from 1 to {LARGEST_ORDER}")
+            raise ModelError(f"{setting('order')} {short_repr(order)} is not a whole number from 1 to {LARGEST_ORDER}")
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
         reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
@@ -178,7 +179,10 @@ class DiscretePid:
         return self._integral.direct + self._derivative.direct
 
     def lags(self) -> list[tuple[Literal["integral", "derivative"], tuple[float, float, float, float]]]:
-        """Coefficients of the first-order lags: keep, now, before, weight; see the controller file."""
+        """Return the coefficients (keep, now, before, weight) of each first-order lag, as in the controller file.
+
+        State of sample k: x_k = keep x_{k-1} + now e_k + before e_{k-1}. Output: the sum of weight x_k over the lags.
+        """
         banks: tuple[tuple[Literal["integral", "derivative"], _Bank], ...] = (
             ("integral", self._integral),
             ("derivative", self._derivative),
@@ -499,7 +503,7 @@ def plant_of(
         if name is None and len(known) == 1:
             names.append(known[0])
         elif name is None:
-            raise ModelError(f"the model has several {what}s: say which, {parameter(what)}…; it has {', '.join(known)}")
+            raise ModelError(f"the model has several {what}s; name one with {parameter(what)}: {', '.join(known)}")
         elif not isinstance(name, str) or name not in known:
             near = nearest(name, known) if isinstance(name, str) else ""
             raise ModelError(

@@ -124,7 +124,7 @@ class Shaper:
         """
         given = as_array("reference", reference)
         if given.dtype.kind not in "fiu" or given.ndim not in (1, 2) or given.size == 0:
-            raise DataError("reference is no array of numbers of shape (rows,) or (rows, columns)")
+            raise DataError("reference is not an array of numbers of shape (rows,) or (rows, columns)")
         x = as_floats("reference", given).reshape(len(given), -1)
         bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if bad.size:
@@ -187,12 +187,12 @@ def input_shaper(
     Notes
     -----
     Singer and Seering (1990), doi:10.1115/1.2894142. Besides its oscillation a fractional model has a component that
-    decays as a power of time, which no shaper cancels; it is no vibration.
+    decays as a power of time, which no shaper cancels; it is not a vibration.
     """
     check_choice("kind", kind, SHAPER_REPETITIONS)
     count = whole_number(modes)
     if count is None or count < 1:
-        raise ModelError(f"{setting('modes')} {short_repr(modes)} is no number of modes; give a whole number from 1")
+        raise ModelError(f"{setting('modes')} {short_repr(modes)} is not a number of modes; give a whole number from 1")
     if isinstance(model, (complex, float, int, np.number)):
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:
@@ -200,14 +200,14 @@ def input_shaper(
     growing = [m for m in every if m.unstable or m.damping <= 0.0]
     if growing:
         raise ModelError(
-            f"the model is not stable ({growing[0]}): what no loop holds cannot be shaped; close a loop around it, and "
+            f"the model is not stable ({growing[0]}), so its response cannot be shaped; close a loop around it, and "
             "shape the poles of the loop"
         )
     swings = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
     if len(swings) < count:
         raise ModelError(
-            f"the model has {len(swings)} modes that swing, and {short_repr(count)} are to be shaped; what relaxes "
-            "needs no shaper"
+            f"the model has {len(swings)} oscillatory modes, and {short_repr(count)} are to be shaped; relaxing modes "
+            "need no shaper"
         )
     chosen = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)

@@ -224,8 +224,8 @@ def inverse_dynamics(
     asked = inverse_transform(needed * command)
     if not np.max(np.abs(reference - rows[0])) < MAX_REFERENCE_RATIO * move:
         raise ModelError(
-            "the reference grows beyond all bounds: what is asked for begins with a move the other way that is slower "
-            "than the path; give it more time, or ask for another output"
+            "the reference diverges: the output first moves the other way, more slowly than the path; give the path "
+            "more time, or choose another output"
         )
     if np.max(np.abs(asked)) > most:
         at = int(np.argmax(np.abs(asked)))
@@ -255,7 +255,7 @@ def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,)."""
     raw = as_array("path", path)
     if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
-        raise DataError(f"path is no array of 16 to {MAX_PATH_ROWS} numbers, one a sample")
+        raise DataError(f"path is not an array of 16 to {MAX_PATH_ROWS} numbers, one per sample")
     rows = np.array(raw, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(rows))
     if bad.size:
@@ -266,7 +266,7 @@ def _path(path: ArrayLike) -> Floats:
             f"path is beyond {POSITIVE_RANGE[1]:g} at row {large[0]} ({large.size} such rows in all); scale it"
         )
     if np.ptp(rows) < POSITIVE_RANGE[0]:
-        raise DataError("path stands still: there is nothing to follow")
+        raise DataError("path: all points are equal; give at least two different points")
     for where, pair in (("begin", rows[:2]), ("end", rows[-2:])):
         if abs(pair[1] - pair[0]) > MAX_INITIAL_OFFSET_SHARE * np.ptp(rows):
             raise DataError(f"path does not {where} at rest; repeat its {'first' if where == 'begin' else 'last'} row")

@@ -214,7 +214,7 @@ def kalman_filter(
         good = bool(np.isfinite(gain).all())
     if not good or np.max(np.abs(np.linalg.eigvals(a - a @ gain @ c))) >= 1.0:
         raise ModelError(
-            f"no observer from {', '.join(measured)} comes to rest: they do not tell all states; measure more outputs"
+            f"no observer from {', '.join(measured)} is stable: not all states are observable; measure more outputs"
         )
     variances = np.einsum("ij,jk,ik->i", realisation.c, left[:-1, :-1], realisation.c)
     deviations = np.sqrt(np.maximum(variances, 0.0)).tolist()
@@ -226,7 +226,7 @@ def kalman_filter(
 def noise_deviations(model: Model, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
-        raise ModelError(f"{setting('noise')} {short_repr(given)} is no mapping from outputs to standard deviations")
+        raise ModelError(f"{setting('noise')} {short_repr(given)} is not a mapping from outputs to standard deviations")
     for name in given or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
@@ -284,7 +284,7 @@ class Lqg:
         self.rate = realisation.rate
         gains = as_floats("feedback", feedback).reshape(1, -1).copy()
         if gains.shape[1] != realisation.states or not np.isfinite(gains).all():
-            raise ModelError(f"feedback is no row of {realisation.states} finite numbers, one a state")
+            raise ModelError(f"feedback is not a row of {realisation.states} finite numbers, one per state")
         self.feedback = gains
         self._a, self._b, self._c = observer.matrices
         self._gains = np.append(gains, [[1.0]], axis=1)
@@ -321,9 +321,7 @@ class Lqg:
             self._states = self._a @ corrected + self._b[:, 0] * self._applied
             command = self.ahead * reference - float(self._gains[0] @ self._states)
         if not math.isfinite(command):
-            raise ModelError(
-                f"the command is {command}, which no machine takes: what is measured, asked for or held is not finite"
-            )
+            raise ModelError(f"the command is {command}: a measurement, the reference or a state is not finite")
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
@@ -529,7 +527,7 @@ def lqg(
     nominal = loop_margins(model)
     if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):
         raise ModelError(
-            f"the loop is no design on the exact response of the model ({nominal}): such loops have no guaranteed "
+            f"the loop is not a design on the exact response of the model ({nominal}): such loops have no guaranteed "
             "margins; make max_input smaller, process_noise larger or the noise smaller, or allow for larger deviations"
         )
     margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
@@ -556,7 +554,8 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
     """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
-            f"{setting('max_deviation')} {short_repr(max_deviation)} is no mapping from outputs, or sums of them, to "
+            f"{setting('max_deviation')} {short_repr(max_deviation)} is not a mapping from outputs, or sums of them, "
+            "to "
             "deviations; give such as {{names[0]!r}: 0.01}"
         )
     return [

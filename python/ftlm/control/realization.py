@@ -124,7 +124,7 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
         count = whole_number(poles)
         if count is None or not MIN_POLES <= count <= MAX_POLES:
             raise ModelError(
-                f"{setting('poles')} {short_repr(poles)} is no whole number from {MIN_POLES} to {MAX_POLES}"
+                f"{setting('poles')} {short_repr(poles)} is not a whole number from {MIN_POLES} to {MAX_POLES}"
             )
         counts = [count]
     library = python_control()
@@ -188,7 +188,7 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     low, high = frequency_pair(band)
     if not (math.isfinite(low) and 0 < low < high <= half / 2):
         raise ModelError(
-            f"band = ({low:g}, {high:g}) rad/s is no interval up to a quarter of the rate, {half / 2:g} rad/s"
+            f"band = ({low:g}, {high:g}) rad/s is not an interval up to a quarter of the rate, {half / 2:g} rad/s"
         )
     return low, high
 

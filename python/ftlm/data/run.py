@@ -421,7 +421,7 @@ class Run:
         Held inputs ("zoh") take their mean over each new interval, the exact integral of the hold. Inputs with "foh"
         and all outputs are interpolated linearly. No anti-alias filter is applied. `warnings` records the resampling.
         Unless every new row is an old one, output-error fits and comparisons use the outputs as they were sampled, at
-        their own times: interpolated values are no measurements.
+        their own times: interpolated values are not measurements.
 
         Parameters
         ----------
@@ -518,7 +518,7 @@ class Run:
         Raises
         ------
         DataError
-            If a name is no signal of this run, or its values are not N numbers, finite where it is an input.
+            If a name is not a signal of this run, or its values are not N numbers, finite where it is an input.
         """
         checked = self._checked_samples("samples", samples, self.length)
         readings = self.sample_times
@@ -707,7 +707,7 @@ class Run:
         Raises
         ------
         DataError
-            A name that is no signal of the run.
+            A name that is not a signal of the run.
         """
         from ftlm.plot.comparison_charts import run_charts
 

@@ -80,7 +80,7 @@ def check_step(step: object, argument: str) -> float:
 
 
 def as_number(given: object) -> float | None:
-    """Return a real number as a float: infinity on overflow, None if it is no number."""
+    """Return a real number as a float: infinity on overflow, None if it is not a number."""
     if isinstance(given, bool) or not isinstance(given, (int, float, np.integer, np.floating)):
         return None
     try:

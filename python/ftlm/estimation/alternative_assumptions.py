@@ -1,4 +1,4 @@
-"""Estimates under other assumptions on the start of a run, on its level and on its inputs between samples."""
+"""Refits under other assumptions: initial conditions, a drifting level, and the hold of inputs between samples."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from ftlm.findings import Finding, make_finding
 from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
 from ftlm.structure.structure import Initial, Offset, Structure
 
-#: Other starts that a fit is compared with.
+#: Initial conditions and offsets with which a fit is compared.
 OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
     ("rest", "none"),
     ("rest", "level"),
     ("caputo", "none"),
     ("caputo", "level"),
 )
-#: Offsets of the equations without a drift and with one.
+#: Offsets without and with a linear trend.
 DRIFT_OFFSETS: tuple[Offset, Offset] = ("constant", "ramp")
-#: Largest ratio of the sums of squares of another start and of the one that was taken at which both explain a run.
+#: Maximum ratio of the sum of squares under other initial conditions to that of the fit at which both explain a run.
 MAX_SQUARES_RATIO = 1.05
-#: Difference of two gains, in joint standard errors and relative to the larger one, from which on they contradict.
+#: Difference of two gains, in joint standard errors and relative to the larger one, beyond which they contradict.
 GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 #: Least share of rows in which an input changes, so that its behavior between samples is in doubt.
 MIN_CHANGING_SHARE = 0.5
@@ -75,8 +75,9 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
 def intersample_findings(fit: Fit) -> list[Finding]:
     """Return a finding on each input for which the runs clearly prefer the other hold, zero-order or first-order.
 
-    Rows alone do not tell a staircase from samples of a smooth signal. The wrong hold is half a sample of delay, which
-    biases the parameters. Each input that changes in most rows is refitted from the optimum with the other hold.
+    Samples alone do not distinguish a staircase from a smooth signal. The wrong hold acts like a delay of half a
+    sample, which biases the parameters. For each input that changes in most rows, the model is refitted with the other
+    hold.
     """
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or structure.has_friction or structure.limits:
@@ -105,7 +106,7 @@ def intersample_findings(fit: Fit) -> list[Finding]:
 
 
 def drift_findings(fit: Fit) -> list[Finding]:
-    """Return a finding if the runs clearly prefer levels that drift: a line in time beside the model."""
+    """Return a finding if the runs clearly prefer a linear trend of the outputs over constant levels."""
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
         return []
@@ -125,7 +126,10 @@ def drift_findings(fit: Fit) -> list[Finding]:
 
 
 def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any] | None:
-    """Return the ratio of the sums of squares of two fits and the parameter that differs most; None if none does."""
+    """Return the ratio of the sums of squares of two fits, and the parameter that differs most in standard errors.
+
+    None if no parameter differs by more than one standard error.
+    """
     ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
     values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
     moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
@@ -143,8 +147,8 @@ def _changes_often(runs: Sequence[Run], name: str) -> bool:
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:
-    """Describe initial conditions."""
-    return ("at rest" if initial == "rest" else "in motion") + (" at a level of its own" if offset == "level" else "")
+    """Return initial conditions as text."""
+    return ("at rest" if initial == "rest" else "in motion") + (" with a nonzero level" if offset == "level" else "")
 
 
 def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple[float, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ftlm.data.frequency_data import FrequencyData
 from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseProblem, ResponseRecord, halton
-from ftlm.structure.circuit import Circuit, impedance_with_slopes
+from ftlm.structure.circuit import Circuit, impedance_and_derivatives
 from ftlm.utils.validation import Complex, Floats
 
 #: Points of time constants and ratios at which initial guesses are tried, and decades of ratios within a group.
@@ -53,12 +53,12 @@ class CircuitProblem(ResponseProblem):
         return np.where(self.is_log, np.exp(np.where(self.is_log, values, 0.0)), values)
 
     def in_problem_units(self, values: Floats) -> Floats:
-        """Return logarithms of parameters; NaN for those that are not above 0."""
+        """Return the logarithms of positive parameters, and other parameters unchanged; NaN if one is not above 0."""
         safe = np.where(values > 0, values, np.nan)
         return np.where(self.is_log, np.log(np.where(self.is_log, safe, 1.0)), values)
 
     def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-        """Return intervals of given half-widths; of positive parameters by their logarithms, and so above 0."""
+        """Return intervals of given half-widths. Those of positive parameters are symmetric in the logarithm."""
         found = super().intervals(values, widths)
         for name, value, is_log in zip(self.names, values.tolist(), self.is_log.tolist(), strict=True):
             if is_log:
@@ -66,18 +66,18 @@ class CircuitProblem(ResponseProblem):
                 found[name] = (value / ratio, value * ratio)
         return found
 
-    def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
-        """Convert a Jacobian by logarithms to one by the parameters."""
-        return slopes / np.where(self.is_log, self.in_seconds(values), 1.0)
+    def jacobian_in_seconds(self, values: Floats, jacobian: Floats) -> Floats:
+        """Convert a Jacobian with respect to logarithms to one with respect to the parameters."""
+        return jacobian / np.where(self.is_log, self.in_seconds(values), 1.0)
 
-    def responses(self, values: Floats, *, slopes: bool = True) -> list[tuple[Complex, Complex | None]]:
+    def responses(self, values: Floats, *, jacobian: bool = True) -> list[tuple[Complex, Complex | None]]:
         """Return the impedance at every record, and its derivatives by all parameters (one column each)."""
         named = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
         out: list[tuple[Complex, Complex | None]] = []
         for record in self.records:
-            z, by_name = impedance_with_slopes(self.circuit, record.frequency, named)
+            z, by_name = impedance_and_derivatives(self.circuit, record.frequency, named)
             z = z + np.zeros(record.frequency.size)
-            columns = [by_name[n] + np.zeros_like(z) for n in self.names] if slopes else None
+            columns = [by_name[n] + np.zeros_like(z) for n in self.names] if jacobian else None
             out.append((z, None if columns is None else np.stack(columns, axis=1)))
         return out
 
@@ -108,8 +108,8 @@ class CircuitProblem(ResponseProblem):
         w = np.geomspace(every.min() / 1e3, every.max() * 1e3, 2000)
         alike: dict[str, list[tuple[float, list[int]]]] = {}
         for part in (p for p in rest if p[0] == "parallel"):
-            z, slopes = impedance_with_slopes(self.circuit, w, named, part)
-            places = [self.names.index(n) for n in slopes]
+            z, derivatives = impedance_and_derivatives(self.circuit, w, named, part)
+            places = [self.names.index(n) for n in derivatives]
             shape = re.sub(r"_?\d+'", "'", repr(part))
             alike.setdefault(shape, []).append((-float(w[np.argmin(z.imag)]), places))
         for group in alike.values():
@@ -147,8 +147,8 @@ class CircuitProblem(ResponseProblem):
                 }.get(letters, {f"{name}_R": size, f"{name}_tau": tau})
             shapes = []
             for part in parts:
-                z, slopes = impedance_with_slopes(self.circuit, every, unit, part)
-                shapes.append((z + np.zeros(every.size), list(slopes)))
+                z, derivatives = impedance_and_derivatives(self.circuit, every, unit, part)
+                shapes.append((z + np.zeros(every.size), list(derivatives)))
             table = np.stack([z * weight for z, _ in shapes], axis=1)
             sizes = _positive_least_squares(
                 np.concatenate([table.real, table.imag]), np.concatenate([goal.real, goal.imag])
@@ -160,7 +160,7 @@ class CircuitProblem(ResponseProblem):
             values = self.in_problem_units(np.array([unit[n] for n in self.names]))
             # Each constraint is an end of one parameter: its largest value, then its smallest.
             inside = np.clip(values, -limits[1::2], limits[0::2])
-            left, _ = self.residuals(inside, slopes=False)
+            left, _ = self.residuals(inside, jacobian=False)
             cost = float(left @ left)
             if math.isfinite(cost):
                 found.append((cost, inside))

@@ -21,11 +21,11 @@ FitType = TypeVar("FitType")
 def check_intervals(bounds: object, *, finite: bool = False) -> None:
     """Raise ModelError unless each bound is a pair of rising numbers by name; only finite ones if `finite`."""
     if not isinstance(bounds, Mapping):
-        raise ModelError(f"bounds = {bounds!r} is no mapping; write {{name: (low, high)}}")
+        raise ModelError(f"bounds = {bounds!r} is not a mapping; write {{name: (low, high)}}")
     for name, pair in bounds.items():
         ends = [real_number(f"bound of {name}", v) for v in pair] if isinstance(pair, (tuple, list)) else []
         if not (len(ends) == 2 and ends[0] < ends[1]) or (finite and not all(map(math.isfinite, ends))):
-            raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
+            raise ModelError(f"bounds of {name} = {pair!r} are not an interval; write (low, high)")
 
 
 def check_bounds(structure: Structure, bounds: Bounds | None, start: object = None) -> tuple[Structure, Bounds]:
@@ -34,12 +34,12 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
     Raises
     ------
     ModelError
-        A name that is no free order or coefficient, no rising pair of numbers, or a start out of its bounds.
+        A name that is not a free order or coefficient, no rising pair of numbers, or a start out of its bounds.
     """
     check_intervals(bounds or {})
     out, given = {}, bounds or {}
     inputs = {item.name: item for item in structure.free_inputs}
-    # A coefficient that follows from a law is no free parameter.
+    # A coefficient that follows from a law is not a free parameter.
     free = [n for n in structure.coefficient_names if n not in {law[0] for law in structure.coefficient_law}]
     check_known("bound of", given, [*free, *structure.order_names, *inputs])
     for name, pair in given.items():

@@ -196,8 +196,8 @@ def result_profiles(
     """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
     if "reference" in result.settings:
         raise ModelError(
-            f"a fit with {parameter('reference')} is where residuals are orthogonal to instruments, and no minimum "
-            "of a cost: it has no profile; use its standard errors"
+            f"a fit with {parameter('reference')} makes residuals orthogonal to instruments, and has no cost to "
+            "profile; use its standard errors"
         )
     if "noise_model" in result.settings:
         raise ModelError(f"a fit with {parameter('noise', 'ar')} has no profile; use its standard errors")
@@ -209,10 +209,12 @@ def result_profiles(
     unknown = [n for n in names if n not in problem.names]
     if unknown:
         others = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
-        raise ModelError(f"{unknown[0]!r}{others} is no free parameter of this fit; it has {', '.join(problem.names)}")
+        raise ModelError(
+            f"{unknown[0]!r}{others} is not a free parameter of this fit; it has {', '.join(problem.names)}"
+        )
     probability = real_number("level", level)
     if not 0.0 < probability < 1.0:
-        raise ModelError(f"level = {level} is no probability between 0 and 1, such as 0.95")
+        raise ModelError(f"level = {level} is not a probability between 0 and 1, such as 0.95")
     asked = list(dict.fromkeys(names)) or problem.names
     found = profile_intervals(
         result.joint, problem, result.task.runs, asked, probability, threads=threads, progress=progress

@@ -449,7 +449,7 @@ def differences(results: Sequence[Identification]) -> list[ParameterDifference]:
 
 
 def is_identifiable(result: Identification, name: str) -> bool:
-    """Whether a parameter is identifiable from a segment: finite standard error and a bounded side."""
+    """Whether a parameter is identifiable from a segment: finite standard error, and an interval with a finite end."""
     low, high = result.intervals[name]
     return 0.0 < result.standard_errors[name] < math.inf and (low > -math.inf or high < math.inf)
 

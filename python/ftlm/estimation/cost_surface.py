@@ -72,7 +72,7 @@ def output_error_landscape(
     Raises
     ------
     ModelError
-        A name that is no free order.
+        A name that is not a free order.
     """
     joint, task, pair = result.joint, result.task, orders
     chosen = correlated_orders(result)

@@ -115,8 +115,8 @@ def fit_with_instruments(
 def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> float:
     """Return the largest bias of a parameter by feedback, in its standard errors.
 
-    It is the first Gauss-Newton step of a fit with instruments (see :func:`fit_with_instruments`), where `answers` are
-    the inputs without the part that answers the residuals. Infinite if there is no such step.
+    `answers` are the inputs without the part that feedback from the residuals explains. They serve as instruments, and
+    the bias is the first Gauss-Newton step of :func:`fit_with_instruments`; infinite if that step does not exist.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
@@ -148,9 +148,9 @@ def _moment_norm(moment: tuple[Iterate, Floats, Floats]) -> float:
 
 
 def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
-    """Return the covariance from the influence of each residual on each parameter, by Bartlett weights of the lags.
+    """Return the heteroskedasticity and autocorrelation consistent covariance (Newey and West, doi:10.2307/1913610).
 
-    See doi:10.2307/1913610.
+    ``influence`` is the derivative of each parameter with respect to each residual.
     """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
     return _core.long_run_covariance(influence, series)
@@ -252,7 +252,7 @@ def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[floa
     """Return the covariance of the numbers of a model; None where a direction is not identifiable."""
     moved = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
     with np.errstate(invalid="ignore", over="ignore"):
-        # Of directions that the runs do not see covariances are no numbers, or beyond them.
+        # Of directions that the runs do not see covariances are not numbers, or beyond them.
         spread = moved @ joint.covariance @ moved.T
     return tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None
 

@@ -299,7 +299,7 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
                 own[side] = known[0]
             elif own[side] not in known:
                 raise DataError(
-                    f"{record.name} has the {side} {own[side]!r}, which is no {side} of the equations; these have "
+                    f"{record.name} has the {side} {own[side]!r}, which is not an {side} of the equations; these have "
                     f"{', '.join(known)}: write the equation in the names of the data, or say {parameter(side)} when "
                     "loading"
                 )
@@ -400,7 +400,7 @@ def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
     size = math.sqrt(sum(float(np.sum(np.abs(r.response * r.weight) ** 2)) for r in problem.records))
 
     def residuals(numbers: Floats) -> Floats:
-        return problem.residuals(numbers, slopes=False)[0]
+        return problem.residuals(numbers, jacobian=False)[0]
 
     if not np.all(np.isfinite(residuals(values))):
         return ResponseFit(values, math.inf, False, ())
@@ -425,9 +425,9 @@ def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) 
 def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
     """Return distinct optima of the multistart that are nearly as likely as the best."""
     ranked = sorted(fits, key=lambda f: f.cost)
-    kept, seen = [], [problem.residuals(ranked[0].values, slopes=False)[0]]
+    kept, seen = [], [problem.residuals(ranked[0].values, jacobian=False)[0]]
     for fit in ranked[1:]:
-        left = problem.residuals(fit.values, slopes=False)[0]
+        left = problem.residuals(fit.values, jacobian=False)[0]
         if _log_likelihood_difference(fit.cost, ranked[0].cost, kind, left.size) > SECOND_OPTIMUM_LOG_LIKELIHOOD:
             break
         # Elements that change places are one and the same model.
@@ -469,8 +469,8 @@ def _result(
     findings: list[Finding] = []
 
     def covariance_at(end: ResponseFit) -> Floats:
-        residuals, slopes = problem.residuals(end.values)
-        steep = problem.slopes_in_seconds(end.values, slopes)[rising]
+        residuals, jacobian = problem.residuals(end.values)
+        steep = problem.jacobian_in_seconds(end.values, jacobian)[rising]
         if kind == "deviation" and not too_large:
             return covariance_of(steep.T, [np.zeros(e.size) for e in series], float(free))
         return covariance_of(steep.T, _series(records, residuals[rising]), end.cost)
@@ -541,10 +541,10 @@ def _series(records: Sequence[FrequencyData], left: Floats) -> list[Floats]:
 
 def _identifiability_findings(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[Finding]:
     """Return findings on parameters that the data determine poorly or not at all."""
-    unseen = [n for n, e in standard.items() if not math.isfinite(e)]
+    unidentifiable = [n for n, e in standard.items() if not math.isfinite(e)]
     out = []
-    if unseen:
-        out.append(make_finding("response_not_told_apart", parameter=", ".join(unseen)))
+    if unidentifiable:
+        out.append(make_finding("response_not_told_apart", parameter=", ".join(unidentifiable)))
     for name, value in zip(problem.names, values.tolist(), strict=True):
         error = standard[name]
         vague = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)

@@ -222,7 +222,7 @@ class FrequencyIdentification:
 
     Parameters
     ----------
-    source
+    system
         Identified model or circuit.
     data
         Records that it was fitted to.
@@ -244,7 +244,7 @@ class FrequencyIdentification:
         Findings about the model.
     """
 
-    source: Model | Circuit
+    system: Model | Circuit
     data: tuple[FrequencyData, ...]
     weights: str
     values: Mapping[str, float]
@@ -272,9 +272,9 @@ class FrequencyIdentification:
         ModelError
             Equations were identified.
         """
-        if isinstance(self.source, Model):
+        if isinstance(self.system, Model):
             raise ModelError("equations were identified, no circuit; use .model")
-        return self.source
+        return self.system
 
     @cached_property
     def model(self) -> Model:
@@ -283,11 +283,11 @@ class FrequencyIdentification:
         Raises
         ------
         ModelError
-            A circuit that is no equation with powers of s.
+            A circuit that is not an equation with powers of s.
         """
-        if isinstance(self.source, Model):
-            return self.source
-        top, bottom = self.source.polynomials()
+        if isinstance(self.system, Model):
+            return self.system
+        top, bottom = self.system.polynomials()
         output, input = self.data[0].output, self.data[0].input
         # An inductor in series is a derivative of the current.
         made = Ratio(top, bottom, 0.0).model(output, input, improper_order=MAX_IMPROPER_ORDER)
@@ -296,7 +296,7 @@ class FrequencyIdentification:
     @property
     def orders(self) -> dict[str, float]:
         """Free orders with their estimates."""
-        return {n: v for n, v in self.values.items() if isinstance(self.source, Model) and n in self.source.orders}
+        return {n: v for n, v in self.values.items() if isinstance(self.system, Model) and n in self.system.orders}
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -306,7 +306,7 @@ class FrequencyIdentification:
     @property
     def errors(self) -> tuple[ResponseError, ...]:
         """Error of the model on each record."""
-        return tuple(error_of(self.source, record) for record in self.data)
+        return tuple(error_of(self.system, record) for record in self.data)
 
     @check_arguments
     def validate(self, data: FrequencyData | Sequence[FrequencyData]) -> FrequencyValidation:
@@ -322,17 +322,17 @@ class FrequencyIdentification:
         DataError
             A record has other signals.
         """
-        others = tuple(assign_signals(self.source, record) for record in as_frequency_data(data))
-        errors = tuple(error_of(self.source, record) for record in others)
+        others = tuple(assign_signals(self.system, record) for record in as_frequency_data(data))
+        errors = tuple(error_of(self.system, record) for record in others)
         return FrequencyValidation(others, errors, self._assess(errors, others))
 
     @property
     def parameters(self) -> dict[str, Parameter]:
         """Orders, coefficients and delays by name, with standard errors, intervals and units."""
-        given = self.source.values if isinstance(self.source, Circuit) else self.source.coefficients
+        given = self.system.values if isinstance(self.system, Circuit) else self.system.coefficients
         values = {**self.values, **given}
         return parameter_estimates(
-            self.source, values, errors=self.standard_errors, intervals=self.intervals, free=self.names
+            self.system, values, errors=self.standard_errors, intervals=self.intervals, free=self.names
         )
 
     @property
@@ -349,7 +349,7 @@ class FrequencyIdentification:
     def to_frame(self) -> Any:
         """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""
         return parameter_frame(
-            self.parameters.values(), self.source.structure.reference if isinstance(self.source, Model) else {}
+            self.parameters.values(), self.system.structure.reference if isinstance(self.system, Model) else {}
         )
 
     @property
@@ -388,7 +388,7 @@ class FrequencyIdentification:
 
     def _unstable_poles(self) -> list[Finding]:
         """Return a finding on poles with a positive real part, if there are any."""
-        if isinstance(self.source, Circuit):
+        if isinstance(self.system, Circuit):
             # Elements above 0 dissipate.
             return []
         with contextlib.suppress(FtlmError):
@@ -404,10 +404,10 @@ class FrequencyIdentification:
 
         judged = self.verdict if validation is None else validation.verdict
         lines = [*wrap_text(str(judged)), ""]
-        lines += [str(self.source)] if isinstance(self.source, Circuit) else equation_lines(self.source)
+        lines += [str(self.system)] if isinstance(self.system, Circuit) else equation_lines(self.system)
         lines.append("")
         lines += self._numbers()
-        lines += [*([] if isinstance(self.source, Circuit) else behavior_lines(self.source)), ""]
+        lines += [*([] if isinstance(self.system, Circuit) else behavior_lines(self.system)), ""]
         lines += _errors_in_words(self.errors)
         if validation is not None:
             lines += ["validation", *_errors_in_words(validation.errors)[1:]]
@@ -442,7 +442,7 @@ class FrequencyIdentification:
 
     def figures(self) -> list[Figure]:
         """Return Bode and Nyquist charts with the measured points, and residual charts."""
-        model = self.source
+        model = self.system
         return [f for r in self.data for f in (*response_figures(model, r), relative_residual_figure(model, r))]
 
     @check_arguments
@@ -468,11 +468,11 @@ class FrequencyIdentification:
         from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
 
         shown, more = first_findings(self.findings)
-        source = self.source
+        source = self.system
         new = () if validation is None else validation.data
         charts = Section(
             f"{'Validation' if new else 'Estimation'}: measured and modeled response",
-            figures=[f for record in new or self.data for f in response_figures(self.source, record)],
+            figures=[f for record in new or self.data for f in response_figures(self.system, record)],
             small=True,
         )
         about = Section(
@@ -488,7 +488,7 @@ class FrequencyIdentification:
         rows += [] if validation is None else [_error_row("validation", e) for e in validation.errors]
         heads = ("data", "record", "response", "error, % rms", "largest, %", "at [rad/s]")
         notes = [w for r in self.data for w in r.warnings]
-        figures = [relative_residual_figure(self.source, record) for record in self.data]
+        figures = [relative_residual_figure(self.system, record) for record in self.data]
         residuals = Section(
             "Residuals" if not new else "Residuals, and the fit to the estimation data",
             [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
@@ -512,9 +512,9 @@ class FrequencyIdentification:
 
         return {
             **(
-                {"circuit": str(self.source)}
-                if isinstance(self.source, Circuit)
-                else {"equations": [str(e) for e in self.source.equations]}
+                {"circuit": str(self.system)}
+                if isinstance(self.system, Circuit)
+                else {"equations": [str(e) for e in self.system.equations]}
             ),
             "weights": self.weights,
             "values": dict(self.values),
@@ -540,18 +540,18 @@ class FrequencyIdentification:
         """Return the equations or the circuit as HTML."""
         from ftlm.report.typesetting import equation_html
 
-        if isinstance(self.source, Circuit):
-            return Markup("<p>{}</p>").format(str(self.source).replace("-", " − "))
-        delay = self.source.structure.delay
-        lines = (Markup("<p>{}</p>").format(equation_html(e, delay)) for e in self.source.equations)
+        if isinstance(self.system, Circuit):
+            return Markup("<p>{}</p>").format(str(self.system).replace("-", " − "))
+        delay = self.system.structure.delay
+        lines = (Markup("<p>{}</p>").format(equation_html(e, delay)) for e in self.system.equations)
         return Markup("").join(lines)
 
     def _parameter_table(self) -> Table:
         """Return the table of the parameters with their intervals."""
         from ftlm.report.typesetting import parameter_table, unit_html
 
-        if isinstance(self.source, Model):
-            return parameter_table(self.source)
+        if isinstance(self.system, Model):
+            return parameter_table(self.system)
         rows: list[list[Cell]] = []
         for p in self.parameters.values():
             known = [v if math.isfinite(v) else None for v in (p.standard_error, *p.interval)]

@@ -438,7 +438,7 @@ def differential_evolution_search(
         done += rows.shape[0]
         if progress is not None:
             progress(min(done, total), total)
-        # Only comparisons count, and the spread of errors over hundreds of decades is no number.
+        # Only comparisons count, and the spread of errors over hundreds of decades is not a number.
         with np.errstate(divide="ignore"):
             return np.clip(np.log(problem.errors(rows, math.inf)), -MAX_LOG_ERROR, MAX_LOG_ERROR)
 
@@ -485,14 +485,15 @@ class GeneticAlgorithm:
     population
         Candidates of one generation, at least 8.
     bounds
-        (low, high) of coefficients by name. By default ±2 times the value that the maker states, or else ±4 times the
-        coefficient with which its term alone would be as large as the output, at the middle of the orders' intervals.
+        (low, high) of coefficients by name. By default ±2 times the value that the manufacturer states. Without one, ±4
+        times the coefficient with which its term alone would be as large as the output, at the middle of the intervals
+        of the orders.
 
     Raises
     ------
     ModelError
         No seeds or too many, a population outside [8, 100000], evaluations of less than two generations, bounds that
-        are no interval, an invalid order grid or norm.
+        are not an interval, an invalid order grid or norm.
     """
 
     name: ClassVar[str] = "genetic"

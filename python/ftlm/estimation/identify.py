@@ -128,7 +128,7 @@ def fit_with_offset_decision(
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Fits of several starts of a run, of which one is taken.
+    """Fits under several initial conditions, of which one is chosen.
 
     Parameters
     ----------
@@ -146,13 +146,13 @@ class Hypotheses:
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
     def refit(self, structure: Structure, fit: Fit) -> Fit:
-        """Return the fit of a structure from the optimum of another one that differs in its start alone."""
+        """Return the fit of a structure from the optimum of another one that differs only in initial conditions."""
         joint = fit.joint
         if joint is None or self.complete is None:
             return self.fit(structure)
         loss: Loss = "squares" if joint.robust is None else "huber"
         known = {n: v[0] for n, v in structure.order_values.items() if len(v) == 1}
-        # The grid of a fit is the finer one of the two that its step was refined on.
+        # The refinement of a fit is that of the finer of its two last grids.
         coarser = replace(joint, refinement=max(joint.refinement // 2, 1))
         near = fit_output_error(fit.task.runs, structure.with_orders(known), near=coarser, loss=loss)
         return replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
@@ -164,7 +164,7 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     moved = _fit_in_motion(fit, structure, hypotheses)
     if moved is not None:
         return moved
-    # In a model that is not linear a constant is no sensitivity alone: it decides where a body rests.
+    # In a nonlinear model a constant has no constant sensitivity: it determines where a body rests.
     if fit.task.structure.offset != "none" or not structure.is_linear or not _is_testable(fit.task.runs):
         return hypotheses.take(structure, fit)
     shown = _shows_level(fit)
@@ -183,7 +183,7 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
 def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
     """Return the fit with initial values of runs whose first rows look like rest, if the runs clearly refute it.
 
-    Few quiet rows do not tell a slow motion from rest. Without color the residuals refute nothing.
+    A few quiet rows do not distinguish slow motion from rest. White residuals do not refute rest.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.offset == "none" and structure.is_linear
@@ -216,8 +216,8 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
 def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, shown: bool) -> Fit | None:
     """Return the best fit with a level of the outputs, from rest or in motion, if the runs prefer it; else None.
 
-    Two fits are compared by the color of the one that leaves more. A level that is shown moves the optimum far; another
-    one is fitted from the optimum without it.
+    Two fits are compared with the noise color of the fit with the larger residuals. If the means of the outputs show a
+    level, the optimum moves far and the fit is new; otherwise it starts from the optimum without a level.
     """
     best, chosen, numbers = fit.joint, None, 0
     margin = START_SETTINGS.history_margin if best is not None and isinstance(best.initial, History) else 0.0
@@ -635,7 +635,7 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
 def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     """Return findings of failed residual tests; a joint fit already reports colored residuals."""
     if has_loop_noise_model(fit.settings):
-        # The loop is known, or its noise is; it is no part of what the model was estimated from.
+        # The loop is known, or its noise is; it is not part of what the model was estimated from.
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return residual_findings(tests)
@@ -738,7 +738,7 @@ def identify_many(
     Raises
     ------
     ModelError
-        No runs, an item that is no run, a method that is not known, or one with a store, or with an executor besides
+        No runs, an item that is not a run, a method that is not known, or one with a store, or with an executor besides
         that of this call.
     KeyboardInterrupt
         Ctrl-C.

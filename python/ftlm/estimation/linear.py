@@ -258,7 +258,7 @@ def multi_innovation_trace(
         )
     stride = whole_number(every)
     if stride is None or stride < 1:
-        raise ModelError(f"every = {every!r} is no whole number from 1; 1 gives every step")
+        raise ModelError(f"every = {every!r} is not a whole number of at least 1; 1 gives every step")
     rest = replace(equation, initial="rest")
     rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
     item = equation.equations[0]
@@ -384,7 +384,9 @@ class Streaming:
         self.structure = structure
         length = whole_number(innovation_length)
         if length is None or not 1 <= length < 1 << 31:
-            raise ModelError(f"{setting('innovation_length')} {innovation_length!r} is no whole number from 1")
+            raise ModelError(
+                f"{setting('innovation_length')} {innovation_length!r} is not a whole number of at least 1"
+            )
         step, longest = check_step(step, "step"), check_step(longest, "longest")
         self.step = step
         self._recursions: list[Recursion] = []

@@ -33,7 +33,7 @@ from ftlm.validation.data_advice import check_excitation, find_dead_channel
 #: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
 #: Least number of samples per period of a mode whose numbers do not rest on the inputs between samples, and damping
-#: ratio from which on a mode is no swing.
+#: ratio from which on a mode is not a swing.
 MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
 #: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
 #: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
@@ -83,12 +83,14 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
         findings.append(make_finding("step_moves_estimate", pulses=joint.refinement))
     findings += _unstable_optimum_findings(joint)
     errors = joint.standard_errors
-    unseen = [n for n in joint.names if math.isinf(errors[n])]
-    if unseen:
-        findings.append(make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen)))
+    unidentifiable = [n for n in joint.names if math.isinf(errors[n])]
+    if unidentifiable:
+        findings.append(
+            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
+        )
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
         # Negated so that a standard error that is not a number counts as too large.
-        if name in unseen:
+        if name in unidentifiable:
             continue
         if not errors[name] <= high - low and not _has_bounded_interval(joint, name):
             findings.append(make_finding("order_not_told", parameter=name))
@@ -96,7 +98,7 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
             findings.append(make_finding("on_bound", parameter=name, what=f"order {name}", value=f"{value:g}"))
     for item in problem.inputs:
         value, (low, high) = joint.inputs[item.name], item.bounds
-        if item.name in unseen:
+        if item.name in unidentifiable:
             continue
         if not errors[item.name] <= high - low and not _has_bounded_interval(joint, item.name):
             findings.append(make_finding("input_number_not_told", parameter=item.name, words=item.words))
@@ -108,9 +110,9 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
     for name, value in joint.coefficients.items():
         # Where the cost is no parabola, its profile knows better.
         told = name in joint.profiles and 0.0 not in joint.profiles[name]
-        if name not in unseen and not errors[name] <= abs(value) and not told:
+        if name not in unidentifiable and not errors[name] <= abs(value) and not told:
             findings.append(make_finding("not_different_from_0", parameter=name, value=value, error=errors[name]))
-    findings += correlation_findings(joint) + unbounded_interval_findings(joint, unseen)
+    findings += correlation_findings(joint) + unbounded_interval_findings(joint, unidentifiable)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
     return [*findings, *(make_finding("residuals_not_white", output=output) for output in coloured)]
 
@@ -124,7 +126,7 @@ def second_optimum_findings(
     """Return a finding on the most likely other optimum at values over three standard errors apart.
 
     Each optimum comes with the fall of the log likelihood and its own standard errors: what it does not determine
-    itself is no value.
+    itself is not a value.
     """
     for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
         if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:
@@ -213,12 +215,12 @@ def _has_bounded_interval(joint: JointFit, name: str) -> bool:
     return name in joint.profiles and not joint.profiles[name].is_open
 
 
-def unbounded_interval_findings(joint: JointFit, unseen: Sequence[str]) -> list[Finding]:
+def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) -> list[Finding]:
     """Return a finding on parameters with an unbounded interval."""
     sides = {
         n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
         for n, p in joint.profiles.items()
-        if n not in unseen
+        if n not in unidentifiable
     }
     # An order that ends at 0 has nothing below it.
     open_ended = {n: s for n, s in sides.items() if s and (s != ["below"] or joint.orders.get(n) != 0.0)}

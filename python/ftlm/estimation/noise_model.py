@@ -91,13 +91,13 @@ def _noise_model(residuals: Sequence[Floats]) -> Floats:
 
 
 def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
-    """Return the residuals of all runs at lags 1 to ``order``, one column a lag; NaN before the first."""
+    """Return the residuals of all runs at lags 1 to ``order``, one column per lag; NaN before the first."""
     columns = [[np.concatenate([np.full(lag, np.nan), v[:-lag]]) for v in residuals] for lag in range(1, order + 1)]
     return np.stack([np.concatenate(column) for column in columns], axis=1)
 
 
 def whiten(run: Run, colour: Floats) -> Run:
-    """Return a run filtered by A(q); the first outputs, of which the past is not known, are missing."""
+    """Return a run filtered by A(q). The first output samples are missing, because their past is unknown."""
     past = colour.size - 1
 
     def whitened_samples(values: Floats) -> Floats:

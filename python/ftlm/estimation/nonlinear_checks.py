@@ -101,8 +101,8 @@ def _rms(parts: Sequence[Floats]) -> float:
 def _forgetting_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
     """Return a finding if the sensitivity of a free run grows exponentially while its output does not.
 
-    Then the end of the run depends on its parameters more than any noise, as for chaotic motion, and nothing that is
-    fitted to all of it has a meaning.
+    The end of the run then depends too strongly on the parameters, as in chaotic motion, so that a fit to the whole run
+    is not meaningful.
     """
     numbers = parameter_vector(model)
     worst: tuple[float, float, str] | None = None

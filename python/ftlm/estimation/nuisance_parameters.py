@@ -290,22 +290,22 @@ def fit_with_initial_conditions(
     """
 
     def fit_initial_terms(
-        initial: Initial, *, refine: bool = True, raced: _core.JointMultistart | None = None
+        initial: Initial, *, refine: bool = True, multistart: _core.JointMultistart | None = None
     ) -> JointFit:
         asked = replace(structure, initial=initial)
         begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
-        return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)
+        return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, multistart=multistart)
 
     decided = structure.initial != "auto" or not has_memory(structure) or not structure.is_linear
     if not decided and isinstance(start, History):
         # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
         # for more terms, not for fewer.
         asked = replace(structure, initial=start)
-        raced = None if alone else run_multistart(runs, asked, threads, progress)
-        many = fit_initial_terms(start, refine=False, raced=raced)
+        multistart = None if alone else run_multistart(runs, asked, threads, progress)
+        many = fit_initial_terms(start, refine=False, multistart=multistart)
         kept = _simplify_initial_terms(many, runs, structure, loss, refine=False)
         asked = replace(structure, initial=kept.initial)
-        fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
+        fine = fit_output_error(runs, asked, near=kept, loss=loss, multistart=multistart)
         unstable = fine.unstable_optimum or kept.unstable_optimum or many.unstable_optimum
         fine = replace(fine, starts=many.starts, origin=many.origin, unstable_optimum=unstable)
         return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
@@ -361,7 +361,7 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
         few = refit_from(joint, runs, replace(asked, initial="caputo"), loss)
-        # On the same kind of grid: what a coarse one leaves is no history.
+        # On the same kind of grid: what a coarse one leaves is not a history.
         many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
         return None

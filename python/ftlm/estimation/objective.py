@@ -70,24 +70,24 @@ def minimize_cost(
     *,
     evaluations: int,
     plain: bool = False,
-    held: int | Sequence[int] = (),
+    fixed: int | Sequence[int] = (),
     tolerance: float = COST_REDUCTION_TOLERANCE,
-    steady: bool = False,
+    prefer_stable: bool = False,
 ) -> Iterate:
-    """Minimize the cost by Levenberg-Marquardt; parameters with an index in `held` stay fixed.
+    """Minimize the cost by Levenberg-Marquardt; parameters with an index in `fixed` stay fixed.
 
-    With `steady`, no step leads from a stable model to an unstable one. Initial states of bodies with friction are not
-    projected out and continue from the last values.
+    With `prefer_stable`, no step leads from a stable model to an unstable one. Initial states of bodies with friction
+    are not projected out and continue from the last values.
     """
     states = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     outcome = problem.core.minimize(
         experiments,
         (attempt.values.tolist(), states),
         plain,
-        (held,) if isinstance(held, int) else held,
+        (fixed,) if isinstance(fixed, int) else fixed,
         evaluations,
         tolerance,
-        steady,
+        prefer_stable,
         stop_flag(),
     )
     orders, coefficients, inputs = problem.split(outcome["values"])
@@ -130,7 +130,7 @@ class Objective:
         evaluations: int,
         *,
         plain: bool = False,
-        held: int | Sequence[int] = (),
+        fixed: int | Sequence[int] = (),
         tolerance: float = COST_REDUCTION_TOLERANCE,
     ) -> Iterate:
         """Minimize the cost by Levenberg-Marquardt; see :func:`minimize_cost`."""
@@ -140,9 +140,9 @@ class Objective:
             attempt,
             evaluations=evaluations,
             plain=plain,
-            held=held,
+            fixed=fixed,
             tolerance=tolerance,
-            steady=self.prefer_stable,
+            prefer_stable=self.prefer_stable,
         )
 
     def evaluate(self, attempt: Iterate) -> Iterate:
@@ -202,7 +202,7 @@ def covariance(attempt: Iterate, grid: Objective) -> Floats:
 
 
 def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) -> Floats:
-    """Return the covariance from a Jacobian (row a parameter), residual series and their sum of squares.
+    """Return the covariance from a Jacobian (one row per parameter), residual series and their sum of squares.
 
     Missing residuals are NaN. Covariances with a parameter of infinite variance are NaN.
     """
@@ -211,7 +211,7 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
 
 def propagated_errors(slopes: Floats, spread: Floats) -> Floats:
     """Return standard errors by first-order propagation, infinite if a variance involved is infinite."""
-    unseen = np.isinf(np.diag(spread))
-    known = slopes[:, ~unseen]
-    variance = np.einsum("ij,jk,ik->i", known, spread[np.ix_(~unseen, ~unseen)], known)
-    return np.where((slopes[:, unseen] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))
+    unidentifiable = np.isinf(np.diag(spread))
+    known = slopes[:, ~unidentifiable]
+    variance = np.einsum("ij,jk,ik->i", known, spread[np.ix_(~unidentifiable, ~unidentifiable)], known)
+    return np.where((slopes[:, unidentifiable] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))

@@ -42,9 +42,9 @@ class UnstableOptimum:
         Whether the fit is the unstable optimum, because the data require it or no stable one exists.
     residual_excess
         Relative excess of the root-mean-square residuals of the stable optimum. Infinite if there is none; negative if
-        the unstable point is no optimum.
+        the unstable point is not an optimum.
     at_stability_limit
-        Whether the stable point lies on the stability limit and is no optimum of its own.
+        Whether the stable point lies on the stability limit and is not an optimum of its own.
     """
 
     is_accepted: bool
@@ -61,15 +61,15 @@ class ProfileInterval:
     Parameters
     ----------
     low, high
-        Its ends, in the unit of the number; infinite where the cost does not rise to the threshold within the bounds,
-        as far as there is a finite simulation.
+        Ends, in the unit of the parameter; infinite if the cost does not reach the threshold within the bounds, or
+        within the range of finite simulations.
     level
-        Probability with which intervals of repeated runs hold the truth.
+        Confidence level.
     points
-        (value, rise) of every refit: the rise of the weighted sum of squares in units of the noise's variance, so that
-        its root counts standard deviations; widened for coloured residuals as the standard errors are.
+        (value, rise) of every refit. The rise is that of the sum of squares over the noise variance, so its root counts
+        standard deviations. It is corrected for colored residuals as standard errors are.
     evaluations
-        Free runs that it took.
+        Number of simulations.
     """
 
     low: float
@@ -201,7 +201,7 @@ class JointFit:
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
     @property
-    def choice(self) -> str:
+    def origin_text(self) -> str:
         """Description of the initial guess that led to this optimum, and of the cost of the next optimum."""
         if not self.starts:
             return f"from {self.origin}"
@@ -294,13 +294,13 @@ def fit_output_error(
     loss: Loss = "squares",
     known: Sequence[Mapping[str, float]] = (),
     near: JointFit | None = None,
-    raced: _core.JointMultistart | None = None,
+    multistart: _core.JointMultistart | None = None,
 ) -> JointFit:
     """Fit all equations of a structure to all runs by output error, with automatic initialization.
 
     A coefficient law of the structure is imposed, and its initial terms must be decided. `start` gives values of all
     free parameters by name and replaces the automatic initial guesses; `known` adds to them. `near` is a fit of the
-    same structure to nearly the same runs, whose grid and weights are reused. `raced` is the result of an earlier
+    same structure to nearly the same runs, whose grid and weights are reused. `multistart` is the result of an earlier
     multistart. Without `refine` the grid is not refined below the samples. Progress is called with (parts done, total
     parts). The loss ranks optima on all samples, but not the initial guesses.
 
@@ -327,7 +327,7 @@ def fit_output_error(
         [[v[n] for n in problem.names] for v in known],
         None if start is None else [start[n] for n in problem.names],
         given_near,
-        raced,
+        multistart,
         loss == "huber",
         refine,
         (threads, memory_limit()),

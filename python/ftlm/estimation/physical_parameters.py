@@ -87,10 +87,10 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
     stages = []
     for name, value in known.items():
         if name not in names:
-            raise ModelError(f"{name!r} is no physical parameter of the arm; use one of {', '.join(names)}")
+            raise ModelError(f"{name!r} is not a physical parameter of the arm; use one of {', '.join(names)}")
         stage = names[name][0]
         if stage in stages:
-            raise ModelError(f"two parameters of stage {stage} are given; the fit needs one, {name} is one too many")
+            raise ModelError(f"two parameters of stage {stage} are given, but only one may be known; leave {name} out")
         stages.append(stage)
         amount = real_number(name, value)
         if not 0 < amount < math.inf:

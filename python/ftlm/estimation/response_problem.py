@@ -129,9 +129,9 @@ class ResponseProblem:
             out[at] *= self.unit**-way
         return out
 
-    def slopes_in_seconds(self, values: Floats, slopes: Floats) -> Floats:
+    def jacobian_in_seconds(self, values: Floats, jacobian: Floats) -> Floats:
         """Convert a Jacobian by scaled parameters to one by parameters in seconds."""
-        out = slopes.copy()
+        out = jacobian.copy()
         log = np.log(self.unit)
         for name, at in self._coefficient.items():
             item, term = self.term_of[name]
@@ -139,7 +139,7 @@ class ResponseProblem:
             # c' = c unit^-(alpha - order): by c itself, and by each order at a fixed c.
             for order, sign in ((item.order, -1.0), (term.order, 1.0)):
                 for n, w in order.weights:
-                    out[:, self._place[n]] += sign * w * log * float(values[at]) * slopes[:, at]
+                    out[:, self._place[n]] += sign * w * log * float(values[at]) * jacobian[:, at]
             out[:, at] *= self.unit**-power
         for at in self._delay.values():
             out[:, at] *= self.unit
@@ -157,11 +157,11 @@ class ResponseProblem:
         at = self._delay.get(signal)
         return self.known_delays.get(signal, 0.0) if at is None else float(values[at])
 
-    def responses(self, values: Floats, *, slopes: bool = True) -> list[tuple[Complex, Complex | None]]:
+    def responses(self, values: Floats, *, jacobian: bool = True) -> list[tuple[Complex, Complex | None]]:
         """Return the model response at every record, and its derivatives by all parameters (one column each)."""
-        return [self._response(record, values, slopes) for record in self.records]
+        return [self._response(record, values, jacobian) for record in self.records]
 
-    def _response(self, record: ResponseRecord, values: Floats, slopes: bool) -> tuple[Complex, Complex | None]:
+    def _response(self, record: ResponseRecord, values: Floats, jacobian: bool) -> tuple[Complex, Complex | None]:
         s = 1j * record.frequency
         log = np.log(s)
         items, names = self.structure.equations, self.structure.outputs
@@ -185,10 +185,10 @@ class ResponseProblem:
             whole = np.linalg.solve(matrix, (right * late[:, None])[..., None])[..., 0]
             unit = np.zeros((s.size, len(items), 1), dtype=np.complex128)
             unit[:, record.output] = 1.0
-            ahead = np.linalg.solve(matrix.transpose(0, 2, 1), unit)[..., 0] if slopes else None
+            ahead = np.linalg.solve(matrix.transpose(0, 2, 1), unit)[..., 0] if jacobian else None
         except np.linalg.LinAlgError:
             nothing = np.full(s.size, np.nan, dtype=np.complex128)
-            return nothing, np.full((s.size, len(self.names)), np.nan, dtype=np.complex128) if slopes else None
+            return nothing, np.full((s.size, len(self.names)), np.nan, dtype=np.complex128) if jacobian else None
         response = np.asarray(whole[:, record.output], dtype=np.complex128)
         if ahead is None:
             return response, None
@@ -215,17 +215,20 @@ class ResponseProblem:
             out[:, self._delay[record.input]] = -s * response
         return response, out
 
-    def residuals(self, values: Floats, *, slopes: bool = True) -> tuple[Floats, Floats]:
-        """Return the residuals times weights, real parts before imaginary parts, and their Jacobian."""
-        left, steep = [], []
+    def residuals(self, values: Floats, *, jacobian: bool = True) -> tuple[Floats, Floats]:
+        """Return the weighted residuals, real parts before imaginary parts, and their Jacobian.
+
+        Without `jacobian` the Jacobian has no columns.
+        """
+        left, rows = [], []
         with np.errstate(all="ignore"):
-            for record, (response, moved) in zip(self.records, self.responses(values, slopes=slopes), strict=True):
+            for record, (response, moved) in zip(self.records, self.responses(values, jacobian=jacobian), strict=True):
                 left.append((response - record.response) * record.weight)
                 if moved is not None:
-                    steep.append(moved * record.weight[:, None])
+                    rows.append(moved * record.weight[:, None])
         flat = np.concatenate(left)
-        jacobian = np.concatenate(steep) if steep else np.zeros((flat.size, 0), dtype=np.complex128)
-        return np.concatenate([flat.real, flat.imag]), np.concatenate([jacobian.real, jacobian.imag])
+        matrix = np.concatenate(rows) if rows else np.zeros((flat.size, 0), dtype=np.complex128)
+        return np.concatenate([flat.real, flat.imag]), np.concatenate([matrix.real, matrix.imag])
 
     def constraints(self) -> tuple[Floats, Floats, list[str]]:
         """Return the constraints ``rows @ values <= limits`` of orders and delays, with descriptions."""
@@ -302,7 +305,7 @@ def initial_guesses(problem: ResponseProblem) -> list[Floats]:
     found = _linear_coefficients(problem, points) if problem.coefficients else list(points)
     judged = []
     for values in found:
-        left, _ = problem.residuals(values, slopes=False)
+        left, _ = problem.residuals(values, jacobian=False)
         cost = float(left @ left)
         if np.isfinite(cost):
             judged.append((cost, values))

@@ -215,7 +215,7 @@ class Identification:
         Raises
         ------
         ModelError
-            A model without coefficient law or intervals, or a name that is no parameter of it.
+            A model without coefficient law or intervals, or a name that is not a parameter of it.
         """
         if self.joint is None:
             raise ModelError(
@@ -352,7 +352,7 @@ class Identification:
             "residuals": None if self.residuals is None else self.residuals.to_dict(),
             "information": None if self.information is None else self.information.to_dict(),
             "searches": {name: s.to_dict() for name, s in self.searches.items()},
-            "choice": None if self.joint is None else self.joint.choice,
+            "choice": None if self.joint is None else self.joint.origin_text,
             "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
         }
@@ -422,7 +422,7 @@ class Identification:
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
             lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
         if self.joint is not None:
-            lines.append(f"  {self.joint.choice}")
+            lines.append(f"  {self.joint.origin_text}")
         if errors:
             others = ", but those written out: by profile likelihood" if self.profiles else ""
             lines.append(f"  (value ± standard error; 95 % intervals are ± 1.96 of these{others})")

@@ -36,7 +36,7 @@ MIN_FIT_GAIN = 0.5
 MAX_BURIED_RESIDUAL = 0.99
 #: Findings that explain a poor fit by the data.
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
-UNSEEN_TOPIC = FINDING_TOPICS["unseen"]
+NOT_SEPARABLE_TOPIC = FINDING_TOPICS["not_separable"]
 #: Findings that name what a model lacks, and are reported before the residuals that show it.
 MISSING_PART_CODES = (
     "dynamics_missing",
@@ -56,7 +56,18 @@ MISSING_PART_CODES = (
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 #: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by
 #: rounding alone, and a parameter may be uncertain, but not by much.
-RULED_TOPICS = ("chaos", "residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
+RULED_TOPICS = (
+    "chaos",
+    "residuals",
+    "closed_loop",
+    "imprecise",
+    "not_separable",
+    "near_identity",
+    "poor_fit",
+    "validation_loss",
+    "unstable",
+    "overflow",
+)
 
 
 @dataclass(frozen=True)
@@ -217,9 +228,11 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 def saved_findings(known: Estimate) -> list[Finding]:
     """Return all findings that speak against using a saved model, those recorded at the fit first."""
     found = [] if known.against is UNSET else list(known.against)
-    unseen = [n for n, e in known.standard_errors.items() if e is None]
-    if unseen and not any(f.topic is UNSEEN_TOPIC for f in found):
-        found.append(make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen)))
+    unidentifiable = [n for n, e in known.standard_errors.items() if e is None]
+    if unidentifiable and not any(f.topic is NOT_SEPARABLE_TOPIC for f in found):
+        found.append(
+            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
+        )
     if known.warnings:
         found.append(make_finding("sentences_alone"))
     return found
@@ -236,15 +249,15 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     yield from _free_runs(result)
     errors, joint = result.standard_errors, result.joint
     yield from (f for f in result.findings if f.code == "run_forgets")
-    unseen = [n for n, e in errors.items() if not math.isfinite(e)]
-    if unseen and "run_forgets" not in codes:
-        yield make_finding("not_told_apart", parameter=", ".join(unseen), shown=join_names(unseen))
+    unidentifiable = [n for n, e in errors.items() if not math.isfinite(e)]
+    if unidentifiable and "run_forgets" not in codes:
+        yield make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
     yield from (f for f in result.findings if f.code == "equation_says_identity")
     yield from (f for f in result.findings if f.code in MISSING_PART_CODES)
     yield from _residuals(result)
     if joint is not None and not joint.converged and "not_converged" not in codes:
         yield make_finding("not_converged")
-    vague = [n for n in errors if n not in unseen and _is_uncertain(result, n)]
+    vague = [n for n in errors if n not in unidentifiable and _is_uncertain(result, n)]
     if vague:
         shown = join_names([_format_uncertain(result, n) for n in vague])
         yield make_finding("number_vague", parameter=", ".join(vague), shown=shown)
@@ -413,7 +426,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     yield from coupled
     yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in judged)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
-    # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
+    # With a reference the loop is known: its noise is not part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]
     yield from (make_finding("residuals_not_white", output=o) for o in coloured)
 

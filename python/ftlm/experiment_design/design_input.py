@@ -212,7 +212,7 @@ def design_input(
     """
     if progress is not None and not callable(progress):
         raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
-    wanted = _check_arguments(
+    task = _check_arguments(
         model,
         reference_run,
         duration,
@@ -226,50 +226,48 @@ def design_input(
         period,
         seed,
     )
-    laid, bounds, goal = wanted.fit, wanted.bounds, wanted.criterion
+    fit, bounds, goal = task.fit, task.bounds, task.criterion
     if isinstance(progress, Progress):
-        size = len(laid.names) * len(laid.outputs) * wanted.rows
+        size = len(fit.names) * len(fit.outputs) * task.rows
         progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
     course = ShareTracker(progress)
-    known = Sensitivities.of(laid, wanted.step, wanted.rows - 1, bounds.ramp_samples(wanted.step))
+    known = Sensitivities.of(fit, task.step, task.rows - 1, bounds.ramp_samples(task.step))
     course.advance_to(0.05)
-    spectrum = best_spectrum(spectral_lines(laid, bounds, wanted.step, wanted.rows - 1), goal)
+    spectrum = best_spectrum(spectral_lines(fit, bounds, task.step, task.rows - 1), goal)
     course.advance_to(0.15)
-    tried = _design_candidates(wanted, known, spectrum, course)
-    plain = np.stack([p * square_wave(wanted.rows - 1, wanted.period) for p in bounds.peaks.values()])
-    reference = laid.run(
-        known.rig_commands(plain), wanted.step, f"square of period {wanted.period * wanted.step:.4g} s"
-    )
+    tried = _design_candidates(task, known, spectrum, course)
+    plain = np.stack([p * square_wave(task.rows - 1, task.period) for p in bounds.peaks.values()])
+    reference = fit.run(known.rig_commands(plain), task.step, f"square of period {task.period * task.step:.4g} s")
     base = float(goal.score(known.information(known.derivatives(plain))))
     best = tried[0]
-    commands = best.commands * _robust_scale(wanted, known, best.commands)
-    run = laid.run(known.rig_commands(commands), wanted.step, "designed")
-    errors = _errors(laid, reference, run)
+    commands = best.commands * _robust_scale(task, known, best.commands)
+    run = fit.run(known.rig_commands(commands), task.step, "designed")
+    errors = _errors(fit, reference, run)
     at = list(goal.indices)
     ratios = np.log(errors["square"][at]) - np.log(errors["designed"][at])
     course.advance_to(1.0)
     return DesignedInput(
         run=run,
         reference=reference,
-        shape=_shape_text(best, run, wanted),
+        shape=_shape_text(best, run, task),
         criterion=goal.kind,
-        parameters=tuple(laid.names[i] for i in at),
-        values=dict(zip(laid.names, laid.values, strict=True)),
-        errors={k: dict(zip(laid.names, v.tolist(), strict=True)) for k, v in errors.items()},
+        parameters=tuple(fit.names[i] for i in at),
+        values=dict(zip(fit.names, fit.values, strict=True)),
+        errors={k: dict(zip(fit.names, v.tolist(), strict=True)) for k, v in errors.items()},
         gain=float(np.exp(np.sum(ratios))),
         gains=tuple((d.name, math.exp(min(goal.count * (d.score - base), 700.0))) for d in tried),
         predicted_extremes=_predicted_extremes(run, bounds),
         spectrum=spectrum,
         efficiency=math.exp(best.score - spectrum.bound),
-        findings=wanted.findings,
+        findings=task.findings,
     )
 
 
 def _design_candidates(
-    wanted: DesignTask, known: Sensitivities, spectrum: Spectrum, course: ShareTracker
+    task: DesignTask, known: Sensitivities, spectrum: Spectrum, course: ShareTracker
 ) -> list[Design]:
     """Return all candidate inputs, best first: initial signals, and the exchange results of the best of them."""
-    laid, bounds, goal, rows = wanted.fit, wanted.bounds, wanted.criterion, wanted.rows - 1
+    fit, bounds, goal, rows = task.fit, task.bounds, task.criterion, task.rows - 1
     ended = stop_flag()
 
     def raise_if_cancelled() -> None:
@@ -279,12 +277,12 @@ def _design_candidates(
     peaks = np.array(list(bounds.peaks.values()))[:, None]
     begun = [
         scaled_design(name, peaks * c, known, goal, bounds)
-        for name, c in initial_inputs(spectrum, len(laid.inputs), rows, wanted.step, wanted.seed)
+        for name, c in initial_inputs(spectrum, len(fit.inputs), rows, task.step, task.seed)
     ]
     found = [d for d in begun if d.score > -math.inf]
     if not found:
         raise ModelError(
-            f"no input of this length makes {', '.join(laid.names[i] for i in goal.indices)} separately "
+            f"no input of this length makes {', '.join(fit.names[i] for i in goal.indices)} separately "
             f"identifiable from "
             "the other parameters; name fewer parameters, or make the run longer"
         )
@@ -335,10 +333,10 @@ def _check_arguments(
         raise ModelError(f"reference_run is {type(reference_run).__name__}, not a Run; give a run of the machine")
     free = parameter_set_of(solved)
     outputs = solved.outputs
-    laid = ModelFit.of(solved, per_signal_values("noise", noise, outputs, free.noise))
-    _check_signals(laid, reference_run)
+    fit = ModelFit.of(solved, per_signal_values("noise", noise, outputs, free.noise))
+    _check_signals(fit, reference_run)
     if free.covariance is None:
-        _raise_too_uncertain(laid, "some of its numbers have infinite intervals", None)
+        _raise_too_uncertain(fit, "some of its numbers have infinite intervals", None)
     known = solved.about.get("step") if reference_run is None else reference_run.step
     time = _positive("step", known if step is None else step, "a step [s]")
     length = _positive(
@@ -359,10 +357,10 @@ def _check_arguments(
         per_signal_values(
             "peak",
             peak,
-            laid.inputs,
-            None if reference_run is None else _largest_values(reference_run, laid.inputs, moved=False),
+            fit.inputs,
+            None if reference_run is None else _largest_values(reference_run, fit.inputs, moved=False),
         ),
-        per_signal_values("slew", slew, laid.inputs, dict.fromkeys(laid.inputs, math.inf)),
+        per_signal_values("slew", slew, fit.inputs, dict.fromkeys(fit.inputs, math.inf)),
         per_signal_values("limits", limits, outputs, swings),
     )
     for name, value in bounds.peaks.items():
@@ -376,15 +374,15 @@ def _check_arguments(
             f"of {length:g} s in all: no input of that peak can be kept within it; lower {parameter('peak')}, or "
             f"raise {parameter('slew')} or {parameter('duration')}"
         )
-    _check_stable(laid, bounds)
-    _check_uncertainty(laid, time, length)
-    at = _parameter_indices(laid, parameters)
+    _check_stable(fit, bounds)
+    _check_uncertainty(fit, time, length)
+    at = _parameter_indices(fit, parameters)
     if not isinstance(criterion, str) or criterion not in ("D", "E"):
         raise ModelError(
             f"{setting('criterion')} {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
         )
     # An order is of size 1 by itself; what else is known, is known as a share of itself.
-    units = [1.0 if laid.names[i] in laid.problem.orders else abs(laid.values[i]) or 1.0 for i in at]
+    units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in at]
     begun = check_seed(seed)
     every = round(
         _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]") / time
@@ -403,22 +401,22 @@ def _check_arguments(
     elif colour is not None and noise is None:
         words = (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
     return DesignTask(
-        laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words
+        fit, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words
     )
 
 
-def _check_signals(laid: ModelFit, reference_run: Run | None) -> None:
+def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
     """Raise if a model has no usable input, or a run lacks its inputs."""
-    if not laid.inputs:
+    if not fit.inputs:
         raise ModelError("the model has no input, so there is nothing to design; give one with an input")
-    if laid.problem.structure.all_filtered:
+    if fit.problem.structure.all_filtered:
         raise ModelError(
             "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the "
             "filter on outputs alone"
         )
     if reference_run is None:
         return
-    lacking = [n for n in laid.inputs if n not in reference_run.inputs]
+    lacking = [n for n in fit.inputs if n not in reference_run.inputs]
     if lacking:
         raise DataError(
             f"run {reference_run.name!r} has no input {lacking[0]!r}{nearest(lacking[0], reference_run.inputs)}, which "
@@ -436,7 +434,10 @@ def _positive(name: str, value: object, what: str) -> float:
 
 
 def _largest_values(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]:
-    """Largest size of signals of a run, of outputs from their first value; omits missing and constant signals."""
+    """Return the largest absolute values of signals of a run; missing and constant signals are omitted.
+
+    With ``moved`` they are measured from the first value of each signal.
+    """
     out = {}
     for name in names:
         if name in run:
@@ -448,32 +449,32 @@ def _largest_values(run: Run, names: Sequence[str], *, moved: bool) -> dict[str,
     return out
 
 
-def _parameter_indices(laid: ModelFit, names: Sequence[str] | None) -> tuple[int, ...]:
+def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int, ...]:
     """Return the indices of the parameters of interest."""
     if isinstance(names, str):
         names = [names]
     if names is None:
-        names = laid.problem.orders or laid.names
+        names = fit.problem.orders or fit.names
     if not isinstance(names, Iterable):
-        raise ModelError(f"names is a {type(names).__name__}; give a list of names of {', '.join(laid.names)}")
+        raise ModelError(f"names is a {type(names).__name__}; give a list of names of {', '.join(fit.names)}")
     given = list(names)
     for k, name in enumerate(given):
-        if not isinstance(name, str) or name not in laid.names:
-            near = nearest(name, laid.names) if isinstance(name, str) else ""
+        if not isinstance(name, str) or name not in fit.names:
+            near = nearest(name, fit.names) if isinstance(name, str) else ""
             raise ModelError(
-                f"names[{k}] = {short_repr(name)} is no free parameter of the model{near}; it has "
-                f"{', '.join(laid.names)}"
+                f"names[{k}] = {short_repr(name)} is not a free parameter of the model{near}; it has "
+                f"{', '.join(fit.names)}"
             )
         if name in given[:k]:
             raise ModelError(f"names has {name!r} twice; give each once")
     if not given:
         raise ModelError("names is empty; give the parameters of interest, or leave it out for all orders")
-    return tuple(laid.names.index(n) for n in given)
+    return tuple(fit.names.index(n) for n in given)
 
 
-def _check_stable(laid: ModelFit, bounds: Bounds) -> None:
+def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
     """Raise if a model is unstable, or integrates without a limit of its output."""
-    found = stability(laid.model)
+    found = stability(fit.model)
     if found.unstable_poles != 0 or found.on_axis:
         raise ModelError(
             f"the model is {found}, and inputs are designed for stable models; identify the machine with a stabilizing "
@@ -488,39 +489,37 @@ def _check_stable(laid: ModelFit, bounds: Bounds) -> None:
         )
 
 
-def _check_uncertainty(laid: ModelFit, step: float, length: float) -> None:
+def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
     """Raise if the model is too uncertain: an input optimal for it may be poor for the machine."""
-    spread = laid.covariance
+    spread = fit.covariance
     errors = np.sqrt(np.diag(spread))
     vague = [
         f"{n} = {v:.3g} ± {e:.2g}"
-        for n, v, e in zip(laid.names, laid.values, errors, strict=True)
-        if n in laid.problem.orders and not e <= MAX_ORDER_ERROR
+        for n, v, e in zip(fit.names, fit.values, errors, strict=True)
+        if n in fit.problem.orders and not e <= MAX_ORDER_ERROR
     ]
     if vague:
-        _raise_too_uncertain(laid, f"order {vague[0]}", (step, length))
+        _raise_too_uncertain(fit, f"order {vague[0]}", (step, length))
     rows = min(max(round(length / step), MIN_RUN_SAMPLES), 2000)
     coarse = length / rows
-    probe = np.stack(
-        [np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(laid.inputs))]
-    )
-    run = laid.run(np.cumsum(probe, axis=1) / math.sqrt(rows) + probe, coarse, "probe")
-    rows_of = laid.jacobian(run)
+    probe = np.stack([np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(fit.inputs))])
+    run = fit.run(np.cumsum(probe, axis=1) / math.sqrt(rows) + probe, coarse, "probe")
+    rows_of = fit.jacobian(run)
     moved = np.einsum("pt,pq,qt->t", rows_of, spread, rows_of)
-    for output, part in zip(laid.outputs, np.split(moved, len(laid.outputs)), strict=True):
-        size = float(np.sqrt(np.mean((run[output] / laid.noise[output]) ** 2)))
+    for output, part in zip(fit.outputs, np.split(moved, len(fit.outputs)), strict=True):
+        size = float(np.sqrt(np.mean((run[output] / fit.noise[output]) ** 2)))
         share = float(np.sqrt(np.mean(np.maximum(part, 0.0)))) / max(size, 1e-300)
         if not share <= MAX_RELATIVE_UNCERTAINTY:
             _raise_too_uncertain(
-                laid, f"its own uncertainty moves what {output} does by {100 * share:.0f} %", (step, length)
+                fit, f"its own uncertainty moves what {output} does by {100 * share:.0f} %", (step, length)
             )
 
 
-def _raise_too_uncertain(laid: ModelFit, why: str, times: tuple[float, float] | None) -> None:
+def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | None) -> None:
     """Raise with a recommended first experiment."""
     low, high = (0.1, 10.0) if times is None else (1.0 / times[1], 0.1 / times[0])
     try:
-        own = [abs(m.pole) / (2 * math.pi) for m in modes(laid.model)]
+        own = [abs(m.pole) / (2 * math.pi) for m in modes(fit.model)]
         if own:
             low, high = max(low, min(own) / 10), min(high, 10 * max(own))
     except FtlmError:
@@ -534,22 +533,22 @@ def _raise_too_uncertain(laid: ModelFit, why: str, times: tuple[float, float] | 
     )
 
 
-def _robust_scale(wanted: DesignTask, known: Sensitivities, commands: Floats) -> float:
+def _robust_scale(task: DesignTask, known: Sensitivities, commands: Floats) -> float:
     """Factor that keeps outputs within their limits over the confidence intervals of the model."""
     moved, slopes = known.outputs(commands), known.derivatives(commands)
-    spread = np.einsum("pot,pq,qot->ot", slopes, wanted.fit.covariance, slopes)
-    noise = np.array([wanted.fit.noise[o] for o in wanted.fit.outputs])[:, None]
+    spread = np.einsum("pot,pq,qot->ot", slopes, task.fit.covariance, slopes)
+    noise = np.array([task.fit.noise[o] for o in task.fit.outputs])[:, None]
     reach = np.abs(moved) + NORMAL_95 * noise * np.sqrt(np.maximum(spread, 0.0))
-    return wanted.bounds.scale(commands, reach)
+    return task.bounds.scale(commands, reach)
 
 
-def _errors(laid: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
-    """Standard errors of the model, and predicted ones of fits of the designed and of the reference run."""
-    now, new = laid.covariance, laid.predicted_covariance(run)
+def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
+    """Return standard errors of the model, and those predicted for fits to the reference and to the designed run."""
+    now, new = fit.covariance, fit.predicted_covariance(run)
     size = np.sqrt(np.diag(now))
     told = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
     both = np.linalg.inv(told) * np.outer(size, size)
-    every = {"now": now, "square": laid.predicted_covariance(reference), "designed": new, "both": both}
+    every = {"now": now, "square": fit.predicted_covariance(reference), "designed": new, "both": both}
     return {k: np.sqrt(np.diag(v)) for k, v in every.items()}
 
 
@@ -566,11 +565,11 @@ def _predicted_extremes(run: Run, bounds: Bounds) -> tuple[PredictedExtreme, ...
     )
 
 
-def _shape_text(best: Design, run: Run, wanted: DesignTask) -> str:
+def _shape_text(best: Design, run: Run, task: DesignTask) -> str:
     """Describe the designed input."""
     if not best.name.endswith("exchanged"):
         return best.name
-    first = next(iter(wanted.fit.inputs))
-    switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if wanted.bounds.ramp_samples(wanted.step) == 1 else 0
+    first = next(iter(task.fit.inputs))
+    switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if task.bounds.ramp_samples(task.step) == 1 else 0
     begun = best.name.removesuffix(", exchanged")
     return f"levels exchanged from {begun}" + (f", {switches} switches" if switches else "")

@@ -125,7 +125,10 @@ class Bounds:
         return max(1, *(math.ceil(min(2 * p / self.slews[n] / step, 1e18) - 1e-9) for n, p in self.peaks.items()))
 
     def scale(self, commands: Floats, moved: Floats) -> float:
-        """Factor, at most 1, that keeps commands and outputs within their limits; rows in the order of names."""
+        """Return the factor, at most 1, that keeps commands and outputs within their limits.
+
+        ``commands`` and ``moved`` have one row per input and per output, in the order of the limits.
+        """
         return min(
             1.0,
             *(
@@ -172,10 +175,10 @@ def per_signal_values(
             continue
         value = real_number(f"{what} of {name}", said)
         if not value > 0:
-            raise ModelError(f"{what} of {name} = {value:g} is not above 0; give the largest size it may have")
+            raise ModelError(f"{what} of {name} = {value:g} is not above 0; give its largest absolute value")
         if not LIMIT_RANGE[0] <= value <= LIMIT_RANGE[1] and not math.isinf(value):
             raise ModelError(
-                f"{what} of {name} = {value:g} is no size from {LIMIT_RANGE[0]:g} to {LIMIT_RANGE[1]:g}; use other "
+                f"{what} of {name} = {value:g} is not between {LIMIT_RANGE[0]:g} and {LIMIT_RANGE[1]:g}; use other "
                 "units"
             )
         out[name] = value

@@ -157,19 +157,19 @@ class Sensitivities:
     nuisance: Floats
 
     @classmethod
-    def of(cls, laid: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
+    def of(cls, fit: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
         """Simulate the response to one sample of each input."""
-        kernels, answers, inputs = [], [], len(laid.inputs)
+        kernels, answers, inputs = [], [], len(fit.inputs)
         for k in range(inputs):
             # The first sample of a run is not compared, so the pulse comes with the second.
             commands = np.zeros((inputs, rows + 2))
             commands[k, 1 : 1 + ramp] = 1.0 / ramp
-            run = laid.run(commands, step, "pulse")
-            found = laid.jacobian(run, offset=False)
-            kernels.append(found.reshape(len(laid.names), len(laid.outputs), rows))
-            answers.append(np.stack([run[o][1:-1] for o in laid.outputs]))
-        nuisance = _offset_responses(laid, step, rows)
-        return cls(laid, step, rows, ramp, np.stack(kernels), np.stack(answers), nuisance)
+            run = fit.run(commands, step, "pulse")
+            found = fit.jacobian(run, offset=False)
+            kernels.append(found.reshape(len(fit.names), len(fit.outputs), rows))
+            answers.append(np.stack([run[o][1:-1] for o in fit.outputs]))
+        nuisance = _offset_responses(fit, step, rows)
+        return cls(fit, step, rows, ramp, np.stack(kernels), np.stack(answers), nuisance)
 
     @cached_property
     def length(self) -> int:
@@ -182,7 +182,10 @@ class Sensitivities:
         return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.responses, self.length)
 
     def derivatives(self, commands: Floats) -> Floats:
-        """Derivatives over the noise, shape (parameters, outputs, rows), for commands of shape (inputs, rows)."""
+        """Return derivatives of the outputs over the noise standard deviation, shape (parameters, outputs, rows).
+
+        ``commands`` has shape (inputs, rows).
+        """
         drive = np.fft.rfft(commands, self.length)
         total = np.einsum("ipof,if->pof", self.spectra[0], drive)
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
@@ -209,14 +212,14 @@ class Sensitivities:
         return np.pad(smooth, ((0, 0), (0, 1)))
 
 
-def _offset_responses(laid: ModelFit, step: float, rows: int) -> Floats:
+def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
     """Responses, over the noise, to unknown constants (and ramps) in the equations of one run."""
-    structure = laid.problem.structure
+    structure = fit.problem.structure
     drives = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
         raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not decided; identify it again")
     if not drives:
-        return np.zeros((0, len(laid.outputs) * rows))
+        return np.zeros((0, len(fit.outputs) * rows))
     taken = {*structure.signals, *structure.coefficient_names, *structure.order_names}
     one = next(n for n in (f"one{k}" for k in range(len(taken) + 1)) if not any(t.startswith(n) for t in taken))
     time = step * np.arange(rows + 2)
@@ -226,19 +229,19 @@ def _offset_responses(laid: ModelFit, step: float, rows: int) -> Floats:
         for e in structure.equations
     )
     problem = FreeProblem.of(replace(structure, equations=equations, offset="none"))
-    values = dict(zip(laid.names, laid.values, strict=True))
-    still = laid.run(np.zeros((len(laid.inputs), rows + 2)), step, "still")
+    values = dict(zip(fit.names, fit.values, strict=True))
+    still = fit.run(np.zeros((len(fit.inputs), rows + 2)), step, "still")
     run = still.with_outputs(shapes)
     found = _derivatives(
         problem,
         tuple(values.get(n, 0.0) for n in problem.names),
         run,
-        [1.0 / laid.noise[o] for o in laid.outputs],
-        laid.refinement,
+        [1.0 / fit.noise[o] for o in fit.outputs],
+        fit.refinement,
     )
     own = [i for i, n in enumerate(problem.names) if n not in values]
     # They are told from the second sample on; at the first, a run from rest shows nothing of them.
-    told = found[own].reshape(len(own), len(laid.outputs), rows)
+    told = found[own].reshape(len(own), len(fit.outputs), rows)
     told = np.pad(told, ((0, 0), (0, 0), (1, 0)))[..., :rows]
     return orthonormal(told.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T
 

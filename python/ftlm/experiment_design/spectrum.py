@@ -76,18 +76,18 @@ class Spectrum:
         return math.expm1(self.bound - self.score)
 
 
-def spectral_lines(laid: ModelFit, bounds: Bounds, step: float, rows: int) -> SpectralLines:
+def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> SpectralLines:
     """Lines of a run that is one period, distributed among inputs so that no two share a line."""
-    inputs = laid.inputs
+    inputs = fit.inputs
     most = max(int(MAX_FREQUENCY_RATIO * rows), len(inputs) + 1)
     numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES * 4)).astype(np.int64))
     if len(numbers) > MAX_SPECTRAL_LINES:
         numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES)).astype(np.int64))
     frequencies = numbers / (rows * step)
-    slopes, gains = _response_sensitivities(laid, 2 * math.pi * frequencies, step)
+    slopes, gains = _response_sensitivities(fit, 2 * math.pi * frequencies, step)
     peaks = np.array(list(bounds.peaks.values()))
     swings = np.array(list(bounds.output_limits.values()))
-    weights = 1.0 / np.array([laid.noise[o] for o in laid.outputs])
+    weights = 1.0 / np.array([fit.noise[o] for o in fit.outputs])
     told = (
         np.einsum("oilp,oilq,o->ilpq", slopes, slopes.conj(), weights**2).real * rows * peaks[:, None, None, None] ** 2
     )
@@ -104,23 +104,23 @@ def spectral_lines(laid: ModelFit, bounds: Bounds, step: float, rows: int) -> Sp
     )
 
 
-def _response_sensitivities(laid: ModelFit, w: Floats, step: float) -> tuple[Complex, Complex]:
+def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Complex, Complex]:
     """Derivatives (outputs, inputs, W, parameters) of frequency responses to zero-order-hold inputs, and these."""
     held = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
-    gains = frequency_response(laid.model, w)
-    coupling = laid.problem.structure.coupling
-    own = replace(laid.model, structure=replace(laid.model.structure, coupling=coupling))
-    orders, coefficients, _ = laid.problem.split(laid.values)
-    chain = laid.problem.number_jacobian(orders, coefficients)
+    gains = frequency_response(fit.model, w)
+    coupling = fit.problem.structure.coupling
+    own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
+    orders, coefficients, _ = fit.problem.split(fit.values)
+    chain = fit.problem.number_jacobian(orders, coefficients)
     values = parameter_vector(own)
     # What drives an equation is measured, or follows with it.
     drives = (
         gains
         if coupling == "simulated"
-        else np.concatenate([gains, np.tile(np.eye(len(laid.inputs))[..., None], w.size)])
+        else np.concatenate([gains, np.tile(np.eye(len(fit.inputs))[..., None], w.size)])
     )
-    signals = laid.inputs if coupling == "simulated" else (*laid.outputs, *laid.inputs)
-    slopes = np.zeros((*gains.shape, len(laid.names)), dtype=np.complex128)
+    signals = fit.inputs if coupling == "simulated" else (*fit.outputs, *fit.inputs)
+    slopes = np.zeros((*gains.shape, len(fit.names)), dtype=np.complex128)
     for k, value in enumerate(values):
         if not np.any(chain[k]):
             continue
@@ -131,14 +131,17 @@ def _response_sensitivities(laid: ModelFit, w: Floats, step: float) -> tuple[Com
             moved[k] = at
             ends.append(_output_responses(with_parameter_vector(own, moved), w, coupling, drives, signals))
         slopes += ((ends[0] - ends[1]) / (2 * small))[..., None] * chain[k]
-    for place, item in enumerate(laid.problem.inputs, start=len(laid.names) - len(laid.problem.inputs)):
-        at = laid.inputs.index(item.signal)
+    for place, item in enumerate(fit.problem.inputs, start=len(fit.names) - len(fit.problem.inputs)):
+        at = fit.inputs.index(item.signal)
         slopes[:, at, :, place] = -1j * w * gains[:, at]
     return slopes * held[:, None], gains * held
 
 
 def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
-    """Output responses for simulated coupling, or for measured coupling with given responses of the other signals."""
+    """Return the frequency responses of the outputs to the inputs, shape (outputs, inputs, frequencies).
+
+    With measured coupling the equations read other signals, whose responses to the inputs are ``drives``.
+    """
     if coupling == "simulated":
         return frequency_response(model, w)
     alone = frequency_response(model, w, coupling="measured")

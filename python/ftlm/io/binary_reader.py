@@ -377,7 +377,7 @@ def _gather(hdf5: Any, group: Any, prefix: str, found: Arrays, depth: int) -> No
         matlab = item.attrs.get("MATLAB_class")
         kind = matlab.decode(errors="replace") if isinstance(matlab, bytes) else "" if matlab is None else str(matlab)
         if len(found.header["skipped"]) > MAX_ARRAYS:
-            raise UnreadableError(f"it holds more than {MAX_ARRAYS} things that are no arrays", "save a part of it")
+            raise UnreadableError(f"it holds more than {MAX_ARRAYS} things that are not arrays", "save a part of it")
         if isinstance(item, hdf5.Group):
             if kind or key.startswith("#") or depth >= MAX_GROUP_DEPTH:
                 found.header["skipped"][name] = kind or "of MATLAB's own"

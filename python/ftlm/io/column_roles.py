@@ -102,7 +102,7 @@ _REFERENCE_WORDS = frozenset(("ref", "reference", "setpoint", "target", "desired
 #: Words by which a commanded input and its measurement differ.
 _COMMAND_WORDS = frozenset(("cmd", "command", "commanded"))
 _MEASUREMENT_WORDS = frozenset(("meas", "measured", "actual", "ist"))
-#: Words of temperature columns, whose degrees are no angles.
+#: Words of temperature columns, whose degrees are not angles.
 _TEMPERATURE_WORDS = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
 
 

@@ -449,7 +449,7 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
 def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
     if not isinstance(error, UnicodeDecodeError):
         return DataError(
-            f"{path.name}: the text is no {encoding} ({error}); say {layout_parameter(encoding=Placeholder('NAME'))}"
+            f"{path.name}: the text is not {encoding} ({error}); say {layout_parameter(encoding=Placeholder('NAME'))}"
         )
     at, byte = line + error.object[: error.start].count(b"\n"), error.object[error.start]
     return DataError(

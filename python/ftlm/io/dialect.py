@@ -488,7 +488,7 @@ def _header(
     spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)
 
     def fit_names(line: _Line) -> list[str]:
-        """Return the names, adjusted by one at the end to the width of the rows."""
+        """Return the names, without a comment column that rows lack, or with an empty name for an empty last cell."""
         names = [cell.strip() for cell in line.cells]
         if len(names) == width + 1 and names[-1].casefold() in ("", _COMMENT_COLUMN_NAME):
             return names[:-1]
@@ -522,7 +522,7 @@ def _header(
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
     if commas and not own and count == 1:
         raise DataError(
-            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is no line of names; say "
+            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is not a line of names; say "
             f"{layout_parameter(decimal='comma')}"
         )
     check_distinct(names, line.at, source)
@@ -561,7 +561,8 @@ def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool,
     if rows:
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
-            f"a table of {width} cells a row; give every line the same number of cells, or say how many lines to leave "
+            f"a table of {width} cells per row; give every line the same number of cells, or say how many lines to "
+            "leave "
             f"out with {layout_parameter(skip=Placeholder('LINES'))}"
         )
 

@@ -83,7 +83,7 @@ def binary_format_of(path: Path) -> BinaryFormat | None:
     if suffixes and suffixes[-1] == ".gz":
         inner = next((kind for kind in BINARY_FORMATS if suffixes[0] in kind.suffixes), None)
         if inner is not None:
-            raise DataError(f"{str(path)!r}: {inner.label} files are read unpacked; unpack it with gunzip")
+            raise DataError(f"{str(path)!r}: {inner.label} files cannot be read compressed; unpack it with gunzip")
         return None
     found = next((kind for kind in BINARY_FORMATS if suffixes and suffixes[-1] in kind.suffixes), None)
     return MATLAB_73_FORMAT if found is MATLAB_FORMAT and _is_hdf5(path) else found

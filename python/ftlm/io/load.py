@@ -179,7 +179,7 @@ def run_from_tables(
     header = tables[0].header
     chosen = options.missing_policy(header)
     if header is not None and len(tables) > 1:
-        raise DataError(f"{str(tables[0].path)!r} is a whole run of its own; load it alone")
+        raise DataError(f"{str(tables[0].path)!r} is a complete run; load it alone")
     if header is not None:
         _apply_header(wanted, header)
     pool = Pool(tables)
@@ -347,7 +347,7 @@ def _split_group(path: Path) -> tuple[Path, str]:
 
 
 def run_paths(path: str) -> list[str]:
-    """Return the paths of the runs in a file: of each group with a time of its own, if an HDF5 file has several."""
+    """Return the paths of the runs in a file: those of its groups if several groups of an HDF5 file have a time."""
     if Path(path).suffix.lower() not in HDF5_FORMAT.suffixes or not Path(path).is_file():
         return [path]
     (table,) = read_tables(path, Layout())

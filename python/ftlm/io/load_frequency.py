@@ -136,7 +136,7 @@ _MAX_PART_NAME_CHARACTERS = 60
 _MAGNITUDE_TOLERANCE = 0.02
 
 
-#: Parts in the columns of a file of three columns without names, as potentiostats export them.
+#: Meaning of the columns in a file of three columns without a header line, as potentiostats export them.
 HEADERLESS_PARTS = ("frequency", "real", "imag")
 
 
@@ -272,7 +272,7 @@ def _select_parts(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _Re
     for part, spec in columns.items():
         if part not in _PART_SYNONYMS:
             raise DataError(
-                f"{part!r} is no part of a frequency response{nearest(part, _PART_SYNONYMS)}; the parts are "
+                f"{part!r} is not part of a frequency response{nearest(part, _PART_SYNONYMS)}; the parts are "
                 f"{join_names(_PART_SYNONYMS)}"
             )
         column = pool.find(spec, part)
@@ -358,7 +358,7 @@ def _frequencies(item: _ResponseColumn, asked: str | None, notes: list[str]) -> 
     if not unit:
         if item.unit:
             raise DataError(
-                f"column {item.column.name!r} states the unit {item.unit!r}, which is no unit of frequency; say "
+                f"column {item.column.name!r} states the unit {item.unit!r}, which is not a unit of frequency; say "
                 f"{parameter('frequency_unit')}, one of {', '.join(FREQUENCY_UNITS)}"
             )
         unit = "rad/s" if item.word in _ANGULAR_FREQUENCY_NAMES else "Hz"

@@ -152,7 +152,7 @@ class OpenedFile:
             Inputs or outputs are still unknown; the file exists and ``force`` is not set, or cannot be written.
         """
         if self.problem:
-            raise DataError(f"{self.path} is no run yet, so there are no columns to write: {self.problem}")
+            raise DataError(f"{self.path} is not a run yet, so there are no columns to write: {self.problem}")
         said = {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items() if k in COLUMN_KEYS}
         lines = [f"{key} = {_toml(value)}" for key, value in said.items() if not isinstance(value, dict)]
         for table, values in ((k, v) for k, v in said.items() if isinstance(v, dict)):

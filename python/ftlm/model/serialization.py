@@ -22,7 +22,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import error_text
 
-#: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are no outputs,
+#: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are not outputs,
 #: friction, input nonlinearities, Stribeck friction, free parameters of the fit, findings as records, levels,
 #: non-linear terms.
 BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
@@ -298,7 +298,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     Raises
     ------
     DataError
-        A file that does not exist, is no model (with the place), has a later schema, or exceeds 1 MiB.
+        A file that does not exist, is not a model (with the place), has a later schema, or exceeds 1 MiB.
     """
     read = MODEL_FORMAT.read(path)
     of = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)

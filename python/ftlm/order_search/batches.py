@@ -253,43 +253,46 @@ class Throughput:
 
 
 def run_on_executor(
-    send: Callable[[CandidateBlock], tuple[Any, ...]], left: list[CandidateBlock], executor: Executor, pace: Throughput
+    send: Callable[[CandidateBlock], tuple[Any, ...]],
+    left: list[CandidateBlock],
+    executor: Executor,
+    throughput: Throughput,
 ) -> Iterator[tuple[CandidateBlock, Any]]:
     """Submit blocks in tasks of about :data:`TASK_DURATION_S` seconds each, and yield their results."""
     count = worker_count(executor)
     ahead = TASKS_PER_WORKER * count + 2
-    # Of a short wave every worker gets its share.
-    share = max(pace.min_count, -(-sum(s.last - s.first for s in left) // count))
+    # In a small batch every worker gets a share.
+    share = max(throughput.min_count, -(-sum(s.last - s.first for s in left) // count))
     pending: dict[Future[Any], CandidateBlock] = {}
     waiting = left[::-1]
     try:
         while waiting or pending:
             while waiting and len(pending) < ahead:
-                stretch = waiting.pop()
-                size = min(pace.count_for(TASK_DURATION_S), share)
-                if stretch.start is None and stretch.attempts == 0 and stretch.last - stretch.first > size:
-                    waiting.append(CandidateBlock(stretch.first + size, stretch.last))
-                    stretch = CandidateBlock(stretch.first, stretch.first + size)
+                block = waiting.pop()
+                size = min(throughput.count_for(TASK_DURATION_S), share)
+                if block.start is None and block.attempts == 0 and block.last - block.first > size:
+                    waiting.append(CandidateBlock(block.first + size, block.last))
+                    block = CandidateBlock(block.first, block.first + size)
                 try:
-                    pending[executor.submit(run_in_worker, *send(stretch))] = stretch
+                    pending[executor.submit(run_in_worker, *send(block))] = block
                 except (BrokenExecutor, RuntimeError) as error:
                     raise _executor_error(error) from error
             done, _ = wait(pending, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
             for future in done:
-                stretch = pending.pop(future)
-                timed = _result(future, stretch)
+                block = pending.pop(future)
+                timed = _result(future, block)
                 if timed is None:
-                    waiting.append(stretch)
+                    waiting.append(block)
                     continue
                 seconds, piece = timed
-                pace.update(seconds, stretch.last - stretch.first)
-                yield stretch, piece
+                throughput.update(seconds, block.last - block.first)
+                yield block, piece
     finally:
         for future in pending:
             future.cancel()
 
 
-def _result(future: Future[Any], stretch: CandidateBlock) -> tuple[float, Any] | None:
+def _result(future: Future[Any], block: CandidateBlock) -> tuple[float, Any] | None:
     """Return seconds and result of a task, or None if it must be sent again."""
     try:
         timed = cast("tuple[float, Any] | None", future.result())
@@ -298,13 +301,13 @@ def _result(future: Future[Any], stretch: CandidateBlock) -> tuple[float, Any] |
     except BrokenExecutor as error:
         raise _executor_error(error) from error
     except (Exception, CancelledError) as error:
-        stretch.attempts += 1
-        if stretch.attempts >= MAX_ATTEMPTS:
+        block.attempts += 1
+        if block.attempts >= MAX_ATTEMPTS:
             raise _executor_error(error) from error
         return None
-    if timed is None and not stretch.with_problem:
+    if timed is None and not block.with_problem:
         # The worker has not got what the search is computed from: it goes along the next time.
-        stretch.with_problem = True
+        block.with_problem = True
         return None
     if not isinstance(timed, tuple) or len(timed) != 2:
         raise _executor_error(TypeError(f"a task came back with {type(timed).__name__}"))
@@ -336,8 +339,8 @@ class SearchState(ABC, Generic[Done, Table]):
     #: Whether the core reports progress of local evaluation itself.
     core_reports_progress = False
 
-    def __init__(self, work: SearchProblem[Table], pace: Throughput) -> None:
-        self.work, self.pace = work, pace
+    def __init__(self, work: SearchProblem[Table], throughput: Throughput) -> None:
+        self.work, self.throughput = work, throughput
         self.threads = work.threads
         self.done = self.total = 0
 
@@ -346,9 +349,9 @@ class SearchState(ABC, Generic[Done, Table]):
         """Key of the search in the workers' caches."""
         return self.work.key
 
-    def payload(self, stretch: CandidateBlock) -> SearchProblem[Table] | None:
+    def payload(self, block: CandidateBlock) -> SearchProblem[Table] | None:
         """Search problem to send with a block, or None unless a worker reported that it lacks it."""
-        return self.work if stretch.with_problem else None
+        return self.work if block.with_problem else None
 
     @abstractmethod
     def batches(self) -> Iterator[tuple[int, int]]:
@@ -361,11 +364,11 @@ class SearchState(ABC, Generic[Done, Table]):
         """Evaluate blocks in this process."""
 
     @abstractmethod
-    def task(self, stretch: CandidateBlock) -> tuple[Any, ...]:
+    def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return a function and its arguments that evaluate a block in a worker."""
 
     @abstractmethod
-    def frame(self, number: int, stretch: CandidateBlock, piece: Any) -> Done:
+    def frame(self, number: int, block: CandidateBlock, piece: Any) -> Done:
         """Convert the result of a block to a frame of search ``number``."""
 
     @abstractmethod
@@ -402,7 +405,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
             if len(ranked) == keep:
                 self._parts = [_drop_beaten_rows(ranked[-1], part) for part in self._parts]
             self._seed = [(index, score) for score, index in ranked]
-            self.pace = Throughput()
+            self.throughput = Throughput()
             yield first, end
             first = end
 
@@ -410,24 +413,24 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Part]]:
         """Evaluate each block in one call, from its checkpoint."""
-        for stretch in left:
-            first, last = stretch.first, stretch.last
+        for block in left:
+            first, last = block.first, block.last
             told = None if progress is None else partial(self._report_progress, progress, self.done)
             saved = None if save is None else partial(save, first, last)
-            part = self._search.rounds(first, last, self._seed, stretch.start, self.threads, told, saved)
-            yield stretch, cast("Part", part)
+            part = self._search.rounds(first, last, self._seed, block.start, self.threads, told, saved)
+            yield block, cast("Part", part)
 
     def _report_progress(self, progress: ProgressCallback, before: int, done: int, _all: int, pruned: int) -> None:
         progress(min(before + done, self.total), self.total, pruned)
 
-    def task(self, stretch: CandidateBlock) -> tuple[Any, ...]:
+    def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function and arguments that evaluate a block of rounds."""
-        ranged = stretch.first, stretch.last, self._seed, stretch.start, self.threads
-        return evaluate_rounds, self.key, self.payload(stretch), *ranged
+        ranged = block.first, block.last, self._seed, block.start, self.threads
+        return evaluate_rounds, self.key, self.payload(block), *ranged
 
-    def frame(self, number: int, stretch: CandidateBlock, piece: Part) -> Rounds:
+    def frame(self, number: int, block: CandidateBlock, piece: Part) -> Rounds:
         """Return the frame of a block of rounds."""
-        return Rounds(number, stretch.first, stretch.last, piece)
+        return Rounds(number, block.first, block.last, piece)
 
     def add_block(self, done: Rounds) -> int:
         """Add a block of rounds."""
@@ -473,33 +476,33 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Outcomes]]:
         """Evaluate candidates in tasks of about :data:`CHECKPOINT_INTERVAL_S` seconds."""
-        for stretch in left:
-            at = stretch.first
-            while at < stretch.last:
-                piece = CandidateBlock(at, min(stretch.last, at + self.pace.count_for(CHECKPOINT_INTERVAL_S)))
+        for block in left:
+            at = block.first
+            while at < block.last:
+                piece = CandidateBlock(at, min(block.last, at + self.throughput.count_for(CHECKPOINT_INTERVAL_S)))
                 began = time.monotonic()
                 outcomes = self.search.follow(self._cut(piece), self.threads, None)
-                self.pace.update(time.monotonic() - began, piece.last - piece.first)
+                self.throughput.update(time.monotonic() - began, piece.last - piece.first)
                 yield piece, outcomes
                 at = piece.last
 
-    def task(self, stretch: CandidateBlock) -> tuple[Any, ...]:
+    def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function and arguments that evaluate a block of candidates."""
-        return evaluate_candidates, self.key, self.payload(stretch), self._cut(stretch), self.threads
+        return evaluate_candidates, self.key, self.payload(block), self._cut(block), self.threads
 
-    def _cut(self, stretch: CandidateBlock) -> list[Span]:
+    def _cut(self, block: CandidateBlock) -> list[Span]:
         """Return the candidates of a block as spans, counted through all spans of the batch."""
         cut, at = [], self._first
         for equation, start, end, limit in self._spans:
-            low, high = max(stretch.first - at, 0), min(stretch.last - at, end - start)
+            low, high = max(block.first - at, 0), min(block.last - at, end - start)
             if low < high:
                 cut.append((equation, start + low, start + high, limit))
             at += end - start
         return cut
 
-    def frame(self, number: int, stretch: CandidateBlock, piece: Outcomes) -> Verdicts:
+    def frame(self, number: int, block: CandidateBlock, piece: Outcomes) -> Verdicts:
         """Return the frame of a block of candidates."""
-        return Verdicts(number, stretch.first, stretch.last, *piece)
+        return Verdicts(number, block.first, block.last, *piece)
 
     def add_block(self, done: Verdicts) -> int:
         """Add a block of verdicts."""
@@ -512,10 +515,10 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         return self.search.outcome()
 
 
-def _join_verdicts(wave: list[Verdicts], first: int, end: int) -> Outcomes:
+def _join_verdicts(batch: list[Verdicts], first: int, end: int) -> Outcomes:
     """Return the verdicts of a batch in order; raise ModelError if its blocks do not cover it."""
     at, values, kinds = first, [], []
-    for verdicts in sorted(wave, key=lambda v: v.first):
+    for verdicts in sorted(batch, key=lambda v: v.first):
         if verdicts.first != at:
             break
         at = verdicts.last
@@ -562,7 +565,7 @@ def search_coupled(
 
 
 def _run_batches(
-    course: SearchState[Done, Table],
+    state: SearchState[Done, Table],
     store: Store | None,
     number: int,
     executor: Executor | None,
@@ -572,28 +575,28 @@ def _run_batches(
     section = None if store is None else store.contents.sections[number]
     save = None if store is None else partial(store.save, number)
     pruned = 0
-    for first, end in course.batches():
+    for first, end in state.batches():
         for held in _stored_frames(section, first, end):
-            course.add_block(held)
+            state.add_block(held)
         left = list(_pending_blocks(section, first, end))
-        if left and store is not None and not course.can_resume:
+        if left and store is not None and not state.can_resume:
             raise store.outdated_error()
         if executor is None:
-            pieces = course.evaluate_locally(left, progress, save)
+            pieces = state.evaluate_locally(left, progress, save)
         else:
-            pieces = run_on_executor(course.task, left, executor, course.pace)
-        for stretch, piece in pieces:
-            frame = course.frame(number, stretch, piece)
+            pieces = run_on_executor(state.task, left, executor, state.throughput)
+        for block, piece in pieces:
+            frame = state.frame(number, block, piece)
             if store is not None:
                 store.append_block(frame)
-            pruned += course.add_block(frame)
-            if progress is not None and not (course.core_reports_progress and executor is None):
-                progress(course.done, course.total, pruned)
-    if section is not None and section.law and section.processed_count != course.total:
-        raise ModelError(f"it holds {section.processed_count} candidates of {course.total}")
+            pruned += state.add_block(frame)
+            if progress is not None and not (state.core_reports_progress and executor is None):
+                progress(state.done, state.total, pruned)
+    if section is not None and section.law and section.processed_count != state.total:
+        raise ModelError(f"it holds {section.processed_count} candidates of {state.total}")
     if progress is not None:
-        progress(course.total, course.total, 0)
-    return course.table()
+        progress(state.total, state.total, 0)
+    return state.table()
 
 
 def equation_state(work: EquationProblem, section: Section) -> tuple[int, float | None]:
@@ -608,13 +611,13 @@ def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | 
     """Number of candidates of a coupled search, as far as a checkpoint file determines it, and the best score."""
     if section.table is not None:
         return section.processed_count, _table(work, section.table)["rows"][0][1]
-    course = CoupledSearchState(work)
-    for first, end in course.batches():
+    state = CoupledSearchState(work)
+    for first, end in state.batches():
         for held in _stored_frames(section, first, end):
-            course.add_block(held)
+            state.add_block(held)
         if any(_pending_blocks(section, first, end)):
             break
-    return course.search.state()
+    return state.search.state()
 
 
 def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
@@ -647,13 +650,13 @@ def _pending_blocks(section: Section | None, first: int, end: int) -> Iterator[C
         known = [CandidateBlock(at, frame.last) for at, frame in section.frames.items()]
         known += [CandidateBlock(at, half.last, half.checkpoint) for at, half in section.open.items()]
     at = first
-    for stretch in sorted(known, key=lambda s: s.first):
-        if not first <= stretch.first < end:
+    for block in sorted(known, key=lambda s: s.first):
+        if not first <= block.first < end:
             continue
-        if at < stretch.first:
-            yield CandidateBlock(at, stretch.first)
-        if stretch.start is not None:
-            yield stretch
-        at = stretch.last
+        if at < block.first:
+            yield CandidateBlock(at, block.first)
+        if block.start is not None:
+            yield block
+        at = block.last
     if at < end:
         yield CandidateBlock(at, end)

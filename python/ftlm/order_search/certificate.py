@@ -101,7 +101,8 @@ def certify_orders(
     most = whole_number(max_cells)
     if most is None or not 1 <= most < 1 << 62:
         raise ModelError(
-            f"{setting('max_cells')} {max_cells!r} is no whole number from 1; the default is {DEFAULT_MAX_CELLS}"
+            f"{setting('max_cells')} {max_cells!r} is not a whole number of at least 1; the default is "
+            f"{DEFAULT_MAX_CELLS}"
         )
     gap = real_number(
         "min_separation",

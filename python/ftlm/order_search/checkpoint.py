@@ -70,7 +70,7 @@ def check_record(record: Record) -> None:
     sizes, sensor = (len(record.signals), len(record.inputs)), record.sensor
     shaped = record.means.ndim == 2 and (sensor is None or sensor.ndim == 1)
     if not shaped or sizes != record.means.shape[:1] * 2 or not record.means.size:
-        raise ModelError("the sizes of a record do not fit one another")
+        raise ModelError("the sizes of a record are inconsistent")
     if not 0 <= record.states <= (0 if sensor is None else MAX_FILTER_STATES):
         raise ModelError(f"a record with {record.states} states of its sensor filter")
     check_initial(record.initial)
@@ -96,7 +96,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.structure.equations != other.structure.equations:
             return "another equation"
         if self.values != other.values:
-            return "another lattice"
+            return "another order grid"
         changed = [n for n in self.settings if self.settings[n] != other.settings.get(n)]
         if changed:
             return "other settings: " + ", ".join(f"{n} = {self.settings[n]}" for n in changed)
@@ -205,21 +205,21 @@ class Section:
     def add_frame(self, frame: Frame) -> None:
         """Add a frame; raise ModelError for a duplicate, an empty block, or another kind of search."""
         if self.table is not None or (isinstance(frame, CoupledTable) and not self.law):
-            raise ModelError("a table stands where none belongs")
+            raise ModelError("it has an unexpected final table")
         if isinstance(frame, CoupledTable):
             self.table = frame
             return
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
+            raise ModelError(f"rounds {frame.first} to {frame.last} are not a valid range")
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.frames[self._firsts[place - 1]].last > frame.first:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
+            raise ModelError(f"rounds {frame.first} to {frame.last} are stored twice")
         if isinstance(frame, PartialRounds):
             self._add_partial_rounds(frame)
             return
         count = frame.last - frame.first
         if isinstance(frame, Verdicts) and (len(frame.values), len(frame.kinds)) != (8 * count, count):
-            raise ModelError(f"candidates {frame.first} to {frame.last} have other verdicts")
+            raise ModelError(f"candidates {frame.first} to {frame.last} have a wrong number of verdicts")
         self.open.pop(frame.first, None)
         self.frames[frame.first] = frame
         self._firsts.insert(place, frame.first)
@@ -227,10 +227,10 @@ class Section:
     def _add_partial_rounds(self, frame: PartialRounds) -> None:
         half = self.open.get(frame.first)
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
-            raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
+            raise ModelError(f"rounds {frame.first} to {frame.last} do not continue their block")
         _, followed, end, size, limit = frame.place
         if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
-            raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
+            raise ModelError(f"rounds {frame.first} to {frame.last} have an invalid position")
         if half is None or frame.anew:
             half = self.open[frame.first] = PartialBlock(frame.last, frame.place, frame.order, [], frame.counts, ())
         half.place, half.order, half.counts = frame.place, frame.order, frame.counts
@@ -289,7 +289,7 @@ def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corrupt
                 contents.sections[frame.search].add_frame(frame)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
             raise DataError(
-                f"{path} holds something else in record {number}: {error}; start the search again in another file"
+                f"{path} has an unexpected entry in record {number}: {error}; start the search again in another file"
             ) from error
     return cast("Contents", contents)
 
@@ -360,7 +360,8 @@ class Store:
             difference = one.difference(other)
             if difference is not None:
                 raise DataError(
-                    f"store {self.path} holds another search of {one.name} (asked is {difference}); choose another file"
+                    f"store {self.path} holds another search of {one.name} (this one has {difference}); choose "
+                    "another file"
                 )
 
     def outdated_error(self) -> DataError:
@@ -383,7 +384,7 @@ class Store:
             self.contents.sections[frame.search].add_frame(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
-        """Note the progress of a block of rounds; it is written with others, or when the flush interval ends."""
+        """Queue the progress of a block of rounds; write the queue if the flush interval has passed."""
         if checkpoint is not None:
             (*place, order), anew, (rows, counts, failures) = checkpoint
             before = self._waiting.get((search, first))

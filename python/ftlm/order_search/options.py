@@ -62,7 +62,8 @@ class SearchSettings:
             )
         if length is None or not 1 <= length < 1 << 62:
             raise ModelError(
-                f"{setting('innovation_length')} {self.innovation_length!r} is no whole number from 1; the paper's is 7"
+                f"{setting('innovation_length')} {self.innovation_length!r} is not a whole number of at least 1; the "
+                "paper's is 7"
             )
         given = self.prior_covariance
         covariance = None if given is None else real_number("prior_covariance", given)

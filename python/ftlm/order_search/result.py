@@ -95,7 +95,7 @@ class OrderCertificate:
         return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "lower_bound": self.lower_bound,
             "best": self.best if self.orders else None,
@@ -262,7 +262,7 @@ class SearchResult:
         return to_frame(rows, ["rank"])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "candidates": self.candidates,
             "exclusion_counts": self.exclusion_counts,
@@ -324,7 +324,7 @@ class SearchResult:
         lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.excluded_summary}")
         if self.verdict is not None:
             lines.append(f"rank 1: {self.verdict}")
-        of_table = [f for f in self.findings if f.kind.topic == "search"]
+        of_table = [f for f in self.findings if f.kind.topic == "order_table"]
         of_model = [f for f in self.findings if f.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) and f not in of_table]
         lines += [f"! {g.first_finding}{g.count}" for g in group_findings(of_model)] + [f"! {f}" for f in of_table]
         return "\n".join([*lines, f"next: {self.next_step}"])
@@ -392,7 +392,7 @@ class StoreStatus:
         return self.done_count == self.candidates
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {**asdict(self), "complete": self.complete}
 
     def __str__(self) -> str:

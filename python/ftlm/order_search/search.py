@@ -167,7 +167,7 @@ def check_executor(executor: object) -> None:
     """Raise unless an argument is None or an executor of `concurrent.futures`."""
     if executor is not None and not isinstance(executor, Executor):
         raise ModelError(
-            f"executor = {executor!r} is no executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
+            f"executor = {executor!r} is not an executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
             "Client(…).get_executor()"
         )
 

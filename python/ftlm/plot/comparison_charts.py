@@ -157,10 +157,10 @@ def compared_bars(
     Parameters
     ----------
     compared
-        (name of the model, its comparisons as (what the data were to it, comparison)), such as
-        ``("integer", [("estimation", a), ("validation", b)])``; the same kinds of data for every model.
+        Pairs of the name of a model and its comparisons, each with the role of its data, such as
+        ``("integer", [("estimation", a), ("validation", b)])``. All models have the same roles.
     title
-        What the charts are called.
+        Title of the charts.
 
     Raises
     ------

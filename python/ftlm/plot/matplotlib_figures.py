@@ -142,7 +142,7 @@ def fit(
     Raises
     ------
     ModelError
-        A model without runs, inputs without runs, something that is no result, axes that are none or too many or
+        A model without runs, inputs without runs, something that is not a result, axes that are none or too many or
         few, or no matplotlib.
     DataError
         Runs that do not fit the model.
@@ -241,7 +241,7 @@ def run(run: Run, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is no run, axes that are none or too many or few, or no matplotlib.
+        Something that is not a run, axes that are none or too many or few, or no matplotlib.
     """
     if not isinstance(run, Run):
         raise ModelError(f"run is {type(run).__name__}; give a run, such as ftlm.load returns")
@@ -272,7 +272,7 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        An identification whose runs were too short for tests, something that is no result, or no matplotlib.
+        An identification whose runs were too short for tests, something that is not a result, or no matplotlib.
     """
     found = tests.residuals if isinstance(tests, Identification) else tests
     if found is None:
@@ -373,7 +373,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     Raises
     ------
     ModelError
-        Something that is no model, or no matplotlib.
+        Something that is not a model, or no matplotlib.
     DataError
         Frequencies that are not finite numbers from 0.
     """
@@ -416,7 +416,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is no model, one with friction or without poles, axes that are none, or no matplotlib.
+        Something that is not a model, one with friction or without poles, axes that are none, or no matplotlib.
     """
     found = _model_of(model)
     q, points = pole_points(found)
@@ -460,7 +460,7 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
     Raises
     ------
     ModelError
-        Something that is no model, one whose input saturates or has a dead zone, axes that are none, no matplotlib.
+        Something that is not a model, one whose input saturates or has a dead zone, axes that are none, no matplotlib.
     DataError
         Instants that are not regular from 0.
     """
@@ -502,7 +502,7 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is no identification, one without a joint covariance, axes that are none, or no matplotlib.
+        Something that is not an identification, one without a joint covariance, axes that are none, or no matplotlib.
     """
     if not isinstance(result, Identification):
         raise ModelError(f"result is {type(result).__name__}; give an identification")
@@ -544,7 +544,7 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
     Raises
     ------
     ModelError
-        Something that is no result, axes that are none or too many or few, or no matplotlib.
+        Something that is not a result, axes that are none or too many or few, or no matplotlib.
     """
     comparison = result.comparison if isinstance(result, Identification) else result
     if not isinstance(comparison, Comparison):
@@ -583,7 +583,7 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        No model, something that is no comparison, models with other outputs, axes that are none, or no matplotlib.
+        No model, something that is not a comparison, models with other outputs, axes that are none, or no matplotlib.
     """
     if not isinstance(compared, Mapping) or not compared:
         raise ModelError("bars need at least one model; give comparisons by name, such as {'integer': a, 'free': b}")
@@ -774,7 +774,7 @@ def _model_and_data(
     if not isinstance(result, (FrequencyIdentification, Model)):
         raise ModelError(f"result is {type(result).__name__}; give what identify_frequency returns, or a model")
     if isinstance(result, FrequencyIdentification):
-        model, records = result.source, list(result.data)
+        model, records = result.system, list(result.data)
     else:
         model, records = result, []
     if isinstance(data, FrequencyValidation):

@@ -187,7 +187,7 @@ class Bode:
     curves: tuple[BodeCurve, ...]
 
     def figures(self) -> list[Figure]:
-        """Charts as in a report."""
+        """Return the charts, as in a report."""
         return bode_figures(self.frequency, self.curves)
 
     def __str__(self) -> str:
@@ -261,7 +261,7 @@ class TimeResponse(Response):
     units: Mapping[str, str] = field(default_factory=dict)
 
     def figures(self) -> list[Figure]:
-        """Charts as in a report."""
+        """Return the charts, as in a report."""
         return response_charts(self, units=self.units)
 
     def __str__(self) -> str:

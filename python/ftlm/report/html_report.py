@@ -272,7 +272,7 @@ def first_sections(
     runs: Sequence[Run] = (),
     bands: Sequence[Mapping[str, Band]] = (),
 ) -> list[Section]:
-    """Return the first sections of a page: the fit on unseen runs, equations, warnings; then collapsed details.
+    """Return the first sections of a page: the fit on validation runs, equations, warnings; then collapsed details.
 
     Without validation runs the fit is that on the estimation runs. `bands` are those of the validation runs.
     """
@@ -294,11 +294,11 @@ def first_sections(
         *equations_html(model, None if own is None else own.offsets),
         stability_note(model),
     ]
-    unseen = [(label, c) for label, c in compared if label == "validation"]
+    validated_on = [(label, c) for label, c in compared if label == "validation"]
     fitted = [(label, c) for label, c in compared if label != "validation"]
     left_runs = list(runs)
     known = _with_inputs(model, fitted, left_runs, points)
-    new = _with_inputs(model, unseen, left_runs, points, bands)
+    new = _with_inputs(model, validated_on, left_runs, points, bands)
     first = new or known
     sections = []
     if first:
@@ -394,7 +394,7 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     words = "Exact, orders as they are; the equations together, from what is not modelled."
     if model.estimate is None or model.estimate.covariance is None:
         told = model.estimate is None or None not in model.estimate.standard_errors.values()
-        lacking = "This estimator gives no covariance" if told else "The runs leave directions unseen"
+        lacking = "This estimator gives no covariance" if told else "The runs do not identify all parameters"
         words += f" {lacking}, so there are no bands."
     return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
 
@@ -510,7 +510,7 @@ def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic sta
     """Return the initial guesses and their costs on decimated samples, best first."""
     kept = joint.starts[:rows]
     cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
-    note = f"{joint.choice}. The best ones went on on all samples." if joint.starts else ""
+    note = f"{joint.origin_text}. The best ones went on on all samples." if joint.starts else ""
     return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
 
 

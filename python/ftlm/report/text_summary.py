@@ -61,7 +61,7 @@ def _readable(item: Equation) -> Equation:
 def _offset(output: str, comparison: Comparison | None) -> str | None:
     """Return the offset of the only run as terms of an equation; None without one, or with several runs.
 
-    A level is added to the output, and is no term of its equation.
+    A level is added to the output, and is not a term of its equation.
     """
     if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
         return None

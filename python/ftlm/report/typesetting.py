@@ -96,7 +96,7 @@ def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, flo
             e,
             structure.delay,
             structure.limits,
-            # A level is added to the output, and is no term of its equation.
+            # A level is added to the output, and is not a term of its equation.
             "" if "level" in own.get(e.output, {}) else own.get(e.output) or structure.offset_in_words,
         )
         for e in model.equations
@@ -286,7 +286,7 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
         note = "No standard errors are given here: this table does not say how many of the digits mean something."
     left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
     if reference:
-        note += " Stated values belong to the integer orders of the maker's model."
+        note += " Stated values belong to the integer orders of the manufacturer's model."
     kept = [i for i in range(len(columns)) if i not in left_out]
     groups = (("", 3), ("95 % interval", 2), ("", len(kept) - 5)) if known else ()
     shown_rows = [[cells[i] for i in kept] for cells in rows]

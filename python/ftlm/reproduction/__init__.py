@@ -1,7 +1,13 @@
 """Reproduction of the paper's section 5, and the demonstration that is a part of it."""
 
 from ftlm.reproduction.checks import Check, table_3_coefficients
-from ftlm.reproduction.cross_validation import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs, unseen_page
+from ftlm.reproduction.cross_validation import (
+    Deflection,
+    OrderCrossValidation,
+    Verdict,
+    cross_validate_orders,
+    cross_validation_page,
+)
 from ftlm.reproduction.demo import Demo, run_demo
 from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads, printed_saturation
 from ftlm.reproduction.reproduction import Reproduction, reproduce
@@ -15,17 +21,18 @@ __all__ = [
     "Check",
     "Deflection",
     "Demo",
+    "OrderCrossValidation",
     "PaperRow",
     "Reproduction",
     "Rival",
     "Stage",
-    "UnseenOrders",
     "Verdict",
     "as_printed",
+    "cross_validate_orders",
+    "cross_validation_page",
     "demo_plant",
     "demo_run",
     "implied_spreads",
-    "orders_on_unseen_runs",
     "paper_row",
     "paper_table",
     "paper_table_text",
@@ -33,5 +40,4 @@ __all__ = [
     "reproduce",
     "run_demo",
     "table_3_coefficients",
-    "unseen_page",
 ]

@@ -539,7 +539,7 @@ def _paper_checks(found: Reproduction) -> Iterable[Check]:
         "Table 3 gives the integer-order models of Tables 4 and 5.",
         combine_cases([case(not off)]),
         f"{len(off)} of {len(rows)} coefficients are not those printed; {worst} is {ratios[worst]:.3g} times the "
-        "printed value. The maker's effective parameters, torque with gear and efficiency, give all of them to "
+        "printed value. The manufacturer's effective parameters, torque with gear and efficiency, give all of them to "
         f"{100 * max(abs(e / p - 1) for _, e, p in rows.values()):.1g} %",
         f"{worst} = {rows[worst][2]:g}",
         f"every coefficient within {100 * MIN_RELATIVE_DIFFERENCE:g} %",

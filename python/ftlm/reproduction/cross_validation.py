@@ -44,7 +44,7 @@ FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
 WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 #: Most samples of a run in a fit; the arm's modes are a decade below the reduced rate of a 20 s run.
 MOST_ROWS = 1250
-#: Label of the structures of ``Deflection.before``.
+#: Label of the structures of ``Deflection.without_rate``.
 WITHOUT_RATE_LABEL = "without the rate of the other deflection"
 
 
@@ -147,7 +147,7 @@ class Deflection:
         Fits by kind, then by estimation run.
     failed
         Reasons for missing fits, by kind and run.
-    before
+    without_rate
         Cross-validation without the rate of the other deflection; None if the other stage was not measured.
     """
 
@@ -155,7 +155,7 @@ class Deflection:
     structure: Structure
     fits: dict[str, dict[str, RunFit]]
     failed: dict[tuple[str, str], str] = field(default_factory=dict)
-    before: Deflection | None = None
+    without_rate: Deflection | None = None
 
     def gains(self, kind: str) -> dict[tuple[str, str], float]:
         """Gain in fit over integer orders by (estimation run, validation run) [percentage points]."""
@@ -207,7 +207,7 @@ class Deflection:
             f"{symbol(name)} " + ", ".join(f"{_range(low, high)} on {run}" for run, (low, high) in each.items())
             for name, each in told.items()
         )
-        words = f"Fit of unseen runs, percent: {pairs}. 95 % intervals: {orders}."
+        words = f"Fit of validation runs, percent: {pairs}. 95 % intervals: {orders}."
         if not all(have_common_value(each.values()) for each in told.values()):
             words += " The runs contradict each other."
         if worse:
@@ -240,7 +240,7 @@ def percent(value: float) -> str:
 
 
 @dataclass(frozen=True)
-class UnseenOrders:
+class OrderCrossValidation:
     """Cross-validation of integer against fractional orders over several runs.
 
     Parameters
@@ -267,7 +267,7 @@ class UnseenOrders:
             "filtered": self.filtered,
             "margin": MIN_FIT_GAIN,
             "deflections": {
-                output: d.to_dict() | ({} if d.before is None else {"without_rate": d.before.to_dict()})
+                output: d.to_dict() | ({} if d.without_rate is None else {"without_rate": d.without_rate.to_dict()})
                 for output, d in self.deflections.items()
             },
             "notes": list(self.notes),
@@ -294,21 +294,21 @@ def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool
     return replace(made, initial="caputo")
 
 
-def orders_on_unseen_runs(
+def cross_validate_orders(
     runs: Sequence[Run],
     *,
     filtered: bool = True,
     threads: int | None = None,
     log: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
-) -> UnseenOrders:
+) -> OrderCrossValidation:
     """Fit every deflection of the arm to each run with integer and fractional orders, and validate it on all others.
 
     A link is (15) with the terms that a real arm needs: the measured hub motion, the accelerations of the other stage
     and the rate of its deflection if both stages were measured, hub angles in the gauge, and an offset of the gauge per
     run. All structures have the same terms and differ in the orders of the link's elasticity (integer 0) and damping
     (integer 1). If both stages were measured, everything is repeated without the rate of the other deflection
-    (``Deflection.before``): an order that improves the prediction only there compensates for the missing term.
+    (``Deflection.without_rate``): an order that improves the prediction only there compensates for the missing term.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def orders_on_unseen_runs(
 
     Returns
     -------
-    UnseenOrders
+    OrderCrossValidation
         Fits, intervals and verdicts.
 
     Raises
@@ -336,7 +336,7 @@ def orders_on_unseen_runs(
     """
     runs = [run if run.name else replace(run, name=f"run {k}") for k, run in enumerate(runs, 1)]
     if len(runs) < 2:
-        raise DataError(f"{len(runs)} run cannot be both fitted and unseen; give two or more")
+        raise DataError(f"cross-validation needs at least two runs, and there is {len(runs)}; give two or more")
     if len({run.name for run in runs}) < len(runs):
         raise DataError(f"runs {join_names(r.name for r in runs)} do not all have names of their own; rename a file")
     stages = stages_in(runs)
@@ -362,9 +362,11 @@ def orders_on_unseen_runs(
         found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, log, progress)
         if both:
             less = link_structure(stage, both=True, filtered=filtered, rate=False)
-            found = replace(found, before=_deflection(less, f", {WITHOUT_RATE_LABEL}", used, threads, log, progress))
+            found = replace(
+                found, without_rate=_deflection(less, f", {WITHOUT_RATE_LABEL}", used, threads, log, progress)
+            )
         deflections[found.output] = found
-    return UnseenOrders(tuple(used), deflections, filtered, tuple(notes))
+    return OrderCrossValidation(tuple(used), deflections, filtered, tuple(notes))
 
 
 def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
@@ -414,7 +416,7 @@ def _deflection(
     return Deflection(output, structure, fits, failed)
 
 
-def sentence(output: str, verdict: Verdict) -> str:
+def verdict_sentence(output: str, verdict: Verdict) -> str:
     """Return a verdict as a sentence."""
     several = verdict.kind == CHARTED_KIND
     what, yes = VERDICT_SUBJECTS[verdict.kind], "earn their place" if several else "earns its place"
@@ -424,22 +426,22 @@ def sentence(output: str, verdict: Verdict) -> str:
     return f"{symbol(output)}: {what} {yes if verdict.earns else no}."
 
 
-def _structures(found: UnseenOrders) -> list[tuple[str, Deflection]]:
+def _structures(found: OrderCrossValidation) -> list[tuple[str, Deflection]]:
     """Return every structure with its heading; those without the rate follow those with it."""
     both = [(o, suffix, d) for o, full in found.deflections.items() for suffix, d in _with_and_without(full)]
     return [(f"{symbol(o)}{suffix}", d) for o, suffix, d in both]
 
 
 def _with_and_without(full: Deflection) -> list[tuple[str, Deflection]]:
-    return [("", full)] + ([] if full.before is None else [(f", {WITHOUT_RATE_LABEL}", full.before)])
+    return [("", full)] + ([] if full.without_rate is None else [(f", {WITHOUT_RATE_LABEL}", full.without_rate)])
 
 
 def _verdict(output: str, verdict: Verdict) -> Markup:
     template = Markup('<span class="verdict"><strong>{}</strong><span class="note">{}</span></span>')
-    return template.format(sentence(output, verdict), verdict.words)
+    return template.format(verdict_sentence(output, verdict), verdict.words)
 
 
-def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
+def validation_charts(found: OrderCrossValidation, deflection: Deflection) -> list[Figure]:
     """Charts of a deflection and its simulations by both structures on the run after the estimation run."""
     charts, output = [], deflection.output
     names = [run.name or "" for run in found.runs]
@@ -462,14 +464,15 @@ def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
     return charts
 
 
-def places_table(found: UnseenOrders) -> Table | None:
+def rate_effect_table(found: OrderCrossValidation) -> Table | None:
     """Table of the verdicts without and with the rate of the other deflection."""
     rows = {
         symbol(output): [
-            [kind, *(VERDICT_CELLS[d.verdict(kind).earns] for d in (full.before, full))] for kind in VERDICT_SUBJECTS
+            [kind, *(VERDICT_CELLS[d.verdict(kind).earns] for d in (full.without_rate, full))]
+            for kind in VERDICT_SUBJECTS
         ]
         for output, full in found.deflections.items()
-        if full.before is not None
+        if full.without_rate is not None
     }
     if not rows:
         return None
@@ -482,7 +485,7 @@ def places_table(found: UnseenOrders) -> Table | None:
     )
 
 
-def fits_table(found: UnseenOrders) -> Table:
+def fits_table(found: OrderCrossValidation) -> Table:
     """Table of the fits of every structure on all runs, with its orders."""
     pairs = [(run.name, other.name) for run in found.runs for other in found.runs]
     rows: dict[str, list[list[Cell]]] = {}
@@ -540,7 +543,7 @@ def _deflection_section(full: Deflection) -> Section:
     )
 
 
-def _method_section(found: UnseenOrders) -> Section:
+def _method_section(found: OrderCrossValidation) -> Section:
     rows: list[list[Cell]] = [[r.name, r.length, Exact(round(r.step, 9)), r.duration] for r in found.runs]
     filtered = " Both deflections passed the 2 Hz low-pass of the arm's stock model." if found.filtered else ""
     words = [
@@ -558,13 +561,13 @@ def _method_section(found: UnseenOrders) -> Section:
     return Section("How it is judged", words, tables=[Table("Runs", ("run", "rows", "step [s]", "length [s]"), rows)])
 
 
-def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+def cross_validation_page(found: OrderCrossValidation, path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write charts, verdicts and numbers as one HTML page.
 
     Parameters
     ----------
     found
-        From :func:`orders_on_unseen_runs`.
+        From :func:`cross_validate_orders`.
     path
         File to write.
     force
@@ -583,8 +586,8 @@ def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: boo
     check_free(path, force=force)
     each = {kind: [_verdict(o, d.verdict(kind)) for o, d in found.deflections.items()] for kind in VERDICT_SUBJECTS}
     first = each.pop(CHARTED_KIND)
-    charts = [chart for d in found.deflections.values() for chart in unseen_charts(found, d)]
-    places = places_table(found)
+    charts = [chart for d in found.deflections.values() for chart in validation_charts(found, d)]
+    places = rate_effect_table(found)
     alone = [verdict for pair in zip(*each.values(), strict=True) for verdict in pair]
     sections = [
         Section("On runs that were not fitted to", first, figures=charts, small=True),
@@ -600,16 +603,16 @@ def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: boo
     return write_page(path, title="Integer against fractional orders", sections=sections, lead=lead, force=force)
 
 
-def unseen_text(found: UnseenOrders) -> str:
+def cross_validation_text(found: OrderCrossValidation) -> str:
     """Summary of verdicts and fits for a terminal."""
     lines: list[str] = []
     for output, full in found.deflections.items():
         for verdict in full.verdicts:
-            lines += [sentence(output, verdict), f"    {verdict.words}"]
+            lines += [verdict_sentence(output, verdict), f"    {verdict.words}"]
     for output, full in found.deflections.items():
-        if full.before is not None:
+        if full.without_rate is not None:
             lines += ["", f"{symbol(output)}, {WITHOUT_RATE_LABEL}:"]
-            lines += [f"    {sentence(output, verdict)}" for verdict in full.before.verdicts]
+            lines += [f"    {verdict_sentence(output, verdict)}" for verdict in full.without_rate.verdicts]
     names = [run.name or "" for run in found.runs]
     for heading, deflection in _structures(found):
         lines += ["", f"{heading}: fit of the free run in percent, fitted to the first, judged on the second"]

@@ -187,8 +187,8 @@ def rival_figures(found: Reproduction) -> list[Figure]:
     figures = []
     for output, rival in found.rivals.items():
         models = {names.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
-        unseen = rival.models["genetic"].validation is not None
-        figures += _fits_chart(models, output, _place(11, output), sine=unseen, simulated=found.simulated)
+        has_validation = rival.models["genetic"].validation is not None
+        figures += _fits_chart(models, output, _place(11, output), sine=has_validation, simulated=found.simulated)
     return figures
 
 

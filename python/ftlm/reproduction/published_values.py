@@ -377,7 +377,10 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
 
 
 def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
-    """Return the table of the interpretation closest to the printed one; filters are tried on deflections only."""
+    """Return the recomputed table of the interpretation that is closest to the printed table.
+
+    Only deflections are also filtered by the sensor filter.
+    """
     table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][1].orders
     tried: list[tuple[float, Interpretation, dict[int, Row]]] = []
     for filtered, terms in product((False, True) if output.endswith("2") else (False,), TERM_INTERPRETATIONS):

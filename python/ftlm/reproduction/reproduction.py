@@ -337,7 +337,7 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
         if name not in ARM_VARIANTS:
             raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
     if not 1 <= (whole_number(records) or 0) <= MAX_RECORDS:
-        raise ModelError(f"{setting('records')} {short_repr(records)} is no whole number from 1 to {MAX_RECORDS}")
+        raise ModelError(f"{setting('records')} {short_repr(records)} is not a whole number from 1 to {MAX_RECORDS}")
     return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 

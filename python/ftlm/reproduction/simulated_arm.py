@@ -26,13 +26,13 @@ DEFAULT_SEED = 1
 
 
 def _with_integer_orders(stage: StageParameters, *, friction: bool) -> StageParameters:
-    """Return a stage with the maker's integer orders, with or without Coulomb friction."""
+    """Return a stage with the manufacturer's integer orders, with or without Coulomb friction."""
     return replace(stage, gamma=1.0, beta=0.0, mu=1.0, coulomb=stage.coulomb if friction else 0.0)
 
 
 def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
     rubbing = PARAMETER_SETS["effective"]
-    # Stage 1 of the maker's file has no link damping.
+    # Stage 1 of the manufacturer's file has no link damping.
     first = replace(_with_integer_orders(rubbing.stage1, friction=friction), d=0.0)
     return replace(
         DEMO_PARAMETERS,
@@ -43,8 +43,8 @@ def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
     )
 
 
-#: Arms for verdicts: that of the demonstration, one with Coulomb friction and stage coupling, and both with the maker's
-#: integer orders. Gauges are exact in all; every angle has the same noise.
+#: Arms for verdicts: that of the demonstration, one with Coulomb friction and stage coupling, and both with the integer
+#: orders of the manufacturer. All gauges are exact; every angle has the same noise.
 ARM_VARIANTS: dict[str, ArmParameters] = {
     "fractional": DEMO_PARAMETERS,
     "fractional, friction": replace(

@@ -280,7 +280,7 @@ class StageWork:
         return self.candidate(label, result.model, result)
 
     def manual(self, label: str) -> Candidate:
-        """Return the maker's integer-order model."""
+        """Return the integer-order model of the manufacturer's manual."""
         return self.candidate(label, link_model(stage=self.number, form="published"))
 
     def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
@@ -367,7 +367,7 @@ class StageWork:
     def joint(
         self, label: str, structure: Structure, words: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
-        """Fit by joint output error, on the whole run or a decimated one."""
+        """Fit by joint output error, to the whole run or to a decimated one."""
         self.begin(words, step)
         run = self.on
         if step == "whole orders" and run.length >= 2 * WHOLE_ROWS:

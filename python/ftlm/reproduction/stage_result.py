@@ -477,11 +477,11 @@ def compare_orders(
     threads: int | None,
     progress: Callable[[int, int], None] | None = None,
     *,
-    unseen: Run,
+    validation: Run,
 ) -> OrderComparison:
     """Fit integer and free orders of one stage of a simulated arm, which starts at rest, on a decimated run.
 
-    Both are compared on an unseen run.
+    Both are compared on an validation run.
 
     Raises
     ------
@@ -489,7 +489,7 @@ def compare_orders(
         No initial guess of one of the fits converged.
     """
     structure = replace(flexible_link(stage=stage, form="lagrange", coupling="simulated"), initial="rest")
-    own, other = (run.select(list(structure.signals)) for run in (square, unseen))
+    own, other = (run.select(list(structure.signals)) for run in (square, validation))
     run = decimate_run(own, ROW_STRIDE)
     # Coefficients of integer orders overflow on an arm without them.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -506,12 +506,12 @@ def _order_comparison(
     arm: str,
     stage: int,
     seen: Sequence[Comparison],
-    unseen: Sequence[Comparison | None],
+    validation: Sequence[Comparison | None],
     fits: Sequence[Identification],
 ) -> OrderComparison:
     """Return the comparison of integer and free orders, in this order."""
     nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in seen)
-    before, after = ({} if c is None else c.fit for c in unseen)
+    before, after = ({} if c is None else c.fit for c in validation)
     gains = {o: after[o] - before[o] for o in nr if o in before and math.isfinite(after[o] - before[o])}
     orders = {n: (v, *fits[1].intervals[n]) for n, v in fits[1].orders.items()}
     return OrderComparison(arm, stage, nr, free_nr, orders, gains, any(map(is_degenerate, fits)))
@@ -520,8 +520,8 @@ def _order_comparison(
 def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
     """Return the cases of one run and its stage results; trials only for runs that start at rest."""
     both = [stage.candidates[n] for n in ("integer, identified", "output error")]
-    seen, unseen, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
-    freed = (_order_comparison(arm, stage.number, seen, unseen, fits),)
+    seen, validation, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
+    freed = (_order_comparison(arm, stage.number, seen, validation, fits),)
     trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else ()
     return Panel(tuple(trials), tuple(Contest.of(arm, o, rival) for o, rival in stage.rivals.items()), freed)
 
@@ -548,7 +548,9 @@ def simulated_panel(
     contests: list[Contest] = []
     freed: list[OrderComparison] = []
     for seed in seeds:
-        run, unseen = (demo_run(s, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm]) for s in ("square", "sine"))
+        run, validation = (
+            demo_run(s, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm]) for s in ("square", "sine")
+        )
         begin("trials")
         trials += trials_of(stage, run, arm, seed, threads)
         if order_grid is None or seed != seeds[0]:
@@ -561,5 +563,5 @@ def simulated_panel(
             made = compare_optimizers(own, structure.equation(output), order_grid, genetic, **work)
             contests.append(Contest.of(arm, output, made))
         begin("freed")
-        freed.append(compare_orders(stage, run, arm, **work, unseen=unseen))
+        freed.append(compare_orders(stage, run, arm, **work, validation=validation))
     return Panel(tuple(trials), tuple(contests), tuple(freed))

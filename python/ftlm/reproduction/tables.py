@@ -121,8 +121,8 @@ def paper_row(
         No such output.
     """
     errors = comparison.equation_error.get(output), comparison.output_error.get(output)
-    unseen = None if validation is None else validation.output_error[output]
-    return PaperRow(label, output, *letters_of(model, output), *errors, unseen)
+    prediction = None if validation is None else validation.output_error[output]
+    return PaperRow(label, output, *letters_of(model, output), *errors, prediction)
 
 
 def table_by_angle(
@@ -302,7 +302,7 @@ def description_tables() -> list[Table]:
 
 
 def parameter_tables() -> list[Table]:
-    """Table 3 beside the maker's effective parameters, and the coefficients that follow from both."""
+    """Table 3 beside the manufacturer's effective parameters, and the coefficients that follow from both."""
     fields = {
         "J": ("hub_inertia", "link_inertia"),
         "B": ("hub_friction", "link_friction"),
@@ -320,7 +320,7 @@ def parameter_tables() -> list[Table]:
         rows.append([shown, Exact(value), unit, effective, value / effective if effective else None])
     return [
         Table(
-            "Table 3. Parameters: printed, and the maker's effective ones",
+            "Table 3. Parameters: printed, and the manufacturer's effective ones",
             ("parameter", "printed", "printed unit", "effective, SI", "printed / effective"),
             rows,
             note="Effective torque constants include gear ratio and efficiency. Lengths enter no equation.",
@@ -381,9 +381,9 @@ def optimizer_tables(found: Reproduction) -> list[Table]:
     def errors(output: str) -> Iterator[list[Cell]]:
         for label, candidate in rivals[output].models.items():
             own, other = candidate.estimation, candidate.validation
-            unseen = criteria_cells(None if other is None else other.output_error[output])
+            prediction = criteria_cells(None if other is None else other.output_error[output])
             spread = float(np.std(own.measured[output][0]))
-            yield [labels.get(label, label), *criteria_cells(own.output_error[output]), *unseen, spread]
+            yield [labels.get(label, label), *criteria_cells(own.output_error[output]), *prediction, spread]
         for k, label in enumerate(("genetic algorithm", "multi-innovation")):
             criteria, implied = map(Exact, printed.TABLE_7_CRITERIA[output][k]), printed.implied_spreads()[output][k]
             yield [printed_head(label), *criteria, None, None, None, implied]

@@ -289,7 +289,7 @@ _ArmFile = msgspec.defstruct(
 
 
 def _values_of(file: msgspec.Struct) -> dict[str, Any]:
-    """Return the keys of a file that are in it."""
+    """Return the keys that are set in a file, with their values."""
     return {key: value for key, value in msgspec.structs.asdict(file).items() if value is not UNSET}
 
 

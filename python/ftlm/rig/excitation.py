@@ -71,7 +71,7 @@ class Excitation:
         samples, length = finite_number(rate), finite_number(duration)
         if samples is None or length is None or not 0 <= length <= MAX_RUN_DURATION_S:
             raise ModelError(
-                f"{setting('duration')} {short_repr(duration)} s at {short_repr(rate)} Hz is no run of at most "
+                f"{setting('duration')} {short_repr(duration)} s at {short_repr(rate)} Hz is not a run of at most "
                 f"{MAX_RUN_DURATION_S:g} s; give its length and its rate"
             )
         check_rate(samples)

@@ -294,7 +294,8 @@ def _numbers(reference: ArrayLike) -> Floats:
     raw = as_array("reference", reference)
     if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
         raise DataError(
-            "reference is no array of numbers of shape (rows, 2), hub angles [rad] of one row a sample, and no pair of "
+            "reference is not an array of numbers of shape (rows, 2), hub angles [rad] with one row per sample, nor "
+            "a pair of "
             "angles to hold"
         )
     return np.array(raw, dtype=np.float64)
@@ -337,7 +338,7 @@ def _describe_controller(controller: Controller) -> dict[str, Any]:
         size = len(json.dumps(told, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError(
-            f"what to_dict() of the controller returns is no JSON ({error_text(error, 200)}); correct it"
+            f"what to_dict() of the controller returns is not valid JSON ({error_text(error, 200)}); correct it"
         ) from None
     if size > MAX_CONTROLLER_JSON_CHARACTERS:
         raise ModelError(

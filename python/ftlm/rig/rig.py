@@ -99,7 +99,7 @@ class InterruptWatch:
 
     def _stop(self) -> None:
         for number, ends in self._pipes.items():
-            # A handler that is no function of Python has replaced that of faulthandler already.
+            # A handler that is not a function of Python has replaced that of faulthandler already.
             if number in self._handlers and callable(signal.getsignal(number)):
                 faulthandler.unregister(number)
             for end in ends:

@@ -58,7 +58,7 @@ class VirtualBoard:
     horizon
         Longest run [s]; determines the size of the simulation history.
     page
-        File of the output registers; it is kept if given.
+        File of the output registers; by default a temporary one, which is deleted.
     inject
         Injected faults: (name in FAULT_INJECTIONS, channel from 0, time [s], number).
 
@@ -89,12 +89,12 @@ class VirtualBoard:
         self._random = np.random.default_rng(self.seed)
         self._rate = 0.0
         if not isinstance(self.inject, (tuple, list)):
-            raise ModelError(f"inject = {short_repr(self.inject)} is no tuple of faults")
+            raise ModelError(f"inject = {short_repr(self.inject)} is not a tuple of faults")
         for fault in self.inject:
             _checked_injection(fault)
 
     def open(self) -> None:
-        """Create the output stage."""
+        """Open the board: create the file of the output registers."""
         if self._page is not None:
             raise RigFault("virtual rig: the board is open already")
         self._page = watchdog.RegisterPage(self.page or watchdog.create_page_file(), create=True)

@@ -63,7 +63,7 @@ class RegisterPage:
         finally:
             os.close(descriptor)
         if self._map[: len(PAGE_SIGNATURE)] != PAGE_SIGNATURE:
-            raise ValueError(f"{self.path} is no page of the virtual rig")
+            raise ValueError(f"{self.path} is not a page of the virtual rig")
         if create:
             self.set("state1", math.nan)
             self.set("state2", math.nan)

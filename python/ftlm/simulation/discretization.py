@@ -115,7 +115,7 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     if power_of_two and m & (m - 1):
         below = 1 << (m.bit_length() - 1)
         raise ModelError(
-            f"{setting('m')} {m} is no power of two, which Haar rows need; take m = {below} or {2 * below}, or "
+            f"{setting('m')} {m} is not a power of two, which Haar rows need; take m = {below} or {2 * below}, or "
             f"{parameter('row_basis', 'time')}"
         )
     return m
@@ -510,7 +510,7 @@ def _is_offset(term: Term, item: Equation, prepared: Sequence[Record]) -> bool:
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
-    """Return free coefficients by name, from the core's products of factor and coefficient."""
+    """Return free coefficients by name. ``raw`` has the product of factor and coefficient of each term."""
     return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
 
 

@@ -212,7 +212,7 @@ def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
 
 
 def _is_at_rest(rows: Floats, noise: float) -> bool:
-    """Whether slope and scatter of rows are those of noise."""
+    """Whether slope and standard deviation of the samples of some rows are those of noise."""
     t = np.arange(rows.size) - 0.5 * (rows.size - 1)
     slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
     limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
@@ -227,7 +227,7 @@ def _without_outliers(rows: Floats, noise: float) -> Floats:
 
 
 def _slope_weight(rows: int) -> float:
-    """Return the ratio of the noise of rows to the standard error of their slope a row."""
+    """Return the ratio of the noise of rows to the standard error of their slope per row."""
     return math.sqrt(rows * (rows**2 - 1) / 12.0)
 
 

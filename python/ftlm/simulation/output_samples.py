@@ -54,7 +54,7 @@ ORDER_TOLERANCE = 1e-9
 #: an integer adds a power that one just below does not, and t^1 in an equation with D^1.0003 acts as a constant force.
 OFFSET_POWER_TOLERANCE = 0.05
 Terms = Mapping[str, Mapping[float, float]]
-#: Exponent under which the level of an output stands among its initial terms: it follows them, and is no power of t.
+#: Exponent that marks the level of an output among its initial terms. It comes last, and is not a power of t.
 LEVEL_EXPONENT = math.inf
 
 

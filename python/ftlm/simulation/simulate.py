@@ -133,7 +133,9 @@ def simulate(
     impulses = {-1.0 - k for k in range(sensor.relative_degree if sensor is not None else 0)}
     for name, terms in (initial or {}).items():
         if name not in model.outputs:
-            raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
+            raise ModelError(
+                f"initial terms of {name!r}, which is not an output of the model: {', '.join(model.outputs)}"
+            )
         check_initial(
             [
                 e

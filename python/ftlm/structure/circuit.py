@@ -50,7 +50,7 @@ class Element:
     impedance
         Impedance at s, and its derivatives: by logarithms of parameters, by an exponent itself.
     ratio
-        Numerator and denominator of the impedance as polynomials; None for a function of s that is no ratio of powers.
+        Numerator and denominator of the impedance as polynomials; None if the impedance is not a ratio of powers of s.
     """
 
     meaning: str
@@ -220,7 +220,7 @@ class Circuit:
     @check_arguments
     def impedance(self, w: ArrayLike) -> Complex:
         """Return the impedance [Ω] at angular frequencies [rad/s], finite, above 0."""
-        return impedance_with_slopes(self, as_floats("w", w), {})[0]
+        return impedance_and_derivatives(self, as_floats("w", w), {})[0]
 
     def polynomials(self) -> tuple[Polynomial, Polynomial]:
         """Return numerator and denominator of the impedance as coefficients by power of s.
@@ -228,7 +228,7 @@ class Circuit:
         Raises
         ------
         ModelError
-            An element whose impedance is no ratio of powers of s.
+            An element whose impedance is not a ratio of powers of s.
         """
 
         def product(one: Polynomial, other: Polynomial) -> Polynomial:
@@ -266,7 +266,7 @@ class Circuit:
         return "".join(c for c in self.text if not c.isspace())
 
 
-def impedance_with_slopes(
+def impedance_and_derivatives(
     circuit: Circuit, w: Floats, more: Mapping[str, float], node: Node | None = None
 ) -> tuple[Complex, dict[str, Complex]]:
     """Return the impedance of a circuit part and its derivatives.
@@ -288,13 +288,15 @@ def impedance_with_slopes(
     if kind not in ("series", "parallel"):
         names = [rest + suffix for suffix, _ in CIRCUIT_ELEMENTS[kind].parameters]
         values = {**circuit.values, **more}
-        z, slopes = CIRCUIT_ELEMENTS[kind].impedance(
+        z, derivatives = CIRCUIT_ELEMENTS[kind].impedance(
             np.asarray(1j * w, dtype=np.complex128), [values[n] for n in names]
         )
-        return z, dict(zip(names, slopes, strict=True))
-    parts = [impedance_with_slopes(circuit, w, more, part) for part in rest]
+        return z, dict(zip(names, derivatives, strict=True))
+    parts = [impedance_and_derivatives(circuit, w, more, part) for part in rest]
     if kind == "series":
         total = np.asarray(np.sum([z for z, _ in parts], axis=0), dtype=np.complex128)
-        return total, {n: slope for _, slopes in parts for n, slope in slopes.items()}
+        return total, {n: derivative for _, derivatives in parts for n, derivative in derivatives.items()}
     beside = np.asarray(1.0 / np.sum([1.0 / z for z, _ in parts], axis=0), dtype=np.complex128)
-    return beside, {n: (beside / z) ** 2 * slope for z, slopes in parts for n, slope in slopes.items()}
+    return beside, {
+        n: (beside / z) ** 2 * derivative for z, derivatives in parts for n, derivative in derivatives.items()
+    }

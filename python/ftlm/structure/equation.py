@@ -343,19 +343,20 @@ class Equation:
         for term in terms:
             if not (math.isfinite(term.factor) and term.factor < 0):
                 raise ModelError(
-                    f"{words} has the factor {term.factor:g}, but friction takes energy: write "
+                    f"{words} has the factor {term.factor:g}, but friction dissipates energy: write "
                     f"'- fc*sign(D {self.output})'"
                 )
             if term.strength is not None and not 0 <= term.strength < math.inf:
                 raise ModelError(
-                    f"{words} has the coefficient {term.coefficient!r}; it is not negative: the sign is in the term"
+                    f"{words} has the coefficient {term.coefficient!r}; give a value of at least 0: the term has the "
+                    "minus sign"
                 )
         if friction.stribeck is not None and not isinstance(friction.stribeck.speed, str):
             speed = friction.stribeck.speed
             if not 0 < speed < math.inf:
                 raise ModelError(
-                    f"{words} falls with speed at vs = {speed:g}; a speed is positive: give one, in units of "
-                    f"{self.output} per s"
+                    f"{words} has the Stribeck speed vs = {speed:g}; give a positive one, in units of {self.output} "
+                    "per s"
                 )
         if self.order.names:
             return

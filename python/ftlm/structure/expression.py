@@ -259,7 +259,7 @@ def power(base: Expression, exponent: float) -> Expression:
             f"the power {exponent:g} of {base} is not in [1, {MAX_POWER}]; a quotient of signals is a signal of the run"
         )
     elif not float(exponent).is_integer():
-        raise ModelError(f"the power {exponent:g} of {base} is no whole number; write abs({base})^{exponent:g}")
+        raise ModelError(f"the power {exponent:g} of {base} is not a whole number; write abs({base})^{exponent:g}")
     if base.operation == "constant":
         try:
             return constant(base.value ** int(exponent))

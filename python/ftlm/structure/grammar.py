@@ -683,7 +683,8 @@ class EquationParser:
         kind, value, _ = self._peek()
         if kind == "name" and value != "D" and self._peek(1)[1] == ")":
             raise self._error(
-                f"sign({value}) is no term; friction of a position is '- fc*sign(D {value})', that of a measured speed "
+                f"sign({value}) is not a term; friction of a position is '- fc*sign(D {value})', that of a measured "
+                "speed "
                 f"'- fc*tanh(100 {value})', with a slope that rises within its noise"
             )
         signal = self._velocity("D and the name of a signal, as in sign(D y)")
@@ -872,7 +873,7 @@ class EquationParser:
         kind, value, at = self._take()
         if not (kind == "number" and value.isdigit() and 1 <= int(value) <= MAX_POLYNOMIAL_POWER):
             raise self._error(
-                f"the power {value!r} of a polynomial at character {at + 1} is no whole number from 1 to "
+                f"the power {value!r} of a polynomial at character {at + 1} is not a whole number from 1 to "
                 f"{MAX_POLYNOMIAL_POWER}; only these give a sum of powers of s"
             )
         found = UNIT_POLYNOMIAL

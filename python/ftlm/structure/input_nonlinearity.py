@@ -95,11 +95,13 @@ class InputNonlinearity:
                 raise ModelError(f"{words} = {self.value!r} is neither a number nor (least, largest)")
             low, high = (real_number(f"{words}", v) for v in self.value)
             if not 0 <= low < high < math.inf:
-                raise ModelError(f"{words} from {low} to {high} is no interval; give two rising values from 0")
+                raise ModelError(
+                    f"{words} from {low} to {high} is not an interval; give two increasing values of at least 0"
+                )
             return
         value = real_number(words, self.value)
         if not (0 <= value < math.inf and (value > 0 or self.law == "dead_zone")):
-            raise ModelError(f"{words} = {self.value} is no number {least} 0, in the unit of {self.signal}")
+            raise ModelError(f"{words} = {self.value} is not a number {least} 0, in the unit of {self.signal}")
 
     @property
     def free(self) -> FreeInputParameter | None:

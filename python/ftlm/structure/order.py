@@ -156,7 +156,7 @@ def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
             numbers = [float(p) for p in parts]
         except ValueError:
             raise ModelError(
-                f"order {name}: {spec!r} is no interval; write LOW:HIGH:STEP such as 0.5:1.5:0.05"
+                f"order {name}: {spec!r} is not an interval; write LOW:HIGH:STEP such as 0.5:1.5:0.05"
             ) from None
         if len(numbers) == 1:
             return _check_range(name, numbers[0])
@@ -170,7 +170,7 @@ def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
     try:
         numbers = [real_number(f"order {name}", v) for v in spec]
     except TypeError:
-        raise ModelError(f"order {name}: {spec!r} is no list of numbers; write LOW:HIGH:STEP or numbers") from None
+        raise ModelError(f"order {name}: {spec!r} is not a list of numbers; write LOW:HIGH:STEP or numbers") from None
     if isinstance(spec, tuple) and len(spec) == 3:
         return order_axis(name, *numbers)
     values = [_check_range(name, v) for v in numbers]

@@ -104,7 +104,7 @@ def order_grid(
         An increment that is not positive, or an interval that is empty or out of range.
     """
     if not (isinstance(alpha, (tuple, list)) and len(alpha) == 2):
-        raise ModelError(f"alpha = {alpha!r} is no interval; write (low, high), such as {DEFAULT_ALPHA_RANGE}")
+        raise ModelError(f"alpha = {alpha!r} is not an interval; write (low, high), such as {DEFAULT_ALPHA_RANGE}")
     low, high = (real_number("alpha", a) for a in alpha)
     if not 0 < low <= MAX_ORDER:
         raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 10]; choose a positive order")
@@ -128,7 +128,7 @@ def check_order_grid_names(given: OrderGrid | None, structure: Structure) -> Non
     for name in given.orders if given is not None else ():
         if name not in structure.order_names and name != "alpha":
             free = ", ".join(structure.order_names) or "none"
-            raise ModelError(f"order {name!r} of {parameter('order_grid')} is no free order; free are {free}")
+            raise ModelError(f"order {name!r} of {parameter('order_grid')} is not a free order; free are {free}")
 
 
 def restrict_order_grid(given: OrderGrid | None, part: Structure) -> OrderGrid | None:

@@ -203,15 +203,15 @@ def _friction_of(words: EquationParser, output: str, leading: float) -> Friction
     for found in (words.friction, words.stribeck):
         if found is not None and found[1] != output:
             raise ModelError(
-                f"equation {words.text!r}: friction follows the velocity of the equation's own output, which is "
-                f"{output}, not {found[1]}; the sign of a measured rate is the signal coulomb_{found[1]}"
+                f"equation {words.text!r}: friction opposes the velocity of the output of the equation, which is "
+                f"{output}, not {found[1]}; the sign of a measured velocity is the signal coulomb_{found[1]}"
             )
     if words.friction is None:
         if words.stribeck is None:
             return None
         raise ModelError(
-            f"equation {words.text!r}: Stribeck friction is what a body has near rest beyond the friction that it has "
-            f"at speed; write '- fc*sign(D {output})' beside it, or '- 0*sign(D {output})' where there is none"
+            f"equation {words.text!r}: Stribeck friction is the excess of friction near rest over Coulomb friction; "
+            f"add '- fc*sign(D {output})', or '- 0*sign(D {output})' without Coulomb friction"
         )
     scaled = replace(words.friction[0], factor=words.friction[0].factor / leading)
     if words.stribeck is None:

@@ -50,7 +50,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             for coefficient, order in terms:
                 if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
                     raise ModelError(
-                        f"sensor filter: {coefficient:g} D^{order:g} in its {part} is no term; give a finite "
+                        f"sensor filter: {coefficient:g} D^{order:g} in its {part} is not a term; give a finite "
                         "coefficient and an order in [0, 10]"
                     )
         highest = max((order for coefficient, order in self.denominator if coefficient), default=None)

@@ -183,7 +183,7 @@ class Structure:
         for name, (low, high) in self.free_delays.items():
             numbers = real_number(f"least delay of {name}", low), real_number(f"largest delay of {name}", high)
             if not -math.inf < numbers[0] < numbers[1] < math.inf:
-                raise ModelError(f"delay of {name} from {low} to {high} s is no interval; give two rising times")
+                raise ModelError(f"delay of {name} from {low} to {high} s is not an interval; give two rising times")
         check_known("limited input", [limit.signal for limit in self.limits], external)
         check_nonlinearities(self.limits, self.delay, self.free_delays)
         for item in self.free_inputs:
@@ -422,7 +422,7 @@ class Structure:
         Raises
         ------
         ModelError
-            A name that is no free order, or values out of range.
+            A name that is not a free order, or values out of range.
         """
         check_known("order", orders, self.order_names)
         numbers: dict[str, float] = {}
@@ -443,7 +443,7 @@ class Structure:
         Raises
         ------
         ModelError
-            A name that is no free coefficient.
+            A name that is not a free coefficient.
         """
         check_known("coefficient", values, self.coefficient_names)
         return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
@@ -457,7 +457,7 @@ class Structure:
         Raises
         ------
         ModelError
-            A name that is no input, a delay that is not finite, or no interval.
+            A name that is not an input, a delay that is not finite, or no interval.
         """
         known, free = dict(self.delay), dict(self.free_delays)
         for name, delay in delays.items():

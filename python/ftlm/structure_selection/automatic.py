@@ -14,7 +14,12 @@ from ftlm.simulation.discretization import compared_values
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.candidates import describe_structure
-from ftlm.structure_selection.cross_validation import Trial, parameter_count, scatter_factor, schwarz_criterion
+from ftlm.structure_selection.cross_validation import (
+    Trial,
+    parameter_count,
+    residual_variance_inflation,
+    schwarz_criterion,
+)
 from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
 from ftlm.validation.feedback import feedback_test
 
@@ -33,7 +38,7 @@ MIN_BIC_DECREASE = 6.0
 FRACTIONAL_DAMPING_ORDER = 2
 #: Offsets of free responses.
 FREE_OFFSETS = ("none", "level")
-#: Orders at which fractional forms start.
+#: Initial guesses of the order alpha of fractional forms.
 INITIAL_FRACTIONAL_ORDERS = (0.5, 0.8, 1.2, 1.7)
 
 #: Delay of inputs by name [s]: a number, or (lower, upper) of one to estimate.
@@ -67,11 +72,11 @@ class IntegerOrderForm:
 
     @property
     def has_feedthrough(self) -> bool:
-        """Whether the output jumps with its inputs."""
+        """Whether the form has direct feedthrough: the output jumps with its inputs."""
         return self.zeros >= self.order
 
     def structure(self, problem: OutputProblem) -> Structure:
-        """Return the structure of the form for one output, with given delays as :meth:`OutputProblem.input_delays`."""
+        """Return the structure of the form for one output; see :meth:`OutputProblem.input_delays` for its delays."""
         output, end = problem.output, problem.suffix
         powers = range(self.order - 1, int(self.integrator) - 1, -1)
         own = [f"a{k}{end} {_derivative(k, output)}" for k in powers]
@@ -104,7 +109,7 @@ class OutputProblem:
     delays
         Given delays.
     suffix
-        End of all names of coefficients and orders, which tells several outputs apart.
+        Suffix of the names of coefficients and orders, which distinguishes several outputs.
     initial
         Start of the runs.
     """
@@ -118,14 +123,14 @@ class OutputProblem:
 
     @property
     def numbered_drivers(self) -> list[tuple[str, str]]:
-        """Driving signals with their numbers in the names of coefficients; empty for a single one."""
+        """Pairs of the number in coefficient names and the driving signal; the number is empty for a single signal."""
         return [(f"{k}_" if len(self.drivers) > 1 else "", name) for k, name in enumerate(self.drivers, 1)]
 
     def input_delays(self, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
         """Return the delays [s] of the driving inputs: a number, or an interval of one to estimate.
 
-        Given delays precede those of all inputs of a delayed form. A form that is not delayed has the given ones that 0
-        is none of.
+        A delayed form has the given delays, and a free delay of every other input. A form that is not delayed has only
+        those given delays that exclude 0.
         """
         inputs = [n for n in self.drivers if n in self.runs[0].inputs]
         given = {n: d for n, d in self.delays.items() if n in inputs}
@@ -136,21 +141,21 @@ class OutputProblem:
 
 @dataclass(frozen=True)
 class FittedForm:
-    """Form or structure with its fit, number of parameters, variance inflation of the residuals, and BIC."""
+    """Structure with its fit, number of parameters, variance inflation of the residuals, and BIC."""
 
     structure: Structure
     joint: JointFit
     form: IntegerOrderForm | None
     parameters: int
-    scatter: float
+    variance_inflation: float
     bic: float = math.inf
 
 
 def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
     """Return fits sorted by BIC, best first, with the smallest variance inflation among them."""
-    scatter = min((f.scatter for f in fits), default=1.0)
+    inflation = min((f.variance_inflation for f in fits), default=1.0)
     return sorted(
-        (replace(f, bic=schwarz_criterion(f.joint, f.parameters, scatter)) for f in fits), key=lambda f: f.bic
+        (replace(f, bic=schwarz_criterion(f.joint, f.parameters, inflation)) for f in fits), key=lambda f: f.bic
     )
 
 
@@ -161,14 +166,14 @@ class AutomaticSelection:
     Parameters
     ----------
     problem
-        The output, and what drives it.
+        The output and its driving signals.
     evaluator
         Evaluator of the candidates.
     """
 
     problem: OutputProblem
     evaluator: CandidateEvaluator
-    #: Inputs that depend on the output: the controller's answer within a row would be taken for direct feedthrough.
+    #: Inputs that depend on the output. Forms with feedthrough are then not tried: feedback within a row looks like it.
     feedback: tuple[str, ...] = field(default=(), init=False)
 
     def run(self) -> list[Trial]:
@@ -198,7 +203,7 @@ class AutomaticSelection:
         for (structure, form, _), joint in zip(items, joints, strict=True):
             if isinstance(joint, JointFit):
                 count = parameter_count(structure, joint, self.evaluator.folds)
-                found.append(FittedForm(structure, joint, form, count, scatter_factor(joint)))
+                found.append(FittedForm(structure, joint, form, count, residual_variance_inflation(joint)))
             else:
                 self.evaluator.trials.append(self.evaluator.validate(describe_structure(structure), structure, joint))
         return _rank(found)
@@ -215,7 +220,7 @@ class AutomaticSelection:
         fits = self._fit_delayed(self._fit_zeros(forms, probes), offset)
         self.feedback = self._inputs_in_loop(fits)
         fits = self._fit_neighbors(fits)
-        # A zero less may be better within an order although a higher order fits the noise.
+        # Fewer zeros may be better within an order even if a higher order fits the noise.
         while fewer := [
             form
             for form in (replace(f, zeros=f.zeros - 1) for f in _best_of_each_order(fits) if f.zeros > 0)
@@ -228,17 +233,17 @@ class AutomaticSelection:
         return fits
 
     def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:
-        """Return the inputs that depend on the output, by the residuals of the best form, which has no feedthrough.
+        """Return the inputs that depend on the output, from the residuals of the best form without feedthrough.
 
-        Within a row a controller and direct feedthrough are correlated with the output alike; the sign is opposite to
-        that of the static gain for a controller.
+        Feedback and direct feedthrough both correlate an input with the output in the same row. For negative feedback
+        the sign of the correlation is opposite to that of the static gain.
         """
         if not fits:
             return ()
         best = fits[0]
         problem, end = self.problem, self.problem.suffix
         residuals = [part[problem.output] for part in best.joint.residuals]
-        # Residuals are those of the inner samples.
+        # There are residuals of the inner samples only.
         signals = {n: [compared_values(r, best.structure, n)[1:-1] for r in problem.runs] for n in problem.drivers}
         coefficients = best.joint.coefficients
         found = []
@@ -269,9 +274,9 @@ class AutomaticSelection:
         return fits
 
     def _fit_zeros(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
-        """Add the fits of forms with all zeros, and of those with fewer that can have the least criterion; best first.
+        """Add fits of forms with all zeros, and of forms with fewer zeros that can have the lowest BIC; best first.
 
-        A form with fewer zeros leaves no less, so its criterion is lower by at most the penalty of its zeros.
+        Fewer zeros cannot reduce the residuals, so they lower BIC by at most the penalty of the removed zeros.
         """
         known = {f.form for f in fits}
         full = _rank([*fits, *self._fit([f for f in forms if f not in known])])
@@ -286,11 +291,11 @@ class AutomaticSelection:
         return _rank([*full, *self._fit(fewer)])
 
     def _penalty(self, fitted: FittedForm) -> float:
-        """Penalty of one zero of every driving signal in the criterion."""
+        """Return the penalty in BIC of one zero of every driving signal."""
         return len(self.problem.drivers) * math.log(fitted.joint.samples)
 
     def _fit_delayed(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
-        """Add the fits of delayed forms, all of them if a delay lowers the criterion of the first or second order."""
+        """Add fits of delayed forms; those above order 2 only if a delay lowers BIC of order 1 or 2."""
         if self.problem.input_delays(delayed=False) == self.problem.input_delays(delayed=True):
             return fits
         delayed = [IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in range(1, MAX_ORDER)]
@@ -316,7 +321,8 @@ class AutomaticSelection:
     def _fit_fractional_forms(self, fits: Sequence[FittedForm], best: FittedForm | None) -> list[FittedForm]:
         """Fit fractional forms from the optima of integer orders, best first.
 
-        They have the offset of the best one of integer orders. If that has a delay, the best of them gets one as well.
+        They have the offset of the best form of integer orders. If that form has a delay, the best fractional form is
+        also fitted with one.
         """
         form = best.form if best is not None and best.form is not None else IntegerOrderForm(1, 0)
         y, end, frequency = self.problem.output, self.problem.suffix, _frequency(fits, form.offset, self.problem.suffix)
@@ -363,14 +369,14 @@ class AutomaticSelection:
 
 
 def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
-    """Return the form of least BIC of each order, with the color of noise of that order."""
+    """Return the form with the lowest BIC of each order; the noise color is that of the same order."""
     forms = [f for f in fits if f.form is not None]
     orders = sorted({f.form.order for f in forms if f.form})
     return [g.form for n in orders if (g := _rank([f for f in forms if f.form and f.form.order == n])[0]).form]
 
 
 def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
-    """Forms that differ in one property: an integrator, direct feedthrough, an offset, a canceled pole and zero."""
+    """Return forms that differ in an integrator, direct feedthrough, an offset, or a canceled pole and zero."""
     found = [
         replace(form, integrator=not form.integrator),
         replace(form, zeros=form.order if form.zeros < form.order else form.order - 1),
@@ -385,14 +391,14 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
 
 
 def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
-    """Decrease of the least criterion by a property; 0 if no form has it."""
+    """Return the decrease of the lowest BIC by a property of forms; 0 if no form has it."""
     with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
     without = [f.bic for f in fits if f.form is not None and not has(f.form)]
     return min(without, default=math.inf) - min(with_it) if with_it else 0.0
 
 
 def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
-    """Frequency [rad/s] of a lag of first order, or of a resonance if that explains more."""
+    """Return the frequency [rad/s] of a resonance of order 2 if there is one, otherwise of a lag of order 1."""
     for order in (2, 1):
         for item in fits:
             if item.form is not None and (item.form.order, item.form.offset, item.form.integrator) == (

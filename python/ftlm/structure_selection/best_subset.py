@@ -62,7 +62,7 @@ class ScreenedSubset:
 
 @dataclass(frozen=True)
 class Column:
-    """Input term at one of its integer orders."""
+    """Input term with one of the integer values of its order."""
 
     coefficient: str
     signal: str
@@ -76,7 +76,7 @@ class Column:
 
 @dataclass(frozen=True)
 class BaseModel:
-    """Base model: own terms at integer orders with coefficients from a grid, and columns of possible input terms."""
+    """Base model: own terms at integer orders with coefficients from a grid, and the columns of its input terms."""
 
     inside: NestedStructures
     variant: Variant
@@ -87,11 +87,11 @@ class BaseModel:
 
     @property
     def highest_order(self) -> float:
-        """Highest order."""
+        """Highest order of the equation."""
         return self.structure.equations[0].order.constant
 
     def grid_points(self) -> Iterator[tuple[float, ...]]:
-        """Yield logarithms of frequency and of damping, as many as there are free own coefficients."""
+        """Yield grid points: ln(frequency) and ln(damping), one coordinate per free own coefficient."""
         if not self.own:
             yield ()
             return
@@ -102,7 +102,7 @@ class BaseModel:
             yield from [(w,)] if len(self.own) == 1 else [(w, math.log(g)) for g in DAMPING_FACTORS]
 
     def coefficients(self, point: tuple[float, ...]) -> dict[str, float]:
-        """Own coefficients at a point: a power of the frequency for the lower order, damping for the higher."""
+        """Return the own coefficients at a grid point: g ω^(α-ν), with g = 1 for the lowest of the own orders ν."""
         w = math.exp(point[0]) if point else 1.0
         shares = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
         ordered = sorted(self.own, key=lambda item: item[1])
@@ -138,7 +138,7 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
 
     It needs several runs, or a validation run: blocks of one run share initial terms.
     """
-    # Subsets are compared as bodies that slide; friction that may be left out is added to the best.
+    # Optional friction is not linear in its parameters; stepwise selection adds it to the best subset.
     inside = NestedStructures(inside.without_optional_friction)
     structure = inside.structure
     drives = [t for t in structure.equations[0].terms if t.signal != structure.equations[0].output]
@@ -189,7 +189,7 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
 
 
 def _candidate_orders(inside: NestedStructures, term: Term, top: float) -> list[float | None]:
-    """Integer orders of an own term below the highest, and None if it is optional."""
+    """Return the integer orders of an own term below the highest order, and None if the term is optional."""
     out: list[float | None] = [None] if term.coefficient in inside.droppable else []
     places = inside.integer_values(term.order.names[0]) if term.order.is_single else [term.order.constant]
     return out + [p for p in places if p < top]
@@ -203,7 +203,7 @@ def _base_model(
     free: tuple[tuple[str, float], ...],
     runs: tuple[Run, ...],
 ) -> BaseModel | None:
-    """Return a base model with every possible column; None if there is none, or not all are linear."""
+    """Return a base model with every valid column; None if there is none, or if two terms share a coefficient."""
     item = inside.structure.equations[0]
     known = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
     kept = [replace(t, order=Order(p)) for t, p in own]
@@ -268,7 +268,7 @@ def score_subsets(
     """
     problem = FreeProblem.of(ground.structure)
     grid = Objective(problem, ground.runs, [1.0], decimation=_decimation(ground.runs))
-    # Made here, once, before the threads ask for them.
+    # Computed once here, because the threads share them.
     experiments, ends = grid.experiments, np.cumsum([0, *(count for _, count in grid.counts)]).tolist()
     places = [problem.coefficients.index(f"column{k}") for k in range(len(ground.columns))]
 
@@ -321,7 +321,7 @@ def _products(
     places: Sequence[int],
     point: tuple[float, ...],
 ) -> Floats | None:
-    """Inner products by run of the responses to the columns and of the residual; None if a response diverges."""
+    """Return, for each run, the inner products of the column responses and the residual; None if one diverges."""
     values = ground.coefficients(point)
     coefficients = [values.get(n, 0.0) for n in problem.coefficients]
     try:
@@ -349,7 +349,7 @@ def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
 
 @dataclass(frozen=True)
 class SubsetScore:
-    """Score of a subset, its grid points by fold (last: all runs), and its coefficients there."""
+    """Score of a subset, its best grid point for each fold and for all runs, and its coefficients for all runs."""
 
     score: float
     points: tuple[int, ...]
@@ -358,7 +358,19 @@ class SubsetScore:
 
 @dataclass(frozen=True)
 class SubsetScorer:
-    """Scorer of subsets: estimation runs by fold (last: all), validation run by fold, and output powers."""
+    """Scorer of subsets.
+
+    Parameters
+    ----------
+    columns
+        Columns of the base model.
+    estimation_runs
+        Indices of the estimation runs of each fold, then of all runs.
+    validation_runs
+        Index of the validation run of each fold.
+    sizes
+        Sum of squares of the output of each run about its mean.
+    """
 
     columns: tuple[Column, ...]
     estimation_runs: tuple[tuple[int, ...], ...]
@@ -367,7 +379,7 @@ class SubsetScorer:
 
     @classmethod
     def of(cls, ground: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
-        """Build from the folds on the runs of a base model."""
+        """Return the scorer for the folds, whose runs are those of the base model."""
 
         def place(run: Run) -> int:
             return next(k for k, r in enumerate(ground.runs) if r is run)

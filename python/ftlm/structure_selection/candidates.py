@@ -24,15 +24,15 @@ class Variant:
     Parameters
     ----------
     coefficients
-        Coefficients of the terms that it has.
+        Coefficients of its terms.
     integer_orders
         Orders with integer values, by name; all others are free.
     offset
         Whether each run has an unknown constant.
     inputs
-        Free delays and input nonlinearities that it has; the other inputs have no delay and no nonlinearity.
+        Names of its free delays and input nonlinearities; the other inputs have no delay and no nonlinearity.
     frictions
-        Frictions that it has, by the names of :attr:`NestedStructures.frictions`.
+        Names of its frictions, as in :attr:`NestedStructures.frictions`.
     """
 
     coefficients: frozenset[str]
@@ -63,8 +63,9 @@ class Change:
 class NestedStructures:
     """A structure and all structures nested in it.
 
-    Optional are terms with a free coefficient of their own (for one equation without laws), an allowed offset, free
-    delays and input nonlinearities, and friction of free size. Orders that stand alone may be integer.
+    Optional elements are terms with a free coefficient (in a single equation without order or coefficient laws), an
+    allowed offset, free delays, free input nonlinearities, and friction with a free coefficient. An order that is a
+    single parameter may be fixed to an integer.
     """
 
     structure: Structure
@@ -176,7 +177,7 @@ class NestedStructures:
             base = self._with_own_terms(top)
             if base is None:
                 continue
-            # A non-linear term of the output drives nothing.
+            # A non-linear term that contains the output is not an input term.
             item = self.structure.equations[0]
             drives = [t for t in item.terms if t.coefficient in self.droppable and item.output not in t.signals]
             known = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
@@ -220,7 +221,7 @@ class NestedStructures:
                         if term.coefficient in droppable:
                             continue
                         return None
-                    # Of own terms whose orders are sought the last is taken for damping, those before it stand below.
+                    # The last own term with a free order is damping (order 1); those before it have lower orders.
                     later = item.terms[item.terms.index(term) + 1 :]
                     below = any(t.column == item.output and t.order.is_single for t in later)
                     value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
@@ -235,7 +236,7 @@ class NestedStructures:
         names = [*self.structure.coefficient_names]
         kept += [n for n in names if n not in droppable]
         variant = Variant(frozenset(kept), tuple(sorted(whole.items())), self.structure.offset == "constant")
-        # Without own terms there is no equation before something drives it.
+        # Without own terms the equation is valid only once an input term is added.
         alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
         return variant if self.is_valid(variant) or not alone else None
 
@@ -251,7 +252,7 @@ class NestedStructures:
                 replace(variant, coefficients=kept).with_integer_orders({name: v}) for v in self.integer_values(name)
             ]
             if self._owns(term):
-                # Where every whole order is taken, it starts free.
+                # If other own terms have all integer orders, the order is free from the start.
                 grown = [v for v in grown if self.is_valid(v)] or [replace(variant, coefficients=kept)]
         else:
             grown = [replace(variant, coefficients=kept)]
@@ -260,13 +261,13 @@ class NestedStructures:
                 yield Change(f"+ {self._term_in(one, term)}", one)
 
     def _term_in(self, variant: Variant, term: Term) -> str:
-        """Text of a term in a variant."""
+        """Return a term of a variant as text."""
         made = self.build(variant)
         found = next(t for e in made.equations for t in e.terms if t.coefficient == term.coefficient)
         return str(found)
 
     def richest(self, variant: Variant) -> Variant:
-        """Return the variant with every term that fits, each at an integer order that no other term of it has."""
+        """Return the variant with all terms for which an integer order is left that no other term has."""
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
@@ -348,7 +349,7 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
     Raises
     ------
     ModelError
-        No candidate, an object that is no structure, or two that differ in parameter names only.
+        No candidate, an object that is not a structure, or two that differ in parameter names only.
     """
     items = (
         list(structures.items())
@@ -364,7 +365,7 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
                 "ftlm.flexible_link(…)"
             )
     if len({n for n, _ in items}) < len(items):
-        # The same words, told apart by what words do not say.
+        # Equal texts of structures that differ elsewhere get a number.
         items = [(f"{n} ({k + 1})", s) for k, (n, s) in enumerate(items)]
     out: dict[str, Structure] = {}
     for name, structure in items:
@@ -377,7 +378,7 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
     for name, structure in out.items():
         other = seen.setdefault(_content(structure), name)
         if other != name:
-            only = "" if repr(out[other]) == repr(structure) else " but for the names of their numbers"
+            only = "" if repr(out[other]) == repr(structure) else " except for parameter names"
             raise ModelError(f"candidates {other!r} and {name!r} are the same structure{only}; leave one out")
     return out
 

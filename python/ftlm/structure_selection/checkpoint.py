@@ -1,4 +1,4 @@
-"""Checkpoint file of a structure selection: every fit and validation as it ends, for resumption."""
+"""Checkpoint file of a structure selection: every finished fit and validation, for resumption."""
 
 from __future__ import annotations
 
@@ -60,7 +60,11 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
     def difference(self, other: Request) -> str | None:
         """Describe the difference to another request, or return None."""
-        words = {"runs": "of other runs", "candidates": "of other candidates", "validation": "by another validation"}
+        words = {
+            "runs": "of other runs",
+            "candidates": "of other candidates",
+            "validation": "with other validation data",
+        }
         return next((said for n, said in words.items() if getattr(self, n) != getattr(other, n)), None)
 
 
@@ -80,7 +84,7 @@ class FitError(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ref
 
     @classmethod
     def of(cls, error: FtlmError) -> FitError | None:
-        """Serialize an error; None for an internal error, which is no result of a candidate."""
+        """Serialize an error; None for an internal error, which is not a result of a candidate."""
         return next((cls(n, str(error)) for n, kind in CANDIDATE_ERRORS.items() if type(error) is kind), None)
 
     def error(self) -> FtlmError:
@@ -89,7 +93,7 @@ class FitError(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ref
 
 
 class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
-    """Fit on file. Its initial terms are a history or were given: on file both are powers of t."""
+    """A stored fit; ``history`` distinguishes a history from given initial terms, which are stored alike."""
 
     joint: JointFit
     history: bool
@@ -103,11 +107,11 @@ class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fi
         """Describe inconsistent data, or return None."""
         joint, count = self.joint, len(self.joint.names)
         if (joint.covariance.shape, joint.finest_grid_values.shape) != ((count, count), (count,)):
-            return f"a covariance or values of other than its {count} numbers"
+            return f"a covariance or values of another size than its {count} parameters"
         if any(e.ndim != 1 for part in joint.residuals for e in part.values()):
-            return "residuals that are no series"
+            return "residuals that are not one-dimensional"
         if self.history and isinstance(joint.initial, str):
-            return f"a history that is no powers of t but {joint.initial!r}"
+            return f"the initial terms {joint.initial!r} instead of powers of t"
         return None
 
     def fit(self) -> JointFit:
@@ -125,7 +129,7 @@ class StoredTrial(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
 
 class StoredSubsets(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
-    """All subsets of the best-subset search on file."""
+    """Result of the best-subset search, as it is stored."""
 
     subsets: list[ScreenedSubset]
 
@@ -153,7 +157,7 @@ class Store:
         try:
             payloads, damage = self._file.read()
             if damage is not None:
-                raise DataError(f"store {path} is damaged: {damage}; choose another file, and leave this one")
+                raise DataError(f"store {path} is damaged: {damage}; choose another file")
             if not payloads:
                 payloads = [RECORD_ENCODER.encode(request)]
                 self._file.append(payloads)
@@ -164,16 +168,16 @@ class Store:
             raise
 
     def _take(self, number: int, payload: bytes, request: Request) -> None:
-        """Check the request in the first record, and note the answer in any other one."""
+        """Check the request in the first record, and store the answer of any other record."""
         path = self._file.path
         try:
             record = ANSWER_DECODER.decode(payload)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
             raise DataError(
-                f"store {path} holds something else in record {number}: {error}; choose another file"
+                f"store {path} has an unexpected entry in record {number}: {error}; choose another file"
             ) from error
         if isinstance(record, Request) != (number == 1):
-            raise DataError(f"store {path} holds something else in record {number}; choose another file")
+            raise DataError(f"store {path} has an unexpected entry in record {number}; choose another file")
         if isinstance(record, Request):
             self._check_same(request, record)
             return
@@ -185,20 +189,22 @@ class Store:
 
     def _check_same(self, asked: Request, held: Request) -> None:
         path = self._file.path
-        # Digests are of what one version writes of candidates: those of another tell nothing.
+        # Digests of candidates depend on the version that wrote them, so only those of one version can be compared.
         if (asked.algorithm, asked.version) != (held.algorithm, held.version):
             raise DataError(
-                f"store {path} is of ftlm {held.version}, algorithm {held.algorithm}, and this is {asked.version}, "
-                f"{asked.algorithm}: finish the selection with that version, or start it again in another file"
+                f"store {path} was written by ftlm {held.version}, algorithm {held.algorithm}; this is "
+                f"{asked.version}, "
+                f"algorithm {asked.algorithm}: finish the selection with that version, or start it again in another "
+                "file"
             )
         difference = asked.difference(held)
         if difference is not None:
             raise DataError(f"store {path} holds a selection {difference}; choose another file")
 
     def _other(self, asked: str, answer: Answer) -> DataError:
-        held = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a judgement", StoredSubsets: "subsets"}
+        held = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
         return DataError(
-            f"store {self._file.path} holds {held[type(answer)]} where {asked} was asked for; choose another file"
+            f"store {self._file.path} holds {held[type(answer)]} where {asked} is expected; choose another file"
         )
 
     def __len__(self) -> int:
@@ -223,7 +229,7 @@ class Store:
             with self._lock:
                 self._file.append([RECORD_ENCODER.encode(StoredAnswer(key, answer))])
                 self._known[key] = answer
-        # What is given is always what the store gives back, so that one that goes on has the same bits.
+        # Decode the stored form even of a new result, so that a resumed selection gives the same bits.
         return read(answer)
 
     def fit(
@@ -256,7 +262,7 @@ class Store:
 
         def read(answer: Answer) -> Trial:
             if not isinstance(answer, StoredTrial):
-                raise self._other("a judgement", answer)
+                raise self._other("a validation", answer)
             trial = answer.trial
             fit = None if trial.failed is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)

@@ -34,7 +34,7 @@ MIN_FIT_PERCENT = -100.0
 
 @dataclass(frozen=True)
 class Fold:
-    """Estimation runs and validation data: another run, or samples of a run that are masked in the fit."""
+    """Estimation runs, and validation data: another run, or rows of a run whose outputs are masked in the fit."""
 
     runs: Runs
     validation_run: Run
@@ -57,10 +57,9 @@ class Fold:
     def fit(self, model: Model) -> dict[str, float]:
         """Return the fit of a simulation on the validation data in percent, by output.
 
-        Initial terms are those of the estimation data of the same run.
-
-        For a run with nonzero initial conditions the first block has initial terms of its own, as a whole run has.
-        Those of a whole run are estimated from its validation data: the residual is raised by their degrees of freedom.
+        A validation run has initial terms of its own, and its residual is raised by their degrees of freedom. A block
+        has those of the estimation data of the same run. The first block of a run with nonzero initial conditions has
+        those of the whole run.
         """
         outputs = model.outputs
         if self.rows is None:
@@ -68,7 +67,7 @@ class Fold:
             samples = {o: int(np.isfinite(y[0]).sum()) for o, y in there.measured.items()}
             left = {o: 1.0 - len(there.initial[0].get(o, ())) / max(n, 1) for o, n in samples.items()}
             return {o: 100.0 - (100.0 - f) / math.sqrt(max(left[o], 1e-3)) for o, f in there.fit.items()}
-        # Later rows tell nothing of motion from before the start that has died away by then.
+        # Without the first block, initial terms that decay early would not be identifiable.
         moving = self.rows[0] == 0 and model.structure.initial != "rest"
         before = compare(
             model, self.validation_run if moving else mask_outputs(self.validation_run, outputs, self.rows)
@@ -144,7 +143,7 @@ class Folds:
         every = as_runs(runs)
         if not isinstance(validation, (str, Run)) and not validation:
             raise ModelError(
-                "validation = [] has no run to validate on; give one that is not fitted to, or use 'runs' or 'blocks'"
+                "validation = [] has no run; give a run that is not an estimation run, or use 'runs' or 'blocks'"
             )
         if not isinstance(validation, str):
             others = as_runs(validation)
@@ -160,8 +159,8 @@ class Folds:
         if validation == "runs":
             if len(every) < 2:
                 raise ModelError(
-                    f"{parameter('validation', 'runs')} leaves one run out at a time, and there is one; give two or "
-                    f"more, give {parameter('validation')} a run of its own, or use "
+                    f"{parameter('validation', 'runs')} leaves one run out at a time, but there is only one; give "
+                    f"several runs, a separate run as {parameter('validation')}, or use "
                     f"{parameter('validation', 'blocks')}"
                 )
             parts = [Fold(Runs(r for k, r in enumerate(every) if k != out), every[out]) for out in range(len(every))]
@@ -169,7 +168,7 @@ class Folds:
         if validation != "blocks":
             raise ModelError(f"{setting('validation')} {validation!r} is not known; use 'runs', 'blocks', or a run")
         parts = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
-        return cls(every, tuple(parts), f"each of {len(parts)} blocks, its outputs unread, by the rest")
+        return cls(every, tuple(parts), f"each of {len(parts)} blocks by a fit without its outputs")
 
     @classmethod
     def of_pieces(cls, runs: Runs, duration: float) -> Folds:
@@ -214,10 +213,10 @@ class Trial:
     validation
         Fit in percent on each validation run or block, by output.
     scores
-        ln(1 - fit / 100) of each, outputs of one after another; lower is better.
+        ln(1 - fit / 100) of each output of each run or block; lower is better.
     bic
         Schwarz's criterion of the residual sum of squares, with an effective number of samples for correlated
-        residuals; None before the correlation of the best residuals is known.
+        residuals; None before the autocorrelation of the best residuals is known.
     values, errors
         Estimates and standard errors on all runs, by name.
     insignificant
@@ -281,9 +280,9 @@ class Trial:
 
 
 def fix_initial_conditions(structure: Structure, runs: Sequence[Run]) -> Structure:
-    """Return the structure with fixed initial conditions: none from rest, else Caputo's for any orders.
+    """Return the structure with fixed initial conditions: rest, or Caputo's initial terms.
 
-    A history has more terms the more orders are free, so a richer candidate could fit more than its model explains.
+    A history has more terms if more orders are free, so a richer candidate could fit more than its model explains.
     """
     if structure.initial != "auto":
         return structure
@@ -303,15 +302,15 @@ def fit(
 
     A fit of this structure to nearly the same runs (`near`) is used as a warm start.
 
-    Friction missing in the initial guesses may have no descent direction at 0. Automatic initial guesses are then added
-    to the given ones, in which it is 0.
+    Friction that the initial guesses omit is set to 0, where it may have no descent direction. Automatic initial
+    guesses are therefore added.
     """
     asked = fix_initial_conditions(structure, runs)
     if near is not None:
         return fit_output_error(runs, asked, refine=refine, near=near)
     problem = FreeProblem.of(asked)
     if not starts or any(n not in s for s in starts for n in problem.names):
-        # Where friction is 0 the speed at which it falls may be any.
+        # With zero friction the Stribeck speed is arbitrary.
         nothing = {n: 0.0 if low == 0 else 1.0 for n, (low, _) in zip(problem.names, problem.all_bounds, strict=True)}
         return fit_output_error(runs, asked, refine=refine, known=[{**nothing, **s} for s in starts])
     ends: list[JointFit] = []
@@ -328,7 +327,7 @@ def fit(
 
 
 def log_residual_power(joint: JointFit) -> float:
-    """Mean over outputs of ln of the mean square residual, unweighted."""
+    """Return the mean over outputs of ln(mean square residual), unweighted."""
     return float(np.mean([2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()]))
 
 
@@ -348,7 +347,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         folds.split is None and structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
     )
     start = joint.values_by_name
-    # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
+    # A fine fit was also computed on half its step. Each fold starts one level coarser, so it compares the same grids.
     near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.step_converged else joint
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
@@ -357,7 +356,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
             own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
             validation[fold.name] = fold.fit(model_of(structure, own, joint.initial))
         except FtlmError as error:
-            # What is wrong is wrong with what is left, not with the runs as they were given.
+            # The message is about the estimation data of the fold, not about the given runs.
             raise type(error)(f"without {fold.name}: {error}") from error
     fits = [
         max(v, MIN_FIT_PERCENT) if math.isfinite(v) else MIN_FIT_PERCENT
@@ -382,16 +381,16 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
 
 
 def validation_score_bound(joint: JointFit, folds: Folds) -> float:
-    """Lower bound of the score on validation data from the fit on all runs; -infinity if there is none.
+    """Return a lower bound of the score on validation data from the fit on all runs; -infinity if there is none.
 
-    A fit without a fold has at least the residual of the full fit on all runs, and at most its residual on the rest. So
-    it has at least the residual of the full fit on that fold. For several outputs this holds for the weighted sum of
-    squares, not for each output.
+    The fit without a fold cannot have smaller residuals than the full fit on all runs, nor larger ones on the rest. So
+    its residuals on that fold are at least those of the full fit. For several outputs this holds for the weighted sum
+    of squares, not for each output.
     """
     if not joint.converged:
         return -math.inf
     pooled = {o: drop_missing(np.concatenate([part[o] for part in joint.residuals])) for o in joint.noise}
-    # Residuals are over the noise that they were weighted with.
+    # Residuals are divided by the noise standard deviations that weighted them.
     scale = {o: v / max(float(np.sqrt(np.mean(pooled[o] ** 2))), 1e-300) for o, v in joint.noise.items()}
     scores = []
     for fold in folds.parts:
@@ -400,7 +399,7 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
             return -math.inf
         first, last = fold.rows or (0, fold.validation_run.length)
         if fold.rows is not None and first == 0 and joint.initial != "rest":
-            # Judged with initial terms that all rows tell of, which may leave less there.
+            # Its initial terms are estimated from all rows, so its residuals may be smaller.
             return -math.inf
         for output, residuals in joint.residuals[place].items():
             if residuals.size != fold.validation_run.length - 2:
@@ -413,7 +412,7 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
 
 
 def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
-    """Return a trial with a fit on all runs on grids refined until converged."""
+    """Return a trial with another fit to all runs, on a grid that was refined until converged."""
     estimation = compare(model_of(trial.structure, joint, joint.initial), folds.runs).fit
     return replace(
         trial,
@@ -427,29 +426,32 @@ def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
 
 
 def insignificant_coefficients(joint: JointFit) -> tuple[str, ...]:
-    """Coefficients that do not differ significantly from 0."""
+    """Return the coefficients that do not differ significantly from 0."""
     intervals = joint.intervals
     return tuple(n for n in joint.coefficients if intervals[n][0] <= 0.0 <= intervals[n][1])
 
 
 def parameter_count(structure: Structure, joint: JointFit, folds: Folds) -> int:
-    """Number of estimated parameters."""
+    """Return the number of estimated parameters, offsets of the runs included."""
     each = {"none": 0, "auto": 0, "level": 1, "constant": 1, "ramp": 2}[structure.offset]
     return len(joint.names) + each * len(structure.equations) * len(folds.runs)
 
 
-def scatter_factor(joint: JointFit) -> float:
-    """Largest ratio of the variance of sums of residuals to that of white noise, at least 1."""
+def residual_variance_inflation(joint: JointFit) -> float:
+    """Return the largest variance inflation of the residuals over runs and outputs, at least 1.
+
+    It is the ratio of the variance of a sum of residuals to that of white noise of the same power.
+    """
     return max([1.0, *(variance_inflation(drop_missing(e)) for part in joint.residuals for e in part.values())])
 
 
-def schwarz_criterion(joint: JointFit, numbers: int, scatter: float) -> float:
-    """Return the Schwarz criterion (BIC) with `scatter` samples per effective sample; doi:10.1214/aos/1176344136.
+def schwarz_criterion(joint: JointFit, parameters: int, inflation: float) -> float:
+    """Return the Schwarz criterion (BIC) with `inflation` samples per effective sample; doi:10.1214/aos/1176344136.
 
     Initial terms count as parameters: a canceled pole and zero add one, which can model a level.
     """
-    samples = joint.samples / scatter
+    samples = joint.samples / inflation
     each = samples / max(len(joint.noise), 1)
     return sum(each * 2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()) + (
-        numbers + joint.initial_terms
+        parameters + joint.initial_terms
     ) * math.log(samples)

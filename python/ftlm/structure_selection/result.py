@@ -36,8 +36,8 @@ class Selection(ReportMixin):
     Parameters
     ----------
     trials
-        Every validated candidate, best prediction of the validation data first. Candidates that fail on a part on
-        which another one does not come later, those without a fit last.
+        Validated candidates, best prediction first. Candidates that fail on parts that others predict come later, those
+        without a fit last.
     chosen
         Index of the chosen one.
     best
@@ -49,7 +49,7 @@ class Selection(ReportMixin):
     fitted
         Total number of fitted candidates. Only the most promising ones of each step are validated.
     findings
-        Findings against the choice.
+        Findings on the choice.
     validated
         Comparison of the identification with separate validation runs; None if runs or blocks were left out in turn.
     """
@@ -93,7 +93,7 @@ class Selection(ReportMixin):
         """Fit of the simulation on the estimation runs in percent, by output."""
         return self.best.fit
 
-    #: The same, by the name that has the unit.
+    #: Alias of :attr:`fit`, whose name states the unit.
     fit_percent = fit
 
     def validate(self, runs: Run | Sequence[Run]) -> Validation:
@@ -156,20 +156,20 @@ class Selection(ReportMixin):
         )
 
     def figure(self) -> Figure:
-        """Chart estimation and validation fit of the best candidate with each number of parameters."""
+        """Return a chart of the fits of the best candidate with each number of parameters."""
         best: dict[int, Trial] = {}
         for trial in (t for t in self.trials if t.failed is None):
             if trial.parameters not in best or trial.score < best[trial.parameters].score:
                 best[trial.parameters] = trial
         along = sorted(best)
-        seen, unseen = (
+        seen, validation_data = (
             [best[n].estimation_fit for n in along],
             [max(best[n].validation_fit, MIN_FIT_PERCENT) for n in along],
         )
-        chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, unseen, strict=True)]
+        chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, validation_data, strict=True)]
         return line_chart(
             [float(n) for n in along],
-            [("estimation", seen), ("validation", unseen), ("chosen", chosen)],
+            [("estimation", seen), ("validation", validation_data), ("chosen", chosen)],
             title="Fit by number of parameters",
             x_label="estimated parameters",
             y_label="fit in %",
@@ -211,11 +211,11 @@ class Selection(ReportMixin):
         return to_frame(rows, ["rank"])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {**self.ranking_dict(), "identification": self.best.to_dict()}
 
     def ranking_dict(self) -> dict[str, Any]:
-        """For JSON, without the identification."""
+        """Return a dictionary for JSON, without the identification."""
         return {
             "chosen": self.winner.name,
             "reason": self.reason,
@@ -245,7 +245,7 @@ class Selection(ReportMixin):
         return f"{self.best.summary(self.validated)}\n\n{self.ranking_text()}"
 
     def ranking_text(self) -> str:
-        """Table of the candidates and the reason of the choice, as text."""
+        """Return the table of the candidates and the reason of the choice, as text."""
         lines = [f"{len(self.trials)} of {self.fitted} fitted candidates validated: {self.validation}"]
         lines.append(f"{'':2}{'valid. %':>9}{'worst %':>9}{'estim. %':>10}{'param.':>9}  structure")
         for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):

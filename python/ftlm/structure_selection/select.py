@@ -30,7 +30,7 @@ from ftlm.structure_selection.automatic import (
 )
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
-from ftlm.structure_selection.cross_validation import Folds, Trial, scatter_factor, schwarz_criterion
+from ftlm.structure_selection.cross_validation import Folds, Trial, residual_variance_inflation, schwarz_criterion
 from ftlm.structure_selection.result import Selection, format_fit
 from ftlm.structure_selection.stepwise import (
     MAX_SCORE_TOLERANCE,
@@ -44,33 +44,33 @@ from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_99
 from ftlm.utils.validation import check_threads, nearest
 
-#: Mean fit [%] of validation data below which a candidate is not the machine.
+#: Mean fit [%] of validation data below which a candidate does not describe the machine.
 MIN_VALIDATION_FIT = 50.0
-#: Difference of an order from an integer that is none.
+#: Difference from an integer below which an order counts as an integer.
 INTEGER_TOLERANCE = 1e-9
 
 
 def automatic_problems(
     runs: Sequence[Run], delays: Delays | None = None, driven_by: Mapping[str, Sequence[str]] | None = None
 ) -> list[OutputProblem]:
-    """Return the outputs of runs whose structure is selected automatically, each with what drives it.
+    """Return one problem per output of the runs, with the signals that drive the output.
 
     Raises
     ------
     ModelError
-        A signal that is none of the runs, or drives itself.
+        A driving signal that is not in the runs or is the output itself.
     """
     first, asked = runs[0], dict(driven_by or {})
     for output, drivers in asked.items():
         if output not in first.outputs:
             raise ModelError(
-                f"{parameter('driven_by')}: {output!r} is no output{nearest(output, first.outputs)}; the runs have "
+                f"{parameter('driven_by')}: {output!r} is not an output{nearest(output, first.outputs)}; the runs have "
                 f"{', '.join(first.outputs)}"
             )
         for name in drivers:
             if name not in first or name == output:
                 raise ModelError(
-                    f"{parameter('driven_by')}: {name!r} does not drive {output}; name an input or another output of "
+                    f"{parameter('driven_by')}: {name!r} cannot drive {output}; name an input or another output of "
                     f"the runs: {', '.join(n for n in first.signals if n != output)}"
                 )
     found = []
@@ -85,13 +85,13 @@ def automatic_problems(
 BIC_TOLERANCE = 2.0
 #: Difference of Schwarz criteria that is very strong evidence; the same source.
 BIC_STRONG_EVIDENCE = 10.0
-#: Minimum number of folds for a test on their scatter, and one-sided 95 % quantiles of Student's t from there on.
-MIN_SCATTER_FOLDS, STUDENT_QUANTILES_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
-#: Score above which a candidate fails on a part, if it also exceeds the best score there by the second value.
+#: Minimum number of folds for a t-test of scores, and one-sided 95 % quantiles of Student's t from this number on.
+MIN_T_TEST_FOLDS, STUDENT_QUANTILES_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
+#: Score above which a candidate fails on a part if it also exceeds the best score on that part by the second value.
 FAILURE_SCORE, FAILURE_SCORE_GAP = math.log(0.5), math.log(2.0)
-#: Ratio of a difference of scores to its standard error over the folds beyond which a prediction is better: the
-#: two-sided 95 % quantile of Student's t for four blocks.
-BETTER_SCATTER_RATIO = 3.2
+#: t statistic of a difference of scores over the folds beyond which a prediction is better: the two-sided 95 % quantile
+#: of Student's t for four blocks.
+MIN_BETTER_T_STATISTIC = 3.2
 #: Maximum number of listed candidates.
 MAX_CANDIDATES = 10_000
 
@@ -117,11 +117,12 @@ def select(
     improvement, backward elimination removes one thing at a time. Listed structures are all validated, from automatic
     initial guesses.
 
-    A candidate fails on a run or a block if its residual is more than half of the output and twice that of another one.
-    Candidates with the fewest failures are eligible. Of those that predict as well as the best, the one with the least
-    Schwarz criterion is chosen, with samples counted by the autocorrelation of the residuals. Prediction is as good if
-    the residual is within 1 %, or within 5 % if the difference over three or more folds is not significant at 95 % or
-    all samples are very strong evidence. Ties are broken by fewer parameters, lower order, and better prediction.
+    A candidate fails on a run or a block if its residual exceeds half of the output and twice the residual of another
+    candidate. Candidates with the fewest failures are eligible. Of those that predict as well as the best, the one with
+    the lowest Schwarz criterion is chosen, with a number of samples corrected for the autocorrelation of the residuals.
+    A candidate predicts as well if its residual is within 1 % of the best. Up to 5 % are tolerated if the difference
+    over three or more folds is not significant at 95 % or, with fewer folds, if the criterion is lower by 10. Ties are
+    broken by fewer parameters, lower order, and better prediction.
 
     Parameters
     ----------
@@ -130,9 +131,9 @@ def select(
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
         ``"auto"``: every input (none for a free decay), integer orders 1 to 4 with zeros, delays, direct feedthrough,
-        an integrator, an output level and a drift, then fractional orders. These are chosen if they predict better, or
-        as well with a Schwarz criterion lower by 10. Feedthrough is not tried where an input answers the output (a
-        closed loop): the answer of a controller within a row would be taken for it. Each output has its own selection,
+        an integrator, an output level and a drift, then fractional orders. Fractional orders are chosen if they predict
+        better, or as well with a Schwarz criterion lower by 10. Feedthrough is not tried if an input depends on the
+        output (a closed loop), because feedback within a row looks like feedthrough. Each output has its own selection,
         and the chosen equations are identified together.
     validation
         ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
@@ -142,12 +143,12 @@ def select(
         default no delay and delays of up to 60 samples are compared. An input has one delay: if it is not the same in
         the equations of several outputs, equations without a free delay are chosen.
     driven_by
-        With ``"auto"``: the signals that drive an output by its name, by default all inputs. Other outputs act as
-        measured.
+        With ``"auto"``: names of the signals that drive an output, by output; by default all inputs. Other outputs act
+        with their measured values.
     threads
         Number of candidates fitted concurrently, by default all cores; the result does not depend on it.
     progress
-        Called with (candidates fitted, candidates known of so far).
+        Called with the number of fitted candidates and the number of candidates so far.
     store
         Checkpoint file with every finished fit. The same call with the same file resumes an interrupted selection and
         gives the same bits.
@@ -170,8 +171,8 @@ def select(
 
     Notes
     -----
-    Initial terms are those of integer orders (none from rest, else level and velocity, Caputo's) unless the structure
-    states otherwise. A history has more terms the more orders are free, so candidates could not be compared. Forward
+    Initial terms are Caputo's (none from rest, otherwise level and velocity) unless the structure states otherwise. A
+    history has more terms if more orders are free, so candidates could not be compared. Forward
     selection costs one fit for each possible addition, at each step. For records of more than about 1800 samples the
     candidates are prescreened on subsampled records, and only survivors are fitted. With three or more input terms in
     one equation and validation on whole runs, every subset at integer orders is first scored in closed form on a grid
@@ -207,12 +208,13 @@ def select(
         raise ModelError(f"{parameter('driven_by')} is used with 'auto'; give the terms to ftlm.equation instead")
     if delay and (unknown := [n for n in delay if n not in folds.runs[0].inputs]):
         raise ModelError(
-            f"{parameter('delay')}: {unknown[0]!r} is no input{nearest(unknown[0], folds.runs[0].inputs)}; the runs "
+            f"{parameter('delay')}: {unknown[0]!r} is not an input{nearest(unknown[0], folds.runs[0].inputs)}; the "
+            "runs "
             f"have {', '.join(folds.runs[0].inputs)}"
         )
     automatic = [IntegerOrderForm(2, 1, bool(delay)).structure(problem) for problem in sought]
     for structure in (*searched, *every.values(), *automatic):
-        # Refused here, once, and not as a failure of every candidate.
+        # Raise here once, instead of a failure of every candidate.
         prepare(
             folds.runs,
             replace(structure.without_input_nonlinearities(), offset="none"),
@@ -297,7 +299,7 @@ def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice
     ranked = _with_criteria(ranked)
     best = ranked[0]
     near = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], best)]
-    # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
+    # Refine the best candidates: over thousands of samples the criterion depends on the step of the grid.
     for k, trial in zip(near, work.map_items(work.refine_trial, [ranked[k] for k in near]), strict=True):
         ranked[k] = trial
     ranked = _with_criteria(ranked)
@@ -366,7 +368,7 @@ def _without_free_delays(choice: Choice) -> Choice:
 
 
 def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
-    """Identify the chosen structure on all runs, and add what is to be said about the choice."""
+    """Identify the chosen structure on all runs, and add findings on the choice."""
     folds, winner = work.folds, choice.winner
     structure = _with_validated_initial_conditions(winner, folds)
     if folds.split is None:
@@ -386,7 +388,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
     for part in choice.parts or (choice,):
         findings += _fractional_order_findings(part.winner, part.ranked, found)
-    unseen = folds.unseen_runs
+    validation_data = folds.unseen_runs
     return Selection(
         choice.ranked,
         choice.ranked.index(winner),
@@ -395,24 +397,26 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         choice.reason,
         work.done_count,
         tuple(findings),
-        None if not unseen else found.validate(unseen),
+        None if not validation_data else found.validate(validation_data),
     )
 
 
 def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
-    """Return ranked trials with BIC, whose effective sample size is that of the residuals of the best trial.
+    """Return ranked trials with BIC, whose effective sample size is that of the residuals of the best prediction.
 
-    Not that of the whitest ones: a high order can fit drifts and disturbances, and still predict worse.
+    The whitest residuals would mislead: a high order can fit drifts and disturbances, and still predict worse.
     """
-    scatter = 1.0 if ranked[0].joint is None else scatter_factor(ranked[0].joint)
-    return [t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, scatter)) for t in ranked]
+    inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
+    return [
+        t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, inflation)) for t in ranked
+    ]
 
 
 def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Identification) -> list[Finding]:
-    """Return a finding on whether the fractional orders of the chosen candidate earn their place.
+    """Return a finding on whether the fractional orders of the chosen candidate improve the prediction.
 
-    The rule is that of ``ftlm orders``, on parts that were not fitted, against the best candidate whose orders are all
-    integers, with delays and offsets as far as candidates have them.
+    The rule is that of ``ftlm orders`` on validation data, compared with the best candidate whose orders are all
+    integers; candidates may have delays and offsets.
     """
     orders = {n: v for n, v in winner.values.items() if n in winner.structure.order_names and n in found.orders}
     if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
@@ -439,7 +443,7 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Id
 
 
 def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
-    """Parts that each trial predicts badly and another, stable one predicts far better."""
+    """Return, for each trial, the parts that it predicts badly while a stable trial predicts them far better."""
     left = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
     least: dict[str, float] = {}
     for scores in (part for part, t in zip(left, every, strict=True) if not t.unstable):
@@ -453,7 +457,7 @@ def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
 def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
     """Sort trials, best first: fewest failures, then the mean score.
 
-    A mean of logarithms offsets a failure on one block by good fits on the others, which a user cannot.
+    The mean score alone would offset a failure on one block by good fits on the others.
     """
     failures = dict(zip(map(id, every), map(len, _failed_parts(every)), strict=True))
     return sorted(
@@ -462,7 +466,7 @@ def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
 
 
 def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
-    """Indices of trials that are no less stable, and fail no more often, than the best."""
+    """Return the indices of trials that are no less stable, and fail no more often, than the best."""
     best, failures = ranked[0], [len(f) for f in _failed_parts(ranked)]
     return [
         k
@@ -474,24 +478,23 @@ def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
 def _predicts_equally(trial: Trial, best: Trial) -> bool:
     """Whether a trial predicts like the best: within 1 %, or up to 5 % if the difference over folds is not significant.
 
-    The best is a maximum over many candidates, so one standard error would reject a true structure in one case of ten.
-    If one block contains information that the others lack, omitting it costs the true structure far more than 5 %: very
-    strong evidence on all samples keeps it eligible. It does so within 5 % if there are too few folds to estimate a
-    scatter.
+    The best is the maximum over many candidates, so a limit of one standard error would reject a true structure in one
+    case of ten. If one block contains information that the others lack, omitting it costs the true structure far more
+    than 5 %. Very strong evidence on all samples keeps it eligible; with too few folds for a t-test only within 5 %.
     """
     apart = np.array(trial.scores) - np.array(best.scores)
     far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
-    if apart.size < MIN_SCATTER_FOLDS:
+    if apart.size < MIN_T_TEST_FOLDS:
         return far <= SCORE_TOLERANCE or (far <= MAX_SCORE_TOLERANCE and likely)
-    scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
-    quantile = STUDENT_QUANTILES_95[min(apart.size - MIN_SCATTER_FOLDS, len(STUDENT_QUANTILES_95) - 1)]
-    return (far <= quantile * scatter and likely) or far <= max(
-        SCORE_TOLERANCE, min(quantile * scatter, MAX_SCORE_TOLERANCE)
+    error = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
+    quantile = STUDENT_QUANTILES_95[min(apart.size - MIN_T_TEST_FOLDS, len(STUDENT_QUANTILES_95) - 1)]
+    return (far <= quantile * error and likely) or far <= max(
+        SCORE_TOLERANCE, min(quantile * error, MAX_SCORE_TOLERANCE)
     )
 
 
 def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
-    """Indices of trials that may be chosen beside integer orders, and a sentence on the fractional ones.
+    """Return the indices of eligible trials if integer orders are preferred, and a sentence on fractional orders.
 
     Fractional orders predict better only if their residuals are 1 % smaller than those of the best integer orders, and
     significantly over the folds. They are also eligible if they predict as well and their criterion is much lower.
@@ -508,23 +511,23 @@ def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[lis
         return better, ""
     alike = [k for k in other if _predicts_equally(ranked[k], least) and _bic(ranked[k]) < limit]
     if alike:
-        return alike, " Integer orders with a delay and zeros predict alike, with more numbers."
+        return alike, " Integer orders with a delay and zeros predict as well, with a higher Schwarz criterion."
     return peers, ""
 
 
 def _predicts_better(trial: Trial, other: Trial) -> bool:
     """Whether the residuals of a trial are smaller than another's by 1 %, and significantly over folds."""
     apart = np.array(trial.scores) - np.array(other.scores)
-    if apart.size < MIN_SCATTER_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
+    if apart.size < MIN_T_TEST_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
         return False
-    scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
-    return float(np.mean(apart)) < -BETTER_SCATTER_RATIO * scatter
+    error = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
+    return float(np.mean(apart)) < -MIN_BETTER_T_STATISTIC * error
 
 
 def _winner(near: Sequence[Trial]) -> Trial:
-    """Return the trial with the least criterion of those that predict equally; ties go to fewer parameters.
+    """Return the trial with the lowest Schwarz criterion; ties go to fewer parameters, then to the lower order.
 
-    From rest an equation differentiated throughout is the same equation, so the lowest order wins.
+    From rest the derivative of an equation is equivalent to it, so the lower order is preferred.
     """
     least = min(_bic(t) for t in near)
     alike = [t for t in near if _bic(t) <= least + BIC_TOLERANCE]
@@ -532,7 +535,7 @@ def _winner(near: Sequence[Trial]) -> Trial:
 
 
 def _total_integer_order(trial: Trial) -> int:
-    """Sum over equations of the highest order rounded to an integer."""
+    """Return the sum over equations of the highest order, rounded to an integer."""
     return sum(round(e.order.substitute(trial.values).constant) for e in trial.structure.equations)
 
 
@@ -587,14 +590,13 @@ def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
         other = min(ahead, key=lambda t: t.score)
         name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
         told += (
-            f" {other.name} has {share:.2g} % smaller residuals on the mean and is not chosen: it fails on "
-            f"{name}, with "
-            f"{format_fit(other.parts[name])} % where the chosen one has {format_fit(winner.parts[name])}."
+            f" {other.name} has {share:.2g} % smaller residuals on average and is not chosen: it fails on {name}, with "
+            f"a fit of {format_fit(other.parts[name])} % where the chosen one has {format_fit(winner.parts[name])} %."
         )
     for name in failures[id(winner)]:
         other = max((t for t in ranked if name in t.parts and not t.unstable), key=lambda t: t.parts[name])
         told += (
-            f" It fails on {name}, with {format_fit(winner.parts[name])} % where {other.name} has "
-            f"{format_fit(other.parts[name])}, which fails elsewhere."
+            f" It fails on {name}, with a fit of {format_fit(winner.parts[name])} %; {other.name} has "
+            f"{format_fit(other.parts[name])} % there, but fails elsewhere."
         )
     return told

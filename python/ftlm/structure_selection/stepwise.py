@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
@@ -16,7 +16,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Objective
 from ftlm.estimation.output_error import COARSE_SHARE, JointFit, output_deviations, start_from_values
 from ftlm.structure.structure import Structure
-from ftlm.structure_selection.best_subset import ScreenedSubset, screen_subsets
+from ftlm.structure_selection.best_subset import ScreenedSubset, TaskPool, screen_subsets
 from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, describe_structure, signature
 from ftlm.structure_selection.checkpoint import Store
 from ftlm.structure_selection.cross_validation import (
@@ -25,7 +25,7 @@ from ftlm.structure_selection.cross_validation import (
     fit,
     fix_initial_conditions,
     parameter_count,
-    scatter_factor,
+    residual_variance_inflation,
     schwarz_criterion,
     update_trial,
     validate_fit,
@@ -38,16 +38,9 @@ from ftlm.utils.resources import interruptible_pool
 PRESCREEN_SAMPLES, PRESCREEN_EVALUATIONS, MAX_PRESCREEN_COST_RATIO = 1200, 60, 3.0
 
 Item = TypeVar("Item")
-MadeGlance = TypeVar("MadeGlance")
+Made = TypeVar("Made")
 #: A structure and its initial guesses.
 Start = tuple[Structure, Sequence[Mapping[str, float]]]
-
-
-class TaskPool(Protocol):
-    """Pool that maps a function over items, in their order."""
-
-    def map_items(self, work: Callable[[Item], MadeGlance], items: Sequence[Item]) -> list[MadeGlance]:
-        """Return the results for the items, in their order."""
 
 
 def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: TaskPool) -> list[int]:
@@ -67,7 +60,7 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Ta
         try:
             return _prescreen_cost(runs, fix_initial_conditions(structure, runs), points, decimation)
         except FtlmError:
-            # The fit on all samples says why.
+            # The fit to all samples reports the error.
             return math.inf
 
     levels = pool.map_items(level, starts)
@@ -94,12 +87,11 @@ def _prescreen_cost(
                 found, grid.minimize(start_from_values(problem, point), PRESCREEN_EVALUATIONS).cost_per_residual
             )
         except FtlmError:
-            # A start whose simulation is not finite is no start.
+            # Initial guesses without a finite simulation are skipped.
             continue
     return found
 
 
-Made = TypeVar("Made")
 #: Initial guesses of an order that becomes free, relative to its integer value.
 INITIAL_ORDER_SHIFTS = (0.0, -0.4, 0.4)
 #: Initial guesses of a free input parameter, as fractions of its interval.
@@ -117,9 +109,9 @@ MAX_SCORE_TOLERANCE = 0.05
 SUBSET_SCORE_MARGIN, MAX_FITTED_SUBSETS = 0.03, 8
 #: Number of listed candidates above which the total time is estimated first.
 TIME_ESTIMATE_CANDIDATES = 200
-#: Score gap to the best initial structure above which one is not extended, for equations without optional terms.
+#: Score gap to the best initial structure above which another one is not extended (no optional terms).
 MAX_ROOT_SCORE_GAP = math.log(2.0)
-#: Number of changes per step, best by criterion, that are evaluated on validation data.
+#: Number of changes per step with the lowest criterion that are evaluated on validation data.
 VALIDATED_CHANGES = 2
 
 
@@ -134,7 +126,7 @@ class CandidateEvaluator:
     threads
         Number of candidates evaluated concurrently; the result does not depend on it.
     progress
-        Called with (candidates fitted, candidates so far).
+        Called with the number of fitted candidates and the number of candidates so far.
     clock
         Clock in seconds.
     store
@@ -164,12 +156,12 @@ class CandidateEvaluator:
         if self.progress is not None:
             self.progress(self.done_count, self.known_count)
 
-    def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], told: Callable[[], None]) -> list[Made]:
+    def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], report: Callable[[], None]) -> list[Made]:
         out: list[Made] = []
         with interruptible_pool(self.threads) as workers:
             for made in workers.map(work, items):
                 out.append(made)
-                told()
+                report()
         return out
 
     def validate(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
@@ -191,7 +183,7 @@ class CandidateEvaluator:
             return trial
         joint = self.fit_candidate(trial.structure, [trial.values])
         try:
-            # On a finer grid it may have no finite simulation: it stays what it was judged as.
+            # Without a finite simulation on the finer grid the trial stays unrefined.
             return trial if isinstance(joint, FtlmError) else update_trial(trial, self.folds, joint)
         except FtlmError:
             return trial
@@ -230,9 +222,9 @@ class FittedVariant:
 def initial_guesses(
     structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
 ) -> list[dict[str, float]]:
-    """Return initial guesses from known `values`, orders that were `whole`, and coefficients that were 0.
+    """Return initial guesses from known `values`, the integers `whole` of orders that become free, and 0.
 
-    Friction missing in `values` is missing in the initial guesses.
+    Coefficients that are not in `values` start at 0; friction that is not in `values` has no initial guess.
     """
     problem = FreeProblem.of(structure)
     usual: dict[str, list[float]] = {}
@@ -260,7 +252,7 @@ def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[
     subsets = work.best_subsets(inside)
     found = _select_from_subsets(inside, work, subsets)
     if found:
-        # What was screened is not fitted again because it is one thing more, or less, than something.
+        # Screened subsets are not fitted again as neighbors of other variants.
         return _eliminate_from_ends(inside, work, found, {signature(inside.build(s.change.variant)) for s in subsets})
     if not inside.droppable:
         return _select_from_full(inside, work)
@@ -338,10 +330,10 @@ def _select_from_subsets(
         by_size.setdefault(len(one.start), one)
     ahead += [s for s in by_size.values() if s not in ahead]
 
-    def from_lattice(subset: ScreenedSubset) -> JointFit | FtlmError:
+    def from_grid(subset: ScreenedSubset) -> JointFit | FtlmError:
         return work.fit_candidate(inside.build(subset.change.variant), [subset.start], refine=False)
 
-    joints = work.map_candidates(from_lattice, ahead)
+    joints = work.map_candidates(from_grid, ahead)
     steps = _by_criterion(inside, work, [(s.change, j) for s, j in zip(ahead, joints, strict=True)])
     if not steps:
         return []
@@ -357,7 +349,7 @@ def _ranking_key(trial: Trial) -> tuple[bool, float]:
 
 
 def values_of(joint: JointFit) -> dict[str, float]:
-    """Return all free parameters by name."""
+    """Return the estimates of all free parameters by name."""
     return joint.values_by_name
 
 
@@ -366,10 +358,10 @@ def _select_forward(
     work: CandidateEvaluator,
     chosen: FittedVariant,
     tried: set[str],
-    judged_already: Trial | None = None,
+    validated: Trial | None = None,
 ) -> tuple[Trial, FittedVariant]:
-    """Add one thing at a time while prediction improves; return the best result on the way."""
-    best = judged_already or _validate_variants(inside, work, [chosen])[0]
+    """Add one term, free order or offset at a time while the prediction improves; return the best result."""
+    best = validated or _validate_variants(inside, work, [chosen])[0]
     best_at, idle = chosen, 0
     tried.add(_key(inside, chosen.change))
     while idle < MAX_IDLE_STEPS:
@@ -389,7 +381,7 @@ def _select_forward(
 
 
 def _max_relevant_score(best: Trial) -> float:
-    """Score above which a candidate is neither better than the best nor equal to it."""
+    """Return the score above which a candidate is neither better than the best nor equal to it."""
     return math.inf if best.unstable else best.score + MAX_SCORE_TOLERANCE
 
 
@@ -405,7 +397,7 @@ def _eliminate_from_full(
     others: Sequence[Mapping[str, float]],
     tried: set[str],
 ) -> tuple[Trial, FittedVariant] | None:
-    """Eliminate one term at a time from the full structure at integer orders; return the best on the way."""
+    """Eliminate one term at a time from the full structure at integer orders; return the best result."""
     full = inside.richest(low.change.variant)
     if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
         return None
@@ -445,10 +437,10 @@ def _validate_variants(
     beyond: float = math.inf,
     margin: float = 0.0,
 ) -> list[Trial]:
-    """Evaluate fitted variants on validation data: all, or only the first ones if the others cannot matter.
+    """Evaluate fitted variants on validation data, without those that cannot be the best.
 
-    A variant whose lower bound of the score exceeds `beyond` waits for those before it. It is skipped if the bound
-    exceeds their best score by more than the margin.
+    Variants from the first whose lower bound of the score exceeds `beyond` are evaluated after those before it. They
+    are skipped if all their bounds exceed the best score so far by more than the margin.
     """
 
     def one(fitted: FittedVariant) -> Trial:
@@ -482,20 +474,20 @@ def _fit_changes(
 def _by_criterion(
     inside: NestedStructures, work: CandidateEvaluator, pairs: Sequence[tuple[Change, JointFit | FtlmError]]
 ) -> list[FittedVariant]:
-    """Sort fitted variants by Schwarz's criterion, with the correlation of the best residuals among them."""
+    """Sort fitted variants by Schwarz's criterion, with the smallest variance inflation of their residuals."""
     there = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
     if not there:
         return []
-    scatter = min(scatter_factor(j) for _, j in there)
+    inflation = min(residual_variance_inflation(j) for _, j in there)
     count = [parameter_count(inside.build(c.variant), j, work.folds) for c, j in there]
-    every = [FittedVariant(c, j, schwarz_criterion(j, n, scatter)) for (c, j), n in zip(there, count, strict=True)]
+    every = [FittedVariant(c, j, schwarz_criterion(j, n, inflation)) for (c, j), n in zip(there, count, strict=True)]
     return sorted(every, key=lambda f: f.bic)
 
 
 def _eliminate_backward(
     inside: NestedStructures, work: CandidateEvaluator, best: Trial, at: FittedVariant, tried: set[str]
 ) -> None:
-    """Eliminate one thing at a time while prediction does not get worse."""
+    """Eliminate one term, free order or offset at a time while the prediction does not get worse."""
     while True:
         changes = [
             c for c in _untried_changes(inside, inside.smaller(at.change.variant), tried) if _is_adjacent_integer(c, at)
@@ -514,7 +506,7 @@ def _eliminate_backward(
 
 
 def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
-    """Whether orders that become integer move to an adjacent integer of their estimate."""
+    """Whether each order that becomes an integer moves by less than 1 from its estimate."""
     values = values_of(at.joint)
     return all(abs(v - values[n]) < 1.0 for n, v in change.variant.integer_orders if n in values)
 
@@ -540,7 +532,7 @@ def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator)
         return work.validate(name, structure, work.fit_candidate(structure, []), fine=True)
 
     items = list(candidates.items())
-    # What a store gives back takes no time, and tells none.
+    # Stored results take no time, so they give no estimate of it.
     if len(items) > TIME_ESTIMATE_CANDIDATES and not (work.store is not None and len(work.store)):
         begun = work.clock()
         work.trials += work.map_candidates(one, items[: work.threads])
@@ -548,10 +540,8 @@ def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator)
         rest = len(items) - work.threads
         warnings.warn(
             f"{len(items)} candidates: the first {work.threads} took {format_duration(took)}, so the other {rest} "
-            "take about "
-            f"{format_duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C ends it, and a "
-            "structure whose "
-            "inside is searched needs far fewer fits",
+            f"take about {format_duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C stops the "
+            "selection, and one structure with a stepwise search of its terms needs far fewer fits",
             UserWarning,
             stacklevel=3,
         )

@@ -99,10 +99,10 @@ def _histogram(
     bar = Markup(
         '<rect class="shade2" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}" fill-opacity=".55"/>'
     )
-    places, tops = plot.across(edges).tolist(), plot.down(counts).tolist()
+    places, tops = plot.x_pixels(edges).tolist(), plot.y_pixels(counts).tolist()
     for x, right, y in zip(places[:-1], places[1:], tops, strict=True):
         out.append(bar.format(x, y, max(right - x - 0.8, 0.4), plot.top + plot.height - y, LINE_STYLES[2][0]))
-    out += [stroke_path(1, zip(plot.across(at), plot.down(curve), strict=True)), TEXT_GROUP]
+    out += [stroke_path(1, zip(plot.x_pixels(at), plot.y_pixels(curve), strict=True)), TEXT_GROUP]
     out += [*plot.labels((across, upward), (x_label, "samples"), width), Markup("</g>")]
     return svg(width, round(HISTOGRAM_HEIGHT_PX), title, described, out, narrow=narrow)
 

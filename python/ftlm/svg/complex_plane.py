@@ -66,7 +66,7 @@ def plane_chart(
     if np.any(bad):
         raise DataError(f"point {int(np.argmax(bad))} of {values.size} is not finite; leave it out")
     if not 0 < sector < math.pi:
-        raise DataError(f"sector = {sector!r} is no angle between 0 and pi")
+        raise DataError(f"sector = {sector!r} is not an angle between 0 and pi")
     inside = int(np.sum(np.abs(np.angle(values)) < sector))
     far = float(np.max(np.abs(values), initial=0.0)) or 1.0
     listed = ", ".join(map(_complex_text, values.tolist()))
@@ -105,7 +105,7 @@ def _draw_plane(
 def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
     """Points of complex values [px]; far outside of the plot it no longer matters where."""
     found = np.asarray(values, dtype=np.complex128)
-    xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.across(found.real), plot.down(found.imag)))
+    xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(found.real), plot.y_pixels(found.imag)))
     return list(zip(xs, ys, strict=True))
 
 

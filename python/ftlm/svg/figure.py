@@ -133,22 +133,22 @@ class PlotArea:
     height: float
     frame: tuple[float, float, float, float]
 
-    def across(self, x: Floats | float) -> Floats:
+    def x_pixels(self, x: Floats | float) -> Floats:
         """Return horizontal places [px]."""
         low, high, _, _ = self.frame
         return np.asarray(self.left + self.width * (np.asarray(x) - low) / (high - low))
 
-    def down(self, y: Floats | float) -> Floats:
+    def y_pixels(self, y: Floats | float) -> Floats:
         """Return vertical places [px]."""
         _, _, low, high = self.frame
         return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
 
     def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
         """Coordinates in integer tenths of a pixel, clipped near the plot to keep them short."""
-        down = np.clip(self.down(y) - self.top, -self.height, 2 * self.height)
+        down = np.clip(self.y_pixels(y) - self.top, -self.height, 2 * self.height)
         xs, ys = (
             np.rint(places * TENTHS_PER_PIXEL).astype(np.int64).tolist()
-            for places in (self.across(x) - self.left, down)
+            for places in (self.x_pixels(x) - self.left, down)
         )
         return xs, ys
 
@@ -160,8 +160,8 @@ class PlotArea:
         )
         return [
             Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
-            *(along.format(self.left, float(self.down(v)), self.width) for v in upward.values),
-            *(up.format(float(self.across(v)), self.top, self.height) for v in across.values),
+            *(along.format(self.left, float(self.y_pixels(v)), self.width) for v in upward.values),
+            *(up.format(float(self.x_pixels(v)), self.top, self.height) for v in across.values),
             axes.format(self.left, self.top, self.height, self.width),
         ]
 
@@ -171,9 +171,9 @@ class PlotArea:
         bottom = self.top + self.height
         out = [Markup('<g class="ticks">')]
         for v, label in zip(upward.values, upward.labels, strict=True):
-            out.append(svg_text(self.left - 6, float(self.down(v)) + 4, label, "end"))
+            out.append(svg_text(self.left - 6, float(self.y_pixels(v)) + 4, label, "end"))
         for v, label in zip(across.values, across.labels, strict=True):
-            out.append(svg_text(float(self.across(v)), bottom + 16, label, "middle"))
+            out.append(svg_text(float(self.x_pixels(v)), bottom + 16, label, "middle"))
         out.append(Markup("</g>"))
         x_text, y_text = (
             truncate_text(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER_WIDTH_PX))

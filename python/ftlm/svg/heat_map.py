@@ -38,7 +38,7 @@ class Landscape:
     x, y
         Their values, ascending.
     scores
-        Shape (y, x); infinite for pairs that are no candidates or whose simulation diverges.
+        Shape (y, x); infinite for pairs that are not candidates or whose simulation diverges.
     other_orders_note
         Treatment of the other parameters, as text.
     score
@@ -87,7 +87,7 @@ def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
     if landscape.score != "score":
         caption += f" Score: {landscape.score}."
     if left_out:
-        caption += f" Grey: {left_out} pairs that are no candidate or whose simulation diverges."
+        caption += f" Grey: {left_out} pairs that are not candidates or whose simulation diverges."
     wide, small = (
         _heat_drawing(landscape, (low, high), (row, column), heading, described, narrow=n) for n in (False, True)
     )

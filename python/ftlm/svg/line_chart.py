@@ -372,7 +372,7 @@ def _curves(chart: _Chart, plot: PlotArea, points: int) -> list[Markup]:
         if d := _outline(shade, plot, points):
             out.append(shaded.format(shade.style, LINE_STYLES[shade.style][0], d))
     if chart.stems:
-        zero = float(plot.down(0.0) - plot.top) * TENTHS_PER_PIXEL
+        zero = float(plot.y_pixels(0.0) - plot.top) * TENTHS_PER_PIXEL
         axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>')
         out.append(axis.format(zero, plot.width * TENTHS_PER_PIXEL))
     # The neutral line lies beneath the others.
@@ -407,7 +407,7 @@ def _outline(shade: _Shade, plot: PlotArea, points: int) -> str:
 
 def _stem_path(line: _Line, plot: PlotArea) -> str:
     kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
-    zero = round(float(plot.down(0.0) - plot.top) * TENTHS_PER_PIXEL)
+    zero = round(float(plot.y_pixels(0.0) - plot.top) * TENTHS_PER_PIXEL)
     return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[kept], line.y[kept]), strict=True))
 
 
@@ -462,7 +462,7 @@ def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
     ends = []
     for line in lines:
         finite = line.y[np.isfinite(line.y)]
-        ends.append(float(np.clip(plot.down(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
+        ends.append(float(np.clip(plot.y_pixels(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
     # Lines that end together keep the order in which they were given.
     order = sorted(range(len(lines)), key=lambda i: (round(ends[i] / LINE_HEIGHT_PX), i))
     places = [ends[i] for i in order]

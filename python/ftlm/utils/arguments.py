@@ -142,7 +142,7 @@ def _alternatives(annotation: Any) -> tuple[Any, ...]:
 
 
 def _describe_type(kind: Any) -> str:
-    """Describe a type that is no union."""
+    """Describe a type that is not a union."""
     if get_origin(kind) is Literal:
         return ", ".join(map(repr, get_args(kind)))
     kind = get_origin(kind) or kind

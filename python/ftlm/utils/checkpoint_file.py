@@ -1,6 +1,6 @@
 """Checkpoint file of a long computation: an SQLite database of records, appended under digests by one writer.
 
-The only table has the name of the computation (``search`` or ``selection``) and one row a record:
+The only table has the name of the computation (``search`` or ``selection``) and one row per record:
 
 ===========  ========================================================================================================
 ``number``   1, 2, …
@@ -101,7 +101,7 @@ class CheckpointFile:
             status = self._status(access)
             # A pipe that nobody writes to would keep SQLite waiting.
             if status is not None and not stat.S_ISREG(status.st_mode):
-                raise DataError(f"store {path} is no regular file; choose another file")
+                raise DataError(f"store {path} is not a regular file; choose another file")
             if status is not None and status.st_size > MAX_FILE_BYTES:
                 raise DataError(
                     f"{path} has {status.st_size} bytes, more than the {MAX_FILE_BYTES} of the largest store; "
@@ -165,7 +165,7 @@ class CheckpointFile:
             raise self._foreign_error()
 
     def _foreign_error(self) -> DataError:
-        return DataError(f"{self.path} is no ftlm {self.kind} store; give a file written with {parameter('store')}")
+        return DataError(f"{self.path} is not an ftlm {self.kind} store; give a file written with {parameter('store')}")
 
     def _opening_error(self, error: sqlite3.Error, verb: str) -> DataError:
         """Return the error of a file that SQLite does not open."""

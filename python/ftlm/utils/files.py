@@ -100,7 +100,7 @@ def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: FileMe
         file = check_new(path, force=force, words=words)
         folder = file.absolute().parent
         if not folder.is_dir():
-            raise DataError(f"{words.format_path(file.parent)} is no folder; make it first")
+            raise DataError(f"{words.format_path(file.parent)} is not a folder; make it first")
         if not os.access(folder, os.W_OK):
             raise DataError(
                 f"{words.format_path(file)} cannot be written: {words.format_path(file.parent)} is read-only; "
@@ -216,10 +216,10 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
     Raises
     ------
     DataError
-        A file that cannot be read, is no regular file, or is too large.
+        A file that cannot be read, is not a regular file, or is too large.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise DataError(f"path = {short_repr(path)} is no path of a file; give {source}")
+        raise DataError(f"path = {short_repr(path)} is not the path of a file; give {source}")
     file = Path(path)
     try:
         descriptor = os.open(file, _READ_FLAGS)
@@ -237,7 +237,7 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
         why = (error.strerror if isinstance(error, OSError) else None) or error
         raise DataError(f"{what} {shown} cannot be read: {why}; check the path") from error
     if not stat.S_ISREG(state.st_mode):
-        raise DataError(f"{file} is no regular file; give {source}")
+        raise DataError(f"{file} is not a regular file; give {source}")
     raise DataError(f"{file} has {state.st_size} bytes, no {what} is larger than {max_bytes}; give {source}")
 
 
@@ -338,7 +338,7 @@ class JsonFormat(Generic[T]):
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             self._check_later(file, content)
             raise DataError(
-                f"{file} is no ftlm {self.what}: {error_text(error, MAX_NAME_CHARACTERS)}; give {self.source}"
+                f"{file} is not an ftlm {self.what}: {error_text(error, MAX_NAME_CHARACTERS)}; give {self.source}"
             ) from error
 
     def _check_later(self, file: Path, content: bytes) -> None:

@@ -40,7 +40,7 @@ def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
     Raises
     ------
     ModelError
-        ``FTLM_MEMORY`` is no positive size.
+        ``FTLM_MEMORY`` is not a positive size.
     """
     given = os.environ.get(MEMORY_VARIABLE, "")
     if given:
@@ -48,7 +48,7 @@ def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
         count = int(size[1]) << 10 * " KMGT".index(size[2] or " ") if size else 0
         if not 0 < count < 1 << 63:
             raise ModelError(
-                f"{MEMORY_VARIABLE}={given!r} is no size of memory; give bytes, or a number with K, M, G or T"
+                f"{MEMORY_VARIABLE}={given!r} is not a memory size; give bytes, or a number with K, M, G or T"
             )
         return count
     return int(DEFAULT_MEMORY_SHARE * (available_memory(system) or FALLBACK_MEMORY_BYTES / DEFAULT_MEMORY_SHARE))

@@ -85,7 +85,7 @@ def check_seed(seed: object) -> int:
     except TypeError:
         number = -1
     if number < 0:
-        raise ModelError(f"{setting('seed')} {short_repr(seed)} is not a whole number from 0")
+        raise ModelError(f"{setting('seed')} {short_repr(seed)} is not a whole number of at least 0")
     return number
 
 
@@ -93,7 +93,7 @@ def check_pulses(m: object, below: float = 1 << 62) -> int:
     """Return the number of block pulses as an int below 2^62, the limit of the core."""
     pulses = whole_number(m)
     if pulses is None or not 1 <= pulses < below:
-        raise ModelError(f"{setting('m')} {m!r} is no number of pulses; give a whole number, at least 1")
+        raise ModelError(f"{setting('m')} {m!r} is not a number of pulses; give a whole number, at least 1")
     return pulses
 
 
@@ -114,12 +114,12 @@ def real_number(name: str, value: object) -> float:
 
 
 def frequency_pair(band: Iterable[object]) -> tuple[float, float]:
-    """Return both ends of a band [rad/s]; raise for anything that is no pair of numbers."""
+    """Return both ends of a band [rad/s]; raise for anything that is not a pair of numbers."""
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
         raise ModelError(
-            f"{setting('band')} {short_repr(band)} is no pair of frequencies; give (low, high) in rad/s"
+            f"{setting('band')} {short_repr(band)} is not a pair of frequencies; give (low, high) in rad/s"
         ) from None
     return low, high
 
@@ -203,7 +203,9 @@ def check_threads(threads: int | None) -> int:
     if threads is None:
         given = os.environ.get(THREADS_VARIABLE, "").strip()
         if given and not (given.isascii() and given.isdecimal() and len(given) < 5 and 1 <= int(given) <= 1024):
-            raise ModelError(f"{THREADS_VARIABLE}={given!r} is no number of threads; give 1 to 1024, or leave it out")
+            raise ModelError(
+                f"{THREADS_VARIABLE}={given!r} is not a number of threads; give 1 to 1024, or leave it out"
+            )
         return int(given) if given else available_threads()
     count = whole_number(threads)
     if count is None or not 1 <= count <= 1024:
@@ -242,7 +244,7 @@ def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
         array = np.asarray(values)
     except Exception as error:
         raise DataError(
-            f"{name} is no array of numbers ({error_text(error, 200).rstrip('.')}); give rows of equal length"
+            f"{name} is not an array of numbers ({error_text(error, 200).rstrip('.')}); give rows of equal length"
         ) from error
     if array.size > MAX_SEQUENCE_LENGTH and array.size * 8 > (available_memory() or math.inf):
         raise DataError(f"{name} has shape {array.shape} and does not fit into memory; give fewer values")
@@ -263,10 +265,10 @@ def _check_sequence(name: str, values: object) -> None:
         except OverflowError:
             length, item = MAX_SEQUENCE_LENGTH + 1, None
         except Exception as error:
-            raise DataError(f"{name} is no array of numbers ({error_text(error, 200)}); give an array") from error
+            raise DataError(f"{name} is not an array of numbers ({error_text(error, 200)}); give an array") from error
         if length > MAX_SEQUENCE_LENGTH or depth > MAX_DIMENSIONS:
             found = f"{MAX_SEQUENCE_LENGTH} values" if length > MAX_SEQUENCE_LENGTH else f"{MAX_DIMENSIONS} dimensions"
-            raise DataError(f"{name} is no array of numbers, but a sequence of more than {found}; give an array")
+            raise DataError(f"{name} is not an array of numbers, but a sequence of more than {found}; give an array")
         if not length:
             return
         depth, first = depth + 1, item

@@ -89,7 +89,7 @@ class Metrics:
     fit: float
 
     def to_dict(self) -> dict[str, float | None]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {name: finite(getattr(self, name)) for name in ("error", "rmse", "nr", "fit")}
 
 
@@ -224,7 +224,7 @@ class Comparison:
         return to_frame(rows, ["run", "output", "of"])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "m": self.m,
             "output_error": {n: f.to_dict() for n, f in self.output_error.items()},

@@ -92,7 +92,7 @@ class Advice:
         return len(self.findings)
 
     def to_dict(self) -> list[dict[str, Any]]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return [f.to_dict() for f in self.findings]
 
     def __str__(self) -> str:
@@ -517,7 +517,7 @@ class Inspection:
         return tuple(f.sentence for f in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         parts = {n: getattr(self, n) for n in ("run", "rows", "step", "duration")}
         signals = [asdict(s) for s in self.signals]
         findings = [f.to_dict() for f in self.findings]

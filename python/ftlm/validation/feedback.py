@@ -17,16 +17,16 @@ from ftlm.utils.statistics import chi_squared, robust_deviation
 from ftlm.utils.validation import Floats
 
 FeedbackState = Literal["command", "none", "found", "undecided"]
-#: Significance level over all sets of regressors, and their numbers of past innovations of the output.
+#: Significance level over all sets of regressors, and the number of past innovations of the output in each set.
 FEEDBACK_LEVEL = 0.005
 INNOVATION_COUNTS = (3, 12)
-#: Shortest run, and most rows that are tested.
+#: Minimum number of rows of a run, and maximum number of tested rows.
 MIN_FEEDBACK_ROWS, MAX_FEEDBACK_ROWS = 150, 8_000
-#: Most lags of the input's own past, of other inputs and of the output, each also limited by a share of the run.
+#: Maximum lags of the input itself, of other inputs and of the output; each is also limited by a share of the run.
 MAX_INPUT_LAGS, MAX_OTHER_LAGS, MAX_OUTPUT_LAGS = 60, 20, 40
-#: An input of so few levels, or of so few levels a row, has no innovation that a linear past leaves.
+#: Number of levels of an input, and ratio of levels to rows, up to which a linear prediction leaves no innovation.
 MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE = 6, 0.01
-#: Fewest changes of an input that is held between them.
+#: Minimum number of changes of an input that is constant between them.
 MIN_CHANGES = 80
 #: One-step prediction error of an input, relative to its deviation, below which its past determines it.
 PREDICTED_SHARE = 3e-4
@@ -40,18 +40,19 @@ ROBUST_SIGMAS, ROBUST_ITERATIONS = 2.0, 4
 CERTAIN_SHARE, ROUGH_SHARE, CERTAIN_RATIO = 0.5, 2e-3, 5.0
 #: Smallest rows x share x (prediction error)^2 that could move an estimate by a part of its standard error.
 MIN_FEEDBACK_POWER = 0.01
-#: Shares of the largest noise in the measured input that are tried, and how far shifts in time are taken as placebos.
+#: Shares of the largest possible input noise that are tried; number of shifts in time that serve as placebos, and
+#: ratio of the statistic to the largest of theirs from which feedback counts as found.
 INPUT_NOISE_SHARES = (0.2, 0.4, 0.6, 0.75, 0.87, 0.94)
 PLACEBO_COUNT, PLACEBO_RATIO = 19, 1.2
-#: The same where what is new in the input is no innovation everywhere: outputs far back measure what that does.
+#: The same ratio where the innovation of the input is not white in every part of the run.
 PLACEBO_RATIO_IN_DOUBT = 10.0
-#: Parts of the run over which the agreement must be steady, and the least share of the median one.
+#: Number of parts of the run that must agree, and smallest agreement of a part relative to the median part.
 STEADY_PARTS, STEADY_SHARE = 8, 0.05
-#: Rows of the short blocks whose color and past are tested.
+#: Rows of the short blocks whose color and dependence on the past are tested.
 LOCAL_ROWS = 50
-#: Spectral lines: most of an input, and how far they stand above their neighborhood.
+#: Maximum number of spectral lines of an input, their ratio to the neighborhood, and its number of bins.
 MAX_LINES, LINE_RATIO, LINE_NEIGHBORS = 16, 40.0, 400
-#: Forgetting of the slow part of the residuals, as an integral action reads it, and the rows of its memory.
+#: Weight of the newest residual in their low-pass part, which an integral action feeds back, and its length in rows.
 SLOW_FORGETTING, SLOW_MEMORY_ROWS = 0.1, 100
 RIDGE_SHARE = 1e-10
 
@@ -77,8 +78,8 @@ class FeedbackTest:
     bias
         Largest bias of a parameter by the feedback, in its standard errors; None if it is not known.
     same_row
-        Statistic of the correlation between the innovations of input and output in the same row over its limit (99.5
-        %), with the sign of the correlation: a controller that acts within the row, or direct feedthrough.
+        Correlation between the innovations of input and output in the same row, relative to its 99.5 % limit, with its
+        sign. Feedback within the row and direct feedthrough both cause it.
     response
         Part of the input that past residuals explain, one array per run in the unit of the input; empty unless found.
     """
@@ -98,7 +99,7 @@ class FeedbackTest:
         return self.state == "found"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         figures = {"ratio": self.ratio, "share": self.share, "rows": self.rows, "bias": self.bias}
         return {"state": self.state, "reason": self.reason, "has_feedback": self.has_feedback, **figures}
 
@@ -183,7 +184,7 @@ def feedback_test(
 
 
 def _fill_missing(residuals: Floats) -> Floats:
-    """Residuals with their mean at missing samples, which costs power alone."""
+    """Return residuals with their mean at missing samples, which only reduces the power of the test."""
     gone = np.isnan(residuals)
     return np.where(gone, np.mean(residuals[~gone]), residuals) if gone.any() and not gone.all() else residuals
 
@@ -212,13 +213,13 @@ def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
 
 
 def _line_regressors(u: Floats) -> list[Floats]:
-    """Cosines and sines of the spectral lines of an input, whose memory exceeds any number of lags."""
+    """Return cosines and sines of the spectral lines of an input, which no number of lags can predict."""
     count = u.size
     size = 1 << math.ceil(math.log2(8 * count))
     window, time, x = np.hanning(count - 1), np.arange(count), u - u.mean()
     columns: list[Floats] = []
     for _ in range(min(MAX_LINES, count // 60)):
-        # Of differences, because the slow part of a random walk stands out like a line, and is none.
+        # Spectrum of differences: the slow part of a random walk would look like a line.
         power = np.abs(np.fft.rfft(np.diff(x) * window, size)) ** 2
         power[:16] = 0
         at = int(np.argmax(power))

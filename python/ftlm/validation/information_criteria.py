@@ -40,7 +40,7 @@ class InformationCriteria:
     bic: float
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         shown = {n: finite(getattr(self, n)) for n in ("log_likelihood", "aic", "aicc", "bic")}
         return {"parameters": self.parameters, "samples": self.samples, **shown}
 
@@ -80,7 +80,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     given = whole_number(parameters)
     if given is None or given < 0:
         raise ModelError(
-            f"{setting('parameters')} {parameters!r} is no number of parameters; give a whole number, at least 0"
+            f"{setting('parameters')} {parameters!r} is not a number of parameters; give a whole number, at least 0"
         )
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())

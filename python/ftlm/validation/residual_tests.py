@@ -42,17 +42,17 @@ from ftlm.validation.feedback import FeedbackTest, feedback_test
 ORDER_TOLERANCE = 1e-9
 #: Ratio of residual RMS to the output's standard deviation below which discretization or quantization explains it.
 NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
-#: Velocity of a simulation, relative to the largest, below which an output stands still.
-REST_SHARE = 0.01
-#: Slope of the smooth step that stands for the sign of a measured speed, relative to the largest speed.
-SIGN_SLOPE = 100.0
-#: Singular values of sensitivities, relative to the largest, below which they are rounding.
-DIRECTION_RANK = 1e-10
+#: Simulated velocity, relative to the largest one, below which an output counts as at rest.
+MAX_REST_VELOCITY_RATIO = 0.01
+#: Slope at 0 of the tanh that replaces the sign of a measured velocity, times the largest velocity.
+SIGN_TANH_SLOPE = 100.0
+#: Singular values of sensitivities, relative to the largest one, below which they count as rounding errors.
+SENSITIVITY_RANK_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
 class CorrelationTest:
-    """Correlations of residuals, and a test whether they could be chance.
+    """Correlations of residuals, and a test whether they are significant.
 
     Parameters
     ----------
@@ -68,10 +68,10 @@ class CorrelationTest:
     passed
         Whether the test is conclusive and the statistic within its limit; False if the residuals are not finite.
     conclusive
-        Whether the test could fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant;
-        then the test has neither passed nor failed.
+        Whether the test could fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant.
+        Then it has neither passed nor failed.
     first
-        Smallest lag tested: 1 for an input that is correlated within the sample alone, otherwise 0.
+        Smallest tested lag: 1 if only the correlation at lag 0 exceeds the limit, otherwise 0.
     """
 
     lags: NDArray[np.int64]
@@ -106,7 +106,7 @@ class CorrelationTest:
         return int(self.lags[at]), float(self.values[at])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "lags": self.lags.tolist(),
             "values": list(map(finite, self.values.tolist())),
@@ -123,22 +123,22 @@ class OutputResiduals:
     Parameters
     ----------
     residuals
-        Measured minus simulated samples, one array per run, without its first and last sample; SI units. NaN at
-        missing samples.
+        Measured minus simulated samples in SI units, one array per run, without the first and last sample of the run.
+        NaN at missing samples.
     rms
-        Their root mean square over all runs.
+        Root mean square of the residuals over all runs.
     nr
-        The same divided by the output's standard deviation.
+        ``rms`` divided by the standard deviation of the output.
     whiteness
-        Autocorrelations.
+        Test of the autocorrelations.
     inputs
-        Cross-correlations with each input, both signals through the whitening filter of the residuals.
+        Test of the cross-correlations with each input. Both signals pass the whitening filter of the residuals.
     feedback_tests
-        Feedback test of each input of its equation.
+        Feedback test of each input of the equation.
     direction
-        Cross-correlation with the direction of the simulated motion; None for equations with friction.
+        Test of the cross-correlations with the sign of the simulated velocity; None for equations with friction.
     friction
-        Term of dry friction of the output.
+        Term of dry friction to add to the equation.
     """
 
     residuals: list[Floats]
@@ -152,17 +152,17 @@ class OutputResiduals:
 
     @property
     def follows_direction(self) -> bool:
-        """Whether residuals depend on the direction of motion, and nothing else explains it."""
+        """Whether residuals depend on the direction of motion, but not on an input, and no feedback was found."""
         return self.direction is not None and self.direction.failed and self.is_noise and not self.feedback
 
     @property
     def feedback(self) -> tuple[str, ...]:
-        """Inputs with feedback from this output: the runs were recorded in a closed loop."""
+        """Inputs that depend on past values of this output, as in a closed loop."""
         return tuple(name for name, test in self.feedback_tests.items() if test.has_feedback)
 
     @property
-    def fails_colored(self) -> bool:
-        """Whether finite residuals follow an input and are not white."""
+    def has_colored_correlation(self) -> bool:
+        """Whether the residuals are finite, not white, and correlated with an input."""
         return math.isfinite(self.rms) and not self.whiteness.passed and any(t.failed for t in self.inputs.values())
 
     @property
@@ -176,7 +176,7 @@ class OutputResiduals:
         return {n: t for n, t in self.inputs.items() if t.conclusive or not math.isnan(t.limit)} or self.inputs
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "rms": finite(self.rms),
             "nr": finite(self.nr),
@@ -194,7 +194,7 @@ class Residuals:
     Parameters
     ----------
     outputs
-        By output.
+        Residuals and tests by output.
     runs
         Names of the runs.
     step
@@ -260,7 +260,7 @@ class Residuals:
         return "passed" if self.passed else "FAILED" if self.conclusive else "undecided"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return a dictionary for JSON."""
         return {
             "passed": self.passed,
             "conclusive": self.conclusive,
@@ -312,7 +312,7 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     Returns
     -------
     Residuals
-        ``.all_passed`` covers both tests; prints as a table.
+        Its attribute ``passed`` covers both tests; it prints as a table.
 
     Raises
     ------
@@ -323,25 +323,25 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
 
     Notes
     -----
-    Whiteness: the 99 % band of one autocorrelation of white noise is 2.576/√N; the verdict is the sum over all
-    lags of (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)² against the 99 % quantile of χ² (Lobato, Nankervis and Savin,
-    doi:10.1111/1468-2354.00106), so that noise may change its size within a run. Independence: residuals and input pass
-    the filter that makes the residuals white, an autoregression of least Bayesian information criterion; raw
-    correlations of two slow signals are so wide by chance that a missing dead time hides in them (Box and Jenkins,
-    chapter 11). The filter is causal, so an input that follows the residuals stays later than they are. The variance of
-    one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), taken no smaller than for
-    white residuals, nor than the mean of Σ eₜ² uₜ₋ₖ² over all lags, which noise that grows with the input widens; the
-    verdict is the largest correlation at lags >= 0 against the band that holds for all of them together with 99 %
-    (Šidák). Where the model has no feedthrough and lag 0 alone is outside, the input answers within
-    a sample or feeds through, and the verdict is that of the other lags. Loops: see :class:`ftlm.FeedbackTest`.
-    A test with a limit above 1, or with a constant input, is inconclusive. Both tests use the
-    simulation: white equation errors prove nothing.
+    Whiteness: the statistic is the sum over all lags k of (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)², its limit the 99 % quantile of
+    χ² (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). The variance of the noise may change within a run.
+    The 99 % band of one autocorrelation of white noise is ±2.576/√N.
+
+    Independence: residuals and input pass the filter that whitens the residuals, an autoregression whose order
+    minimizes the Bayesian information criterion. Without it, chance correlations of two slow signals hide a missing
+    dead time (Box and Jenkins, chapter 11). The statistic is the largest correlation at lags >= 0, its limit the
+    simultaneous 99 % band of all of them (Šidák). The variance of one correlation of independent signals is Bartlett's
+    Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), but at least that for white residuals, and at least the mean of Σ eₜ² uₜ₋ₖ²
+    over all lags, which allows for noise that grows with the input. If the model has no feedthrough and only lag 0 is
+    outside, feedback or feedthrough within one sample explains it, and the other lags decide.
+
+    A test with a limit above 1 or with a constant input is inconclusive. Feedback: see :class:`ftlm.FeedbackTest`.
     """
     check_model(model)
     several = as_runs(runs)
     count = whole_number(lags)
     if count is None or count < 1:
-        raise ModelError(f"{setting('lags')} {lags!r} is no number of lags; give a whole number, at least 1")
+        raise ModelError(f"{setting('lags')} {lags!r} is not a number of lags; give a whole number, at least 1")
     check_run_lengths(several, count)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
@@ -368,8 +368,8 @@ def run_residual_tests(
 ) -> Residuals:
     """Run both tests on the residuals of simulations at the inner samples of these runs.
 
-    ``sensitivities`` returns those of each output to the fitted parameters, per run with shape (parameters, samples).
-    It is called where colored residuals follow an input.
+    ``sensitivities`` returns, by output, the sensitivities to the fitted parameters, one array per run with shape
+    (parameters, samples). It is called only if colored residuals are correlated with an input.
     """
     check_run_lengths(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
@@ -397,7 +397,7 @@ def run_residual_tests(
             row = model.outputs.index(name)
             moves = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
             outputs[name] = _test_direction(outputs[name], name, moves, lags, item.order.constant)
-        if sensitivities is not None and outputs[name].fails_colored:
+        if sensitivities is not None and outputs[name].has_colored_correlation:
             outputs[name] = _test_beyond_parameters(outputs[name], sensitivities().get(name, []), signals, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
@@ -414,7 +414,7 @@ def _test_output(
 ) -> OutputResiduals:
     """Run all tests of one output without its missing samples; they fail if residuals are not finite.
 
-    ``commands`` maps each input of its equation to whether the model has direct feedthrough from it.
+    ``commands`` states for each input of the equation whether the model has direct feedthrough from it.
     """
     everything = np.concatenate([e[~gone] for e, gone in zip(series, gaps, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -436,7 +436,7 @@ def _test_output(
         noise = NoiseModel.fit(series, values, lags)
         inputs[name] = _independence(series, values, noise, lags, first=0)
         if inputs[name].failed and not commands.get(name, True):
-            # What answers within the sample is no sign of what the model lacks.
+            # A correlation at lag 0 alone is feedback or feedthrough within the sample, not missing dynamics.
             later = _independence(series, values, noise, lags, first=1)
             inputs[name] = later if later.passed else inputs[name]
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
@@ -445,13 +445,13 @@ def _test_output(
 def _test_direction(
     output: OutputResiduals, name: str, velocities: Sequence[Floats], lags: int, order: float
 ) -> OutputResiduals:
-    """Test whether residuals depend on the sign of a simulated velocity, as those of a model without friction do."""
+    """Test whether residuals depend on the sign of a simulated velocity, as they do if dry friction is missing."""
     largest = max(float(np.max(np.abs(v))) for v in velocities)
     if not 0.0 < largest < math.inf:
         return output
-    signs = [np.where(np.abs(v) > REST_SHARE * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
+    signs = [np.where(np.abs(v) > MAX_REST_VELOCITY_RATIO * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
     test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
-    term = f"- fc*sign(D {name})" if order > 1.0 else f"- fc*tanh({SIGN_SLOPE / largest:.2g} {name})"
+    term = f"- fc*sign(D {name})" if order > 1.0 else f"- fc*tanh({SIGN_TANH_SLOPE / largest:.2g} {name})"
     return replace(output, direction=test, friction=term)
 
 
@@ -461,10 +461,10 @@ def _test_beyond_parameters(
     signals: Mapping[str, list[Floats]],
     lags: int,
 ) -> OutputResiduals:
-    """Return the tests, with a failure turned into a pass if errors of the parameters explain it.
+    """Return the tests, where failures that errors of the parameters explain are passed.
 
     Least squares ignores the color of the noise, so errors of the parameters alone can correlate residuals with an
-    input. One generalized least-squares step removes that part.
+    input. One generalized least-squares step removes that part of the residuals.
     """
     inputs = dict(output.inputs)
     for name, test in output.inputs.items():
@@ -482,7 +482,7 @@ def _failed_test(lags: NDArray[np.int64]) -> CorrelationTest:
 
 
 def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
-    """Test of whiteness that allows for noise of any size at any time."""
+    """Test the residuals for whiteness; the variance of the noise may change within a run."""
     limit = chi_squared_99(lags)
     own, statistic = autocorrelations(series, lags)[0], portmanteau(series, lags)
     band = NORMAL_99 / math.sqrt(count)
@@ -491,18 +491,18 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """AR noise model of residuals, less their response to an input.
+    """AR noise model of residuals without their response to an input.
 
     Parameters
     ----------
     filter
-        Whitening filter.
+        Whitening filter: coefficients 1, a₁, …, aₙ.
     start
-        First row of the innovations.
+        Row of the first innovation.
     innovations
-        White noise that drives the residuals, per run.
+        Innovations of the noise, one array per run.
     inflation
-        Ratio of its variance to the mean square of the innovations, which the fit of the coefficients made smaller.
+        Correction of the mean square of the innovations for the fitted coefficients: rows / (rows - coefficients).
     """
 
     filter: Floats
@@ -512,9 +512,9 @@ class NoiseModel:
 
     @classmethod
     def fit(cls, series: list[Floats], signal: list[Floats], lags: int) -> NoiseModel:
-        """Fit an ARX model to residuals and one input; keep its noise part.
+        """Fit an ARX model to residuals and one input, and return its noise part.
 
-        An AR model of the residuals alone would take the response to a periodic or slow input for noise, and mask it.
+        An AR model of the residuals alone would include the response to a periodic or slow input, and so hide it.
         Responses to other inputs count as noise.
         """
         through, start, innovations, parameters = _core.arx_model(series, [signal], lags)
@@ -529,7 +529,8 @@ class NoiseModel:
     def subtract(self, series: list[Floats], directions: Sequence[Floats]) -> list[Floats]:
         """Return series without their projection onto directions, by generalized least squares.
 
-        ``directions`` has one array for each series, shape (directions, samples); others change nothing.
+        ``directions`` has one array per series, shape (directions, samples). If the numbers of samples differ, the
+        series are returned unchanged.
         """
         if [rows.shape[1] for rows in directions] != [e.size for e in series]:
             return series
@@ -537,22 +538,23 @@ class NoiseModel:
         columns = [np.concatenate(self.whiten(list(rows))) for rows in zip(*there, strict=True)]
         if not columns:
             return series
-        amounts = minimum_norm_solution(np.stack(columns, axis=1), np.concatenate(self.whiten(series)), DIRECTION_RANK)
+        measured = np.concatenate(self.whiten(series))
+        amounts = minimum_norm_solution(np.stack(columns, axis=1), measured, SENSITIVITY_RANK_TOLERANCE)
         return [e - amounts @ rows for e, rows in zip(series, directions, strict=True)]
 
 
 def _independence(
     series: list[Floats], signal: list[Floats], noise: NoiseModel, lags: int, *, first: int
 ) -> CorrelationTest:
-    """Largest correlation at lags from ``first`` on, against a simultaneous band for all of them."""
+    """Test the largest correlation at lags from ``first`` on against the simultaneous band of all of them."""
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
         return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, conclusive=False)
-    # Through this filter the noise is white, and the inputs lose what they share with it by chance alone.
+    # Whitening the noise makes chance correlations with a slow input small.
     white, through = noise.whiten(series), noise.whiten(signal)
     cross, _, _ = _core.correlation(white, through, lags)
     _, variance, _ = _core.correlation(noise.innovations, through, lags)
-    # Noise that is larger where the input moves widens correlations as its color does.
+    # Noise that is larger where the input is larger has a wider band, as colored noise has.
     variance = max(variance, _product_variance(noise.innovations, through, lags))
     power, driven = (sum(dot(row, row) for row in rows) for rows in (white, noise.innovations))
     share = noise.inflation * driven / power if power > 0.0 else 1.0
@@ -565,7 +567,7 @@ def _independence(
 
 
 def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> float:
-    """Mean variance of the correlations at lags from 0, from the squares of their own products."""
+    """Return the mean variance of the correlations at lags >= 0, from the squared products of both signals."""
     powers = [(e * e, v * v) for e, v in zip(white, (v - v.mean() for v in signal), strict=True)]
     total = sum(float(e.sum()) for e, _ in powers) * sum(float(v.sum()) for _, v in powers)
     each = [sum(dot(e[k:], v[: e.size - k]) for e, v in powers if e.size > k) for k in range(lags + 1)]
@@ -573,7 +575,7 @@ def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> f
 
 
 def failed_tests(tests: Residuals) -> list[Finding]:
-    """Return every failed test, and detected feedback, as findings."""
+    """Return findings on failed and undecided tests, and on detected feedback."""
     found = []
     for name, output in tests.outputs.items():
         if not math.isfinite(output.rms):
@@ -603,13 +605,13 @@ def failed_tests(tests: Residuals) -> list[Finding]:
 
 
 def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding:
-    """Return feedback found in residuals, with its consequence for the estimates."""
+    """Return a finding on detected feedback, with its effect on the estimates."""
     test = output.feedback_tests[signal]
     numbers = {"ratio": test.ratio, "share": 100 * test.share}
     if test.bias is None:
-        # Without a joint fit the color decides: white noise does not come back into an output error.
+        # Without a joint fit the bias is not known. Feedback of white noise hardly biases output-error estimates.
         code = "loop_harmless" if output.whiteness.passed else "loop_found"
-        effect = " little" if output.whiteness.passed else ""
+        effect = " slightly" if output.whiteness.passed else ""
         return make_finding(code, output=name, input=signal, effect=effect, **numbers)
     effect = f" by up to {test.bias:.2g} of their standard errors"
     return make_finding(
@@ -623,20 +625,20 @@ def residual_findings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RA
 
 
 def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
-    """Return every residual test with its statistic and limit."""
+    """Return a table of the residual tests with statistic, limit and verdict."""
     rows: list[list[Cell]] = []
     for name, output in tests.outputs.items():
         judged = [(Markup("whiteness"), output.whiteness)]
         judged += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
         rows += [[symbol_html(name), what, t.statistic, t.limit, t.verdict] for what, t in judged]
     note = (
-        "Whiteness: sum over all lags. Independence: largest correlation at lags from 0 on, residual and "
-        "input through the filter that whitens the residual. One true model in a hundred fails each. Undecided: the "
-        "test could not have failed."
+        "Whiteness: statistic over all lags. Independence: largest correlation at lags >= 0 after residual and input "
+        "pass the filter that whitens the residual. A true model fails each test in 1 % of cases. Undecided: the test "
+        "could not have failed."
     )
     return Table(title, ("output", "test", "statistic", "limit (99 %)", "verdict"), rows, note=note)
 
 
 def residuals_html(tests: Residuals) -> str:
-    """Return every residual test with its verdict."""
+    """Return the table of residual tests as HTML."""
     return str(residual_table(tests, title=f"Residual tests: {', '.join(tests.runs)}").to_html())

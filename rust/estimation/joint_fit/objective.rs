@@ -104,7 +104,7 @@ impl<'a> Objective<'a> {
         Self { experiments: Arc::new(experiments), ..self.clone() }
     }
 
-    /// Objective on half the step.
+    /// Objective on a grid with half the step.
     ///
     /// # Errors
     /// As the source.
@@ -131,7 +131,7 @@ impl<'a> Objective<'a> {
         &self.experiments
     }
 
-    /// Source of the runs.
+    /// Recordings from which the runs were sampled.
     #[must_use]
     pub fn source(&self) -> &'a Recordings {
         self.source

@@ -137,7 +137,9 @@ fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
     .collect()
 }
 
-/// Candidate with all autoregressive coefficients negative, which is stable up to order 2, and the changed indices.
+/// Candidate with all autoregressive coefficients negative, and the indices of the changed coefficients.
+///
+/// It is stable up to order 2.
 ///
 /// The changed coefficients are first kept fixed while the others adapt, because the input coefficients still belong to
 /// the unstable optimum.
@@ -155,7 +157,9 @@ pub fn dissipative_candidate(free: &ParameterSet, runner: &Candidate) -> (Candid
     (candidate_at(runner, place, "all own terms pulling back"), turned)
 }
 
-/// Candidates with one autoregressive coefficient at 0 each, which is first kept fixed while the others adapt.
+/// One candidate per autoregressive coefficient, with that coefficient at 0, and the index of the coefficient.
+///
+/// The coefficient is first kept fixed while the others adapt. Empty if there is only one.
 #[must_use]
 pub fn candidates_without_term(free: &ParameterSet, runner: &Candidate) -> Vec<(Candidate, Vec<usize>)> {
     let places = autoregressive_indices(free);

@@ -250,7 +250,7 @@ fn step_within_bounds(
 /// use ftlm::regressors::Record;
 /// // D^a y = c u with the truth a = 0.8, c = 3.
 /// let input: Vec<f64> = (0..100).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
-/// let run = Record::new(0.05, PulseMeans::from_rows(vec![vec![0.0; 100], input]), None)?;
+/// let run = Record::new(0.05, PulseMeans::from_signals(vec![vec![0.0; 100], input]), None)?;
 /// let output: Vec<f64> = run.integral(1, 0.8).iter().map(|v| 3.0 * v).collect();
 /// let experiment = Experiment::new(run, 1, vec![point_samples(&output)], vec![1.0])?;
 /// let model = FreeModel {

@@ -46,9 +46,9 @@ use crate::regressors::Record;
 /// # use ftlm::order_search::batches::search;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
 /// // y is the integral of order 0.8 of u: D^0.8 y = u.
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
 /// let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
 /// let found = search(&[record], &lattice, &[None], &Options::default(), &Control::default())?;
@@ -179,8 +179,8 @@ impl<'a> BatchEvaluator<'a> {
     /// # use ftlm::parallel::pool;
     /// # use ftlm::regressors::Record;
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-    /// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
-    /// # let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+    /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
+    /// # let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
     /// # let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
     /// # let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
     /// let (options, control, pool) = (Options::default(), Control::default(), pool(1)?);

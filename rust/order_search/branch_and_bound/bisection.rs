@@ -250,11 +250,11 @@ fn inverse_correlation(columns: &[usize], product: impl Fn(usize, usize) -> f64)
 pub struct BoxBound {
     /// The candidates `first + i·stride + j`, i below `rows` and j below `values`.
     pub first: u64,
-    /// See `first`.
+    /// Number of rows i.
     pub rows: u64,
-    /// See `first`.
+    /// Number of candidates j in a row.
     pub values: u64,
-    /// See `first`.
+    /// Difference of the indices of two rows.
     pub stride: u64,
     /// Lower bound of the raw errors Σ|e| or Σe² of all candidates. Initial conditions are zero.
     pub bound: f64,
@@ -276,8 +276,8 @@ pub struct BoxBound {
 /// # use ftlm::order_search::options::Options;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
 /// let lattice = OrderGrid::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
 /// let boxes = box_bounds(&[record], &lattice, &Options::default(), 0)?;

@@ -71,9 +71,9 @@ pub struct Certificate {
 /// # use ftlm::order_search::control::Control;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output: Vec<f64> = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.83);
+/// # let output: Vec<f64> = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.83);
 /// # let output = output.iter().enumerate().map(|(k, y)| y + 0.01 * f64::from((k * k % 7) as u32)).collect();
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// // y is nearly the integral of order 0.83 of u.
 /// let region = Region {
 ///     output: 0,

@@ -211,8 +211,8 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
 /// # use ftlm::order_search::certificate::cell_bounds;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// // y is the integral of order 0.8 of u: that order leaves nothing, orders near 0.5 leave something.
 /// let proved = |middle: f64| cell_bounds(&[record.clone()], 0, &[(1, middle, 0.01)], (10.0, 1.0));
 /// assert!(proved(0.8)? == (0.0, 0.0) && proved(0.5)?.0 > 0.0 && proved(0.5)?.1 > 0.0);

@@ -31,8 +31,8 @@ use crate::simd::LANE_COUNT;
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|.
 /// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };
@@ -64,8 +64,8 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// // y is the integral of order 0.8 of u: free coefficients fit it, a fixed one twice as large does not.
 /// assert!(!is_infeasible(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
@@ -99,8 +99,8 @@ pub fn is_infeasible(
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|, three times by 2Σ|y|.
 /// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };

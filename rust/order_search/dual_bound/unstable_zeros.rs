@@ -45,7 +45,7 @@ const MAX_RECORD_SAMPLES: usize = 1 << 14;
 /// # use ftlm::order_search::options::Norm;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..256).map(|k| if k % 64 < 32 { 1.0 } else { -0.5 }).collect();
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![vec![0.0; 256], input]), None)?;
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![vec![0.0; 256], input]), None)?;
 /// // D y = c y + u grows as exp(c t) for 25.6 time units, or decays.
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let structure = Structure { output: 0, order: 1.0, terms };

@@ -378,12 +378,12 @@ impl SearchState {
 /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 0.8);
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
 /// # let derived: Vec<f64> = input.clone();
-/// # let input = Record::new(0.1, PulseMeans::from_rows(vec![derived]), None)?.integral(0, 0.7);
-/// # let output = Record::new(0.1, PulseMeans::from_rows(vec![input.clone()]), None)?.integral(0, 1.0);
+/// # let input = Record::new(0.1, PulseMeans::from_signals(vec![derived]), None)?.integral(0, 0.7);
+/// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 1.0);
 /// // D^α y = D^{α−1} u for any α: y is the integral of u.
-/// let record = Record::new(0.1, PulseMeans::from_rows(vec![output, input]), None)?;
+/// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let lattice = OrderLawGrid::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
 /// let fixed = [vec![None]];
 /// let found = search(&[record], &lattice, &fixed, &[1.0], &Options::default(), &Control::default())?;

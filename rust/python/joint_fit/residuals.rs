@@ -16,7 +16,7 @@ fn copy_vectors(name: &str, arrays: &[PyReadonlyArray1<'_, f64>]) -> PyResult<Ve
     arrays.iter().map(|array| copy_vector(name, array)).collect()
 }
 
-/// Covariance from a Jacobian (a row a parameter), residuals by run and output, and their sum of squares.
+/// Covariance from a Jacobian (one row per parameter), residuals by run and output, and their sum of squares.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn covariance_of<'py>(
