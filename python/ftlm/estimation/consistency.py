@@ -21,11 +21,11 @@ from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, format_bound
+from ftlm.utils.formatting import Cell, finite, format_bound
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
 from ftlm.utils.validation import Floats, whole_number
-from ftlm.validation.comparison import compare, finite
+from ftlm.validation.comparison import compare
 
 #: Default number of segments of one run.
 DEFAULT_SEGMENTS = 2

@@ -21,11 +21,11 @@ from ftlm.order_search.result import SearchResult
 from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import format_bound
+from ftlm.utils.formatting import finite, format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_threads
-from ftlm.validation.comparison import Comparison, Metrics, filter_state, finite
+from ftlm.validation.comparison import Comparison, Metrics, filter_state
 from ftlm.validation.information_criteria import InformationCriteria
 from ftlm.validation.residual_tests import Residuals, resid
 

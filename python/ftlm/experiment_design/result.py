@@ -15,10 +15,9 @@ from ftlm.experiment_design.problem import Kind
 from ftlm.experiment_design.spectrum import Spectrum
 from ftlm.findings import Finding, texts
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import format_bound
+from ftlm.utils.formatting import finite, format_bound
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import finite
 
 #: A limit counts as active from this fraction of it on.
 ACTIVE_LIMIT_FRACTION = 0.98

@@ -206,29 +206,7 @@ def identification_page(
     validation: Run | Sequence[Run] | None = None,
     force: bool = False,
 ) -> Path:
-    """Write the HTML report of one identification.
-
-    Parameters
-    ----------
-    result
-        From :func:`ftlm.identify`.
-    path
-        File to write.
-    validation
-        Runs that the model was not identified from.
-    force
-        Overwrite an existing file.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be written.
-    """
+    """Write the HTML report of one identification; see :meth:`ftlm.Identification.report`."""
     check_free(path, force=force)
     model = result.model
     others = [] if validation is None else as_runs(validation)
@@ -574,25 +552,7 @@ def identification_html(result: Identification) -> str:
 def model_page(
     model: Model, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
-    """Write the HTML report of a saved model: identification results from its file, and validation runs.
-
-    Parameters
-    ----------
-    model
-        From :func:`ftlm.load_model`.
-    path, validation, force
-        See :func:`identification_page`.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        See :func:`identification_page`.
-    """
+    """Write the HTML report of a saved model: identification results from its file, and validation runs."""
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)
     known = model.estimate

@@ -27,11 +27,11 @@ from ftlm.structure.structure import Structure
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, symbol_html
+from ftlm.utils.formatting import Cell, Exact, finite, format_bound, json_value, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, join_names
-from ftlm.validation.comparison import Comparison, finite, json_value
+from ftlm.validation.comparison import Comparison
 
 #: Free orders of each structure; the other orders are integer.
 INTEGER_KIND = "whole orders"
@@ -559,26 +559,9 @@ def _method_section(found: UnseenOrders) -> Section:
 
 
 def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write charts, verdicts and numbers as one HTML page.
+    """Write the result of :func:`orders_on_unseen_runs` as one HTML page with charts, verdicts and numbers.
 
-    Parameters
-    ----------
-    found
-        From :func:`orders_on_unseen_runs`.
-    path
-        File to write.
-    force
-        Overwrite.
-
-    Returns
-    -------
-    pathlib.Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        The file exists and ``force`` is not set, or cannot be written.
+    Arguments and errors are those of :meth:`ftlm.Identification.report`.
     """
     check_free(path, force=force)
     each = {kind: [_verdict(o, d.verdict(kind)) for o, d in found.deflections.items()] for kind in VERDICT_SUBJECTS}

@@ -31,9 +31,9 @@ from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
-from ftlm.utils.formatting import Exact
+from ftlm.utils.formatting import Exact, attributes, finite
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Metrics, attributes, compare_means, finite, metrics
+from ftlm.validation.comparison import Metrics, compare_means, metrics
 
 #: The paper's p, its number of block pulses, and its four angles in the order n = 1 … 4.
 INNOVATION_LENGTHS = COMPARED_INNOVATION_LENGTHS

@@ -285,24 +285,6 @@ class ReportMixin(ABC):
         """Content of the report."""
 
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the result as one HTML file that opens offline.
-
-        Parameters
-        ----------
-        path
-            File to write.
-        force
-            Overwrite an existing file.
-
-        Returns
-        -------
-        pathlib.Path
-            The file.
-
-        Raises
-        ------
-        DataError
-            The file exists and ``force`` is not set, or cannot be written.
-        """
+        """Write the result as one HTML file; arguments and errors as in :meth:`ftlm.Identification.report`."""
         page = self._page()
         return write_page(path, title=page.title, sections=page.sections, lead=page.lead, force=force)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields, is_dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -39,31 +39,8 @@ from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, Exact, symbol_html
+from ftlm.utils.formatting import Cell, Exact, finite, symbol_html
 from ftlm.utils.validation import Floats, as_floats
-
-
-def finite(value: float) -> float | None:
-    """Return a float for JSON, or None if it is not finite."""
-    return float(value) if math.isfinite(value) else None
-
-
-def attributes(value: object, names: Iterable[str]) -> dict[str, Any]:
-    """Return some attributes of an object for JSON."""
-    return {name: json_value(getattr(value, name)) for name in names}
-
-
-def json_value(value: Any) -> Any:
-    """Return a value for JSON: mappings, sequences, and dataclasses by their fields. Infinity is None."""
-    if isinstance(value, Mapping):
-        return {f"{k:g}" if isinstance(k, float) else str(k): json_value(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_value(each) for each in value]
-    if hasattr(value, "to_dict"):
-        return value.to_dict()
-    if is_dataclass(value):
-        return attributes(value, [each.name for each in fields(value)])
-    return finite(value) if isinstance(value, float) else value
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,9 @@ from ftlm.data.sampling import drop_missing
 from ftlm.errors import ModelError
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, Exact
+from ftlm.utils.formatting import Cell, Exact, finite
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import whole_number
-from ftlm.validation.comparison import finite
 from ftlm.validation.residual_tests import Residuals
 
 

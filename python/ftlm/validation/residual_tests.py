@@ -22,7 +22,7 @@ from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, symbol_html
+from ftlm.utils.formatting import Cell, finite, symbol_html
 from ftlm.utils.linalg import dot, minimum_norm_solution
 from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
@@ -35,7 +35,7 @@ from ftlm.utils.statistics import (
     whiten_series,
 )
 from ftlm.utils.validation import Floats, whole_number
-from ftlm.validation.comparison import finite, simulate_runs
+from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import FeedbackTest, feedback_test
 
 #: Difference below which two orders count as equal.
@@ -137,8 +137,8 @@ class OutputResiduals:
         Feedback test of each input of its equation.
     direction
         Cross-correlation with the direction of the simulated motion; None for equations with friction.
-    friction
-        Term of dry friction of the output.
+    sign_slope
+        Slope of tanh in the friction term of the output; infinite for sign(D y), the term of an order above 1.
     """
 
     residuals: list[Floats]
@@ -148,7 +148,7 @@ class OutputResiduals:
     inputs: dict[str, CorrelationTest]
     feedback_tests: dict[str, FeedbackTest] = field(default_factory=dict)
     direction: CorrelationTest | None = None
-    friction: str = ""
+    sign_slope: float = math.inf
 
     @property
     def follows_direction(self) -> bool:
@@ -396,7 +396,7 @@ def run_residual_tests(
         if item.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
             row = model.outputs.index(name)
             moves = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
-            outputs[name] = _test_direction(outputs[name], name, moves, lags, item.order.constant)
+            outputs[name] = _test_direction(outputs[name], moves, lags, item.order.constant)
         if sensitivities is not None and outputs[name].fails_colored:
             outputs[name] = _test_beyond_parameters(outputs[name], sensitivities().get(name, []), signals, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
@@ -442,17 +442,14 @@ def _test_output(
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
 
-def _test_direction(
-    output: OutputResiduals, name: str, velocities: Sequence[Floats], lags: int, order: float
-) -> OutputResiduals:
+def _test_direction(output: OutputResiduals, velocities: Sequence[Floats], lags: int, order: float) -> OutputResiduals:
     """Test whether residuals depend on the sign of a simulated velocity, as those of a model without friction do."""
     largest = max(float(np.max(np.abs(v))) for v in velocities)
     if not 0.0 < largest < math.inf:
         return output
     signs = [np.where(np.abs(v) > REST_SHARE * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
     test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
-    term = f"- fc*sign(D {name})" if order > 1.0 else f"- fc*tanh({SIGN_SLOPE / largest:.2g} {name})"
-    return replace(output, direction=test, friction=term)
+    return replace(output, direction=test, sign_slope=math.inf if order > 1.0 else SIGN_SLOPE / largest)
 
 
 def _test_beyond_parameters(
@@ -597,7 +594,9 @@ def failed_tests(tests: Residuals) -> list[Finding]:
                 found.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
         if output.follows_direction and output.direction is not None:
             numbers = {"value": output.direction.largest[1], "limit": output.direction.limit}
-            found.append(make_finding("residuals_follow_direction", output=name, term=output.friction, **numbers))
+            slope = output.sign_slope
+            term = f"- fc*sign(D {name})" if math.isinf(slope) else f"- fc*tanh({slope:.2g} {name})"
+            found.append(make_finding("residuals_follow_direction", output=name, term=term, **numbers))
         found += [feedback_finding(name, signal, output) for signal in output.feedback]
     return found
 
