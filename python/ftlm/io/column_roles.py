@@ -30,7 +30,7 @@ class ColumnSelection:
 #: Words of column names by what they say of a column: voltage is an input of motors and an output of cells; a reference
 #: neither enters a plant nor leaves it; a command and its measurement differ in a word; degrees of temperature are no
 #: angles.
-_WORDS = {
+_WORDS_BY_ROLE = {
     kind: frozenset(words.split())
     for kind, words in {
         "input": "u in inp input eingang cmd command current strom torque drehmoment pwm duty drive force kraft power "
@@ -58,12 +58,14 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
 
     References are left out, and a command beside its own measurement, if the other columns have both roles.
     """
-    measured = {_tokens(c) - _WORDS["measurement"] for c in columns if _tokens(c) & _WORDS["measurement"]}
+    measured = {
+        _tokens(c) - _WORDS_BY_ROLE["measurement"] for c in columns if _tokens(c) & _WORDS_BY_ROLE["measurement"]
+    }
     plant = [
         c
         for c in columns
-        if not words_of(c) & _WORDS["reference"]
-        and not (_tokens(c) & _WORDS["command"] and _tokens(c) - _WORDS["command"] in measured)
+        if not words_of(c) & _WORDS_BY_ROLE["reference"]
+        and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in measured)
     ]
     found = _roles_by_words(plant)
     return found if found[0] else _roles_by_words(columns)
@@ -77,10 +79,16 @@ def _tokens(column: str) -> frozenset[str]:
 def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the columns whose names have words of inputs, and those with words of outputs."""
     told = {column: words_of(column) for column in columns}
-    drives = [c for c, words in told.items() if words & _WORDS["input"] and not words & _WORDS["output"]]
-    follows = [c for c, words in told.items() if words & _WORDS["output"] and not words & _WORDS["input"]]
+    drives = [
+        c for c, words in told.items() if words & _WORDS_BY_ROLE["input"] and not words & _WORDS_BY_ROLE["output"]
+    ]
+    follows = [
+        c for c, words in told.items() if words & _WORDS_BY_ROLE["output"] and not words & _WORDS_BY_ROLE["input"]
+    ]
     either = [
-        c for c, words in told.items() if words & _WORDS["input or output"] and c not in drives and c not in follows
+        c
+        for c, words in told.items()
+        if words & _WORDS_BY_ROLE["input or output"] and c not in drives and c not in follows
     ]
     if either and not drives:
         drives, either = either, []
@@ -96,7 +104,7 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
 def known_unit(stated: str, column: str = "") -> str:
     """Return the ftlm unit of a unit in a file; "" if unknown, or if degrees may mean a temperature."""
     unit = parse_unit(stated) or ""
-    return "" if unit in ("deg", "°") and words_of(column) & _WORDS["temperature"] else unit
+    return "" if unit in ("deg", "°") and words_of(column) & _WORDS_BY_ROLE["temperature"] else unit
 
 
 def signal_names(columns: Mapping[str, str]) -> dict[str, str]:

@@ -206,7 +206,15 @@ def identification_page(
     validation: Run | Sequence[Run] | None = None,
     force: bool = False,
 ) -> Path:
-    """Write the HTML report of one identification; see :meth:`ftlm.Identification.report`."""
+    """Write the HTML report of one identification.
+
+    Parameters
+    ----------
+    result
+        From :func:`ftlm.identify`.
+    path, validation, force
+        See :meth:`ftlm.Identification.report`.
+    """
     check_free(path, force=force)
     model = result.model
     others = [] if validation is None else as_runs(validation)
@@ -552,7 +560,15 @@ def identification_html(result: Identification) -> str:
 def model_page(
     model: Model, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
-    """Write the HTML report of a saved model: identification results from its file, and validation runs."""
+    """Write the HTML report of a saved model: identification results from its file, and validation runs.
+
+    Parameters
+    ----------
+    model
+        From :func:`ftlm.load_model`.
+    path, validation, force
+        See :meth:`ftlm.Identification.report`.
+    """
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)
     known = model.estimate

@@ -559,9 +559,14 @@ def _method_section(found: UnseenOrders) -> Section:
 
 
 def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the result of :func:`orders_on_unseen_runs` as one HTML page with charts, verdicts and numbers.
+    """Write charts, verdicts and numbers as one HTML page.
 
-    Arguments and errors are those of :meth:`ftlm.Identification.report`.
+    Parameters
+    ----------
+    found
+        From :func:`orders_on_unseen_runs`.
+    path, force
+        See :meth:`ftlm.Identification.report`.
     """
     check_free(path, force=force)
     each = {kind: [_verdict(o, d.verdict(kind)) for o, d in found.deflections.items()] for kind in VERDICT_SUBJECTS}
