@@ -51,17 +51,27 @@ def curve_frequencies(record: FrequencyData) -> Floats:
     return np.unique(np.concatenate([measured, between, smooth]))
 
 
+def _place_of(model: Model, record: FrequencyData) -> tuple[int, int]:
+    """Return the places of a record's output and input among those of the model."""
+    return model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
+
+
+def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats) -> Complex:
+    """Return the response of the model between the signals of a record."""
+    if isinstance(model, Circuit):
+        return model.impedance(omega)
+    response: Complex = frequency_response(model, omega)[_place_of(model, record)]
+    return response
+
+
 def model_curve(
     model: Model | Circuit, record: FrequencyData, omega: Floats
 ) -> tuple[Complex, Floats | None, Floats | None]:
     """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
-    if isinstance(model, Circuit):
-        return model.impedance(omega), None, None
-    at = model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
-    response = frequency_response(model, omega)[at]
-    if model.estimate is None or model.estimate.covariance is None:
+    response = model_response(model, record, omega)
+    if isinstance(model, Circuit) or model.estimate is None or model.estimate.covariance is None:
         return response, None, None
-    gain, phase = (part[at] for part in response_deviation(model, omega))
+    gain, phase = (part[_place_of(model, record)] for part in response_deviation(model, omega))
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
@@ -121,7 +131,7 @@ def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
 
 def nyquist_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Complex, Complex, str, str]:
     """Return the responses of the model and a record and both axis labels; impedances have -Im upwards."""
-    response, _, _ = model_curve(model, record, curve_frequencies(record))
+    response = model_response(model, record, curve_frequencies(record))
     unit = f" [{record.unit}]" if record.unit else ""
     if record.unit.endswith("Ω"):
         return response.conj(), record.response.conj(), f"Re Z{unit}", f"−Im Z{unit}"
@@ -145,7 +155,7 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> F
     """Return the chart of the residuals relative to the measured response, by frequency."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
-    response, _, _ = model_curve(model, record, omega)
+    response = model_response(model, record, omega)
     size = np.abs(record.response[order])
     missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
     return line_chart(
@@ -576,20 +586,12 @@ def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyDa
     return replace(record, output=out["output"], input=out["input"])
 
 
-def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats | None = None) -> Complex:
-    """Return the model response at the frequencies of a record, or at `omega`."""
-    if isinstance(model, Circuit):
-        return model.impedance(record.frequency if omega is None else omega)
-    response = frequency_response(model, record.frequency if omega is None else omega)
-    inputs = response_inputs(model, coupled=True)
-    values: Complex = response[model.outputs.index(record.output), inputs.index(record.input)]
-    return values
-
-
 def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
     """Return the error of a model on one record."""
     size = np.abs(record.response)
-    missed = np.abs(model_response(model, record) - record.response) / np.where(size > 0, size, np.max(size) or 1.0)
+    missed = np.abs(model_response(model, record, record.frequency) - record.response) / np.where(
+        size > 0, size, np.max(size) or 1.0
+    )
     at = int(np.argmax(missed))
     rms = 100 * float(np.sqrt(np.mean(missed**2)))
     return ResponseError(

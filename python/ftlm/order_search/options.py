@@ -91,8 +91,8 @@ class SearchSettings:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
-    def core_arguments(self, threads: int, memory: int | None = None) -> _core._Options:
-        """Return the settings as arguments of the core; the default memory limit is that of this machine."""
+    def core_arguments(self, threads: int) -> _core._Options:
+        """Return the settings as arguments of the core; the memory limit is that of this machine."""
         return {
             "criterion": self.criterion,
             "norm": self.norm,
@@ -103,7 +103,7 @@ class SearchSettings:
             "threads": threads,
             "pruning": self.pruning,
             "iterations": MAX_IV_ITERATIONS if self.coefficients == "instrumental-variables" else 0,
-            "memory": memory_limit() if memory is None else memory,
+            "memory": memory_limit(),
         }
 
     def to_dict(self) -> dict[str, Any]:

@@ -405,7 +405,7 @@ class StoreStatus:
         return text
 
 
-def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What became of the candidates") -> Table:
+def search_summary(searches: Mapping[str, SearchResult]) -> Table:
     """Return a table of kept and excluded candidates, by reason; together they are all candidates."""
     reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.exclusion_counts))
     rows: list[list[Cell]] = [
@@ -419,7 +419,7 @@ def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What b
         for name, s in searches.items()
     ]
     return Table(
-        title,
+        "What became of the candidates",
         ("search", "ranked by", "candidates", "kept", *reasons),
         rows,
         groups=(("", 4), ("left out", len(reasons))) if reasons else (),
@@ -435,7 +435,7 @@ def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What b
     )
 
 
-def search_top(name: str, search: SearchResult, *, rows: int = 10, title: str = "") -> Table:
+def search_top(name: str, search: SearchResult, *, rows: int = 10) -> Table:
     """Return the first rows of an order search.
 
     Parameters
@@ -446,15 +446,13 @@ def search_top(name: str, search: SearchResult, *, rows: int = 10, title: str = 
         The search.
     rows
         Most rows.
-    title
-        Caption; by default it names the search.
     """
     law = len(search.model.equations) > 1
     score = {"l1": "error (45)", "l2": "RMSE"}.get(search.settings["norm"], "score")
     orders, coefficients = list(search.orders), list(search.coefficients)
     kept = search.table[:rows]
     return Table(
-        title or f"Best {len(kept)} of {number(search.candidates)} candidates: {_search_name(name)}",
+        f"Best {len(kept)} of {number(search.candidates)} candidates: {_search_name(name)}",
         ("rank", "score" if law else score, *map(symbol_html, orders), *map(symbol_html, coefficients)),
         [
             [r.rank, r.score, *(Exact(r.orders[n]) for n in orders), *(r.coefficients[n] for n in coefficients)]

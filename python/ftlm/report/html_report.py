@@ -492,15 +492,15 @@ def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
     ]
 
 
-def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
+def starts_table(joint: JointFit, *, rows: int = 10) -> Table:
     """Return the initial guesses and their costs on decimated samples, best first."""
     kept = joint.starts[:rows]
     cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
     note = f"{joint.choice}. The best ones went on on all samples." if joint.starts else ""
-    return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
+    return Table("Automatic starts", ("rank", "start from", "cost per residual"), cells, note=note)
 
 
-def settings_table(result: Identification, *, title: str = "What the result depends on") -> Table:
+def settings_table(result: Identification) -> Table:
     """Return a table of the settings of a result: estimator, criterion, M, p, K0, initial terms and runs."""
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
@@ -521,7 +521,7 @@ def settings_table(result: Identification, *, title: str = "What the result depe
         [Markup("run <q>{}</q>").format(name), f"{number(step * comparison.m)} s, pulses of {number(step * 1e3)} ms"]
         for (name, _, _), step in zip(comparison.per_run, comparison.step, strict=True)
     ]
-    return Table(title, ("setting", "used"), rows)
+    return Table("What the result depends on", ("setting", "used"), rows)
 
 
 #: Phrases for the result of the independence test.

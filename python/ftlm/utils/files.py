@@ -313,15 +313,12 @@ class JsonFormat(Generic[T]):
         Type of the content.
     latest_schema
         Latest schema that this version reads.
-    max_bytes
-        Largest file that is read.
     """
 
     what: str
     source: str
     kind: type[T]
     latest_schema: int
-    max_bytes: int = MAX_SMALL_FILE_BYTES
 
     def read(self, path: str | os.PathLike[str]) -> T:
         """Read and decode a file.
@@ -331,7 +328,7 @@ class JsonFormat(Generic[T]):
         DataError
             A file that cannot be read, is too large, has another format, or is of a later version.
         """
-        content = read_small_file(path, self.what, self.source, self.max_bytes)
+        content = read_small_file(path, self.what, self.source, MAX_SMALL_FILE_BYTES)
         file = Path(path)
         try:
             return msgspec.json.decode(content, type=self.kind)

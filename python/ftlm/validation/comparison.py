@@ -543,9 +543,7 @@ def validation_fit_findings(before: Mapping[str, float], validation: Comparison)
 _METRIC_LABELS = ("error (45)", "RMSE", "NR", "fit %")
 
 
-def errors_table(
-    compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None, title: str = "Both errors"
-) -> Table:
+def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None) -> Table:
     """Return equation error and output error side by side, a row for each output of each comparison.
 
     Parameters
@@ -555,16 +553,13 @@ def errors_table(
         several runs follow with their own rows.
     units
         Units of the outputs.
-    title
-        Caption.
     """
+    title = "Both errors"
     rows: list[list[Cell]] = []
     headings: dict[int, str] = {}
     unequated: dict[str, str] = {}
 
-    def add(
-        heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics], without: Container[str]
-    ) -> None:
+    def add(heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics]) -> None:
         headings[len(rows)] = heading
         for name in output:
             unit = (units or {}).get(name, "")
@@ -575,12 +570,12 @@ def errors_table(
             )
 
     for label, comparison in compared:
-        runs, without = comparison.per_run, comparison.without_equation_error
-        unequated |= without
+        runs = comparison.per_run
+        unequated |= comparison.without_equation_error
         if len(runs) > 1:
-            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error, without)
+            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error)
         for name, equation, output in runs:
-            add(f"{label}: {name}", equation, output, without)
+            add(f"{label}: {name}", equation, output)
     reasons = [f"{words}." for words in describe_missing_equation_errors(unequated)]
     own = 1 + len(_METRIC_LABELS)
     if unequated and all(cell is None for row in rows for cell in row[1:own]):

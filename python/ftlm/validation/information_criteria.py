@@ -95,7 +95,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     return InformationCriteria(k, samples, likelihood, aic, aicc, k * math.log(samples) - 2 * likelihood)
 
 
-def information_table(information: InformationCriteria, *, title: str = "Information criteria") -> Table:
+def information_table(information: InformationCriteria) -> Table:
     """Return AIC, AICc and BIC with the numbers of parameters and samples."""
     criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
     # Differences count, not sizes: all digits before the point.
@@ -105,4 +105,4 @@ def information_table(information: InformationCriteria, *, title: str = "Informa
         "Lower is better, among models of the same outputs on the same runs. Orders, coefficients, initial terms and "
         "one noise level an output count as numbers."
     )
-    return Table(title, ("criterion", "value"), rows, note=note)
+    return Table("Information criteria", ("criterion", "value"), rows, note=note)
