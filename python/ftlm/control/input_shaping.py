@@ -15,7 +15,7 @@ from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import with_error
+from ftlm.utils.formatting import attributes, with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, short_repr, whole_number
@@ -136,13 +136,8 @@ class Shaper:
 
     def to_dict(self) -> dict[str, Any]:
         """Return impulses and modes for JSON."""
-        return {
-            "kind": self.kind,
-            "times": list(self.times),
-            "amplitudes": list(self.amplitudes),
-            "modes": [[m.frequency, m.damping] for m in self.modes],
-            "worst": self.worst,
-        }
+        modes = [[m.frequency, m.damping] for m in self.modes]
+        return attributes(self, ("kind", "times", "amplitudes")) | {"modes": modes, "worst": self.worst}
 
     def __str__(self) -> str:
         steps = ", ".join(f"{a:.4g} at {t:.4g} s" for a, t in zip(self.amplitudes, self.times, strict=True))

@@ -30,7 +30,7 @@ from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, format_bound, number, symbol, wrap_text
+from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
@@ -516,28 +516,13 @@ class FrequencyIdentification:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
-
-        def ends(pair: tuple[float, float]) -> list[float | None]:
-            return [v if math.isfinite(v) else None for v in pair]
-
-        return {
-            **(
-                {"circuit": str(self.source)}
-                if isinstance(self.source, Circuit)
-                else {"equations": [str(e) for e in self.source.equations]}
-            ),
-            "weights": self.weights,
-            "values": dict(self.values),
-            "standard_errors": {n: e if math.isfinite(e) else None for n, e in self.standard_errors.items()},
-            "intervals": {n: ends(pair) for n, pair in self.intervals.items()},
-            "chi_squared": self.chi_squared,
-            "errors": [vars(e) for e in self.errors],
-            "converged": self.converged,
-            "starts": list(self.start_counts),
-            "white": self.white,
-            "findings": [f.to_dict() for f in self.findings],
-            "warnings": list(self.warnings),
-        }
+        if isinstance(self.source, Circuit):
+            what: dict[str, Any] = {"circuit": str(self.source)}
+        else:
+            what = {"equations": [str(e) for e in self.source.equations]}
+        names = ("weights", "values", "standard_errors", "intervals", "chi_squared", "errors", "converged")
+        starts = {"starts": list(self.start_counts)}
+        return what | attributes(self, names) | starts | attributes(self, ("white", "findings", "warnings"))
 
     def __str__(self) -> str:
         return self.summary()

@@ -39,7 +39,7 @@ from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, Exact, finite, symbol_html
+from ftlm.utils.formatting import Cell, Exact, attributes, json_value, symbol_html
 from ftlm.utils.validation import Floats, as_floats
 
 
@@ -66,7 +66,7 @@ class Metrics:
 
     def to_dict(self) -> dict[str, float | None]:
         """For JSON."""
-        return {name: finite(getattr(self, name)) for name in ("error", "rmse", "nr", "fit")}
+        return attributes(self, ("error", "rmse", "nr", "fit"))
 
 
 #: Metrics of an unknown error.
@@ -201,21 +201,12 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
+        parts = ("run", "equation_error", "output_error")
         return {
-            "m": self.m,
-            "output_error": {n: f.to_dict() for n, f in self.output_error.items()},
-            "equation_error": {n: f.to_dict() for n, f in self.equation_error.items()},
-            "runs": [
-                {
-                    "run": name,
-                    "equation_error": {n: f.to_dict() for n, f in equation.items()},
-                    "output_error": {n: f.to_dict() for n, f in output.items()},
-                }
-                for name, equation, output in self.per_run
-            ],
-            **({"offsets": list(self.offsets)} if self.offsets else {}),
-            "findings": [f.to_dict() for f in self.findings],
-            "warnings": list(self.warnings),
+            **attributes(self, ("m", "output_error", "equation_error")),
+            "runs": [dict(zip(parts, json_value(part), strict=True)) for part in self.per_run],
+            **attributes(self, ["offsets"] if self.offsets else []),
+            **attributes(self, ("findings", "warnings")),
         }
 
     def __str__(self) -> str:

@@ -9,7 +9,7 @@ from ftlm.data.sampling import drop_missing
 from ftlm.errors import ModelError
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, Exact, finite
+from ftlm.utils.formatting import Cell, Exact, attributes
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import whole_number
 from ftlm.validation.residual_tests import Residuals
@@ -40,8 +40,7 @@ class InformationCriteria:
 
     def to_dict(self) -> dict[str, float | int | None]:
         """For JSON."""
-        shown = {n: finite(getattr(self, n)) for n in ("log_likelihood", "aic", "aicc", "bic")}
-        return {"parameters": self.parameters, "samples": self.samples, **shown}
+        return attributes(self, ("parameters", "samples", "log_likelihood", "aic", "aicc", "bic"))
 
     def __str__(self) -> str:
         return (

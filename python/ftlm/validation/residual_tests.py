@@ -22,7 +22,7 @@ from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, finite, symbol_html
+from ftlm.utils.formatting import Cell, attributes, json_value, symbol_html
 from ftlm.utils.linalg import dot, minimum_norm_solution
 from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
@@ -107,13 +107,8 @@ class CorrelationTest:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "lags": self.lags.tolist(),
-            "values": list(map(finite, self.values.tolist())),
-            **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
-            "passed": self.passed,
-            "conclusive": self.conclusive,
-        }
+        rows = {"lags": self.lags.tolist(), "values": json_value(self.values.tolist())}
+        return rows | attributes(self, ("band", "statistic", "limit", "passed", "conclusive"))
 
 
 @dataclass(frozen=True)
@@ -177,14 +172,8 @@ class OutputResiduals:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "rms": finite(self.rms),
-            "nr": finite(self.nr),
-            "whiteness": self.whiteness.to_dict(),
-            "inputs": {n: t.to_dict() for n, t in self.inputs.items()},
-            "feedback": list(self.feedback),
-            "loops": {n: t.to_dict() for n, t in self.feedback_tests.items()},
-        }
+        tests = attributes(self, ("rms", "nr", "whiteness", "inputs", "feedback"))
+        return tests | {"loops": json_value(self.feedback_tests)}
 
 
 @dataclass(frozen=True)
@@ -261,13 +250,7 @@ class Residuals:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "passed": self.passed,
-            "conclusive": self.conclusive,
-            "runs": list(self.runs),
-            "refinement": self.refinement,
-            "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
-        }
+        return attributes(self, ("passed", "conclusive", "runs", "refinement", "outputs"))
 
     def __str__(self) -> str:
         tests = [(f"{output} and {signal}" if signal else f"{output} alone", t) for output, signal, t in self.tests]
