@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import re
 import warnings
@@ -20,6 +19,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
+from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Floats, as_floats, check_vector, frequency_pair, short_repr, whole_number
 
 #: Maximum errors of the approximation without a warning.
@@ -360,10 +360,7 @@ def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> An
     ModelError
         python-control is not installed; see also :func:`approximate`.
     """
-    try:
-        control = importlib.import_module("control")
-    except ImportError:
-        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+    control = python_control()
     near = approximate(model, band=band, order=order)
     for words in near.warnings:
         warnings.warn(words, UserWarning, stacklevel=2)

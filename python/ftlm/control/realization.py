@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -17,6 +16,7 @@ from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
+from ftlm.utils.resources import python_control
 from ftlm.utils.validation import (
     Complex,
     Floats,
@@ -171,14 +171,6 @@ def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
             raise
         except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeWarning) as error:
             raise ModelError(f"{what} ({error_text(error, 200)}); {way_out}") from None
-
-
-def python_control() -> Any:
-    """Import python-control; raise with the install command if it is absent."""
-    try:
-        return importlib.import_module("control")
-    except ImportError:
-        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
 
 
 def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:

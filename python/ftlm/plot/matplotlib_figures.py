@@ -34,6 +34,7 @@ from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.parameters import parameter
+from ftlm.utils.resources import optional_module
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, as_array, as_floats
 from ftlm.validation.comparison import Comparison
@@ -47,10 +48,7 @@ NOTEBOOK_DPI = 110
 
 def figure_of(rows: int, columns: int = 1, *, row: float = ROW_HEIGHT_INCH, **options: Any) -> tuple[Any, Any]:
     """Return a figure with a grid of axes, created without pyplot."""
-    try:
-        module = importlib.import_module("matplotlib.figure")
-    except ImportError:
-        raise ModelError("matplotlib is not installed; pip install 'ftlm[plot]'") from None
+    module = optional_module("matplotlib.figure", "matplotlib", "'ftlm[plot]'")
 
     class NotebookFigure(module.Figure):  # type: ignore[misc, name-defined]
         """Figure that notebooks show although pyplot does not manage it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import logging
 import os
 import re
@@ -18,8 +17,9 @@ import msgspec
 import msgspec.toml
 
 from ftlm._core import __version__
-from ftlm.errors import DataError, ModelError
+from ftlm.errors import DataError
 from ftlm.utils.parameters import parameter
+from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import error_text, nearest, short_repr
 
 #: INFO: files read and written, start and end of fits. WARNING: findings that make a result doubtful.
@@ -379,8 +379,5 @@ def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:
     ModelError
         pandas is not installed.
     """
-    try:
-        pandas = importlib.import_module("pandas")
-    except ImportError:
-        raise ModelError("pandas is not installed; pip install pandas") from None
+    pandas = optional_module("pandas", "pandas", "pandas")
     return pandas.DataFrame.from_records(list(rows)).set_index(list(index))
