@@ -18,7 +18,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import attributes, with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, short_repr, whole_number
+from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, check_whole, short_repr
 
 #: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
 SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
@@ -185,9 +185,7 @@ def input_shaper(
     decays as a power of time, which no shaper cancels; it is no vibration.
     """
     check_choice("kind", kind, SHAPER_REPETITIONS)
-    count = whole_number(modes)
-    if count is None or count < 1:
-        raise ModelError(f"{setting('modes')} {short_repr(modes)} is no number of modes; give a whole number from 1")
+    count = check_whole("modes", modes, 1)
     if isinstance(model, (complex, float, int, np.number)):
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:

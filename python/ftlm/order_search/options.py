@@ -10,7 +10,7 @@ from ftlm import _core
 from ftlm.errors import ModelError
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import check_choice, real_number, whole_number
+from ftlm.utils.validation import check_choice, check_whole, real_number, whole_number
 
 Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
@@ -55,15 +55,12 @@ class SearchSettings:
         check_choice("norm", self.norm, get_args(Norm))
         check_choice("coefficients", self.coefficients, get_args(Coefficients))
         check_choice("row_basis", self.row_basis, get_args(RowBasis))
-        top, length = whole_number(self.top), whole_number(self.innovation_length)
+        top = whole_number(self.top)
         if top is None or not 1 <= top <= MAX_TOP:
             raise ModelError(
                 f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read"
             )
-        if length is None or not 1 <= length < 1 << 62:
-            raise ModelError(
-                f"{setting('innovation_length')} {self.innovation_length!r} is no whole number from 1; the paper's is 7"
-            )
+        length = check_whole("innovation_length", self.innovation_length, 1)
         given = self.prior_covariance
         covariance = None if given is None else real_number("prior_covariance", given)
         if covariance is not None and not 0 < covariance < math.inf:

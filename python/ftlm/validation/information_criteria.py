@@ -6,12 +6,10 @@ import math
 from dataclasses import dataclass
 
 from ftlm.data.sampling import drop_missing
-from ftlm.errors import ModelError
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, Exact, attributes
-from ftlm.utils.parameters import setting
-from ftlm.utils.validation import whole_number
+from ftlm.utils.validation import check_whole
 from ftlm.validation.residual_tests import Residuals
 
 
@@ -75,11 +73,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     -----
     doi:10.1109/TAC.1974.1100705, doi:10.1093/biomet/76.2.297, doi:10.1214/aos/1176344136.
     """
-    given = whole_number(parameters)
-    if given is None or given < 0:
-        raise ModelError(
-            f"{setting('parameters')} {parameters!r} is no number of parameters; give a whole number, at least 0"
-        )
+    given = check_whole("parameters", parameters, 0)
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = given + tests.initial_terms + len(tests.outputs)

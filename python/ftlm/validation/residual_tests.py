@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import interpolate_gaps
-from ftlm.errors import DataError, ModelError
+from ftlm.errors import DataError
 from ftlm.findings import Finding, make_finding, texts
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import compared_values
@@ -24,7 +24,6 @@ from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, attributes, json_value, symbol_html
 from ftlm.utils.linalg import dot, minimum_norm_solution
-from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
     NORMAL_99,
     SIGNIFICANCE_LEVEL,
@@ -34,7 +33,7 @@ from ftlm.utils.statistics import (
     portmanteau,
     whiten_series,
 )
-from ftlm.utils.validation import Floats, whole_number
+from ftlm.utils.validation import Floats, check_whole
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import FeedbackTest, feedback_test
 
@@ -322,9 +321,7 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     """
     check_model(model)
     several = as_runs(runs)
-    count = whole_number(lags)
-    if count is None or count < 1:
-        raise ModelError(f"{setting('lags')} {lags!r} is no number of lags; give a whole number, at least 1")
+    count = check_whole("lags", lags, 1)
     check_run_lengths(several, count)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
