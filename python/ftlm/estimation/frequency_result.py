@@ -104,28 +104,35 @@ def bode_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Response
     )
 
 
+def curve_chart(
+    title: str, label: str, omega: Floats, lines: Sequence[tuple[str, Floats]], half_width: Floats | None
+) -> Figure:
+    """Return a chart over frequency: a model's curve with its 95 % band, and any measured points."""
+    values = lines[0][1]
+    return line_chart(
+        omega,
+        lines,
+        log_x=True,
+        bands=[] if half_width is None else [(values - half_width, values + half_width)],
+        title=title,
+        dots=("measured",),
+        width=SMALL_WIDTH_PX,
+        height=220,
+        x_label="frequency [rad/s]",
+        y_label=label,
+        caption="" if half_width is None else "Shade: 95 % band, from the covariance of the fit.",
+    )
+
+
 def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return gain and phase charts of a record and the model with its 95 % band."""
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
     figures = []
     for curve in bode_curves(model, record):
-        dots, half = np.full(curve.omega.size, np.nan), curve.half_width
+        dots = np.full(curve.omega.size, np.nan)
         dots[np.searchsorted(curve.omega, curve.measured_omega)] = curve.measured
-        figures.append(
-            line_chart(
-                curve.omega,
-                [("model", curve.values), ("measured", dots)],
-                log_x=True,
-                bands=[] if half is None else [(curve.values - half, curve.values + half)],
-                title=f"{title}: {curve.kind}",
-                dots=("measured",),
-                width=SMALL_WIDTH_PX,
-                height=220,
-                x_label="frequency [rad/s]",
-                y_label=curve.label,
-                caption="" if half is None else "Shade: 95 % band, from the covariance of the fit.",
-            )
-        )
+        lines = [("model", curve.values), ("measured", dots)]
+        figures.append(curve_chart(f"{title}: {curve.kind}", curve.label, curve.omega, lines, curve.half_width))
     return figures
 
 
