@@ -2,21 +2,15 @@
 
 from ftlm.reproduction.checks import Check, table_3_coefficients
 from ftlm.reproduction.cross_validation import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs, unseen_page
-from ftlm.reproduction.demo import Demo, run_demo
 from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads, printed_saturation
-from ftlm.reproduction.reproduction import Reproduction, reproduce
 from ftlm.reproduction.simulated_arm import demo_plant, demo_run
 from ftlm.reproduction.stage_result import Candidate, Rival, Stage
-from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
 
 __all__ = [
     "AsPrinted",
     "Candidate",
     "Check",
     "Deflection",
-    "Demo",
-    "PaperRow",
-    "Reproduction",
     "Rival",
     "Stage",
     "UnseenOrders",
@@ -26,12 +20,7 @@ __all__ = [
     "demo_run",
     "implied_spreads",
     "orders_on_unseen_runs",
-    "paper_row",
-    "paper_table",
-    "paper_table_text",
     "printed_saturation",
-    "reproduce",
-    "run_demo",
     "table_3_coefficients",
     "unseen_page",
 ]
