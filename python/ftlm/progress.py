@@ -7,14 +7,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from ftlm.utils.formatting import EscapedStream, escape_controls, escape_standard_streams
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
-    from rich.progress import TaskID
 
 #: Work that ends sooner shows no bar.
 BAR_DELAY_S = 1.0
@@ -97,66 +95,28 @@ class ShareTracker:
         return report_subtask
 
 
-class _Bars:
-    """Progress bars of one job on a shared display, updated from several threads."""
+def _start_bar() -> RichProgress:
+    """Return a bar on the terminal without a label, a total and figures yet."""
+    from rich.console import Console  # noqa: PLC0415 — only a terminal needs it
+    from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._shown: RichProgress | None = None
-
-    def start(self, total: int | None) -> TaskID:
-        """Add a bar; its label appears with the first figures."""
-        from rich.console import Console  # noqa: PLC0415 — only a terminal needs it
-        from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
-
-        with self._lock:
-            if self._shown is None:
-                stream: Any = sys.stderr
-                escaped = isinstance(stream, EscapedStream)
-                self._shown = Progress(
-                    TextColumn("{task.description}"),
-                    BarColumn(),
-                    TextColumn("{task.fields[counted]}"),
-                    TextColumn("{task.fields[pruned]}"),
-                    TextColumn("{task.fields[left]}"),
-                    console=Console(file=stream.stream) if escaped else Console(stderr=True),
-                    transient=True,
-                )
-                self._shown.start()
-                if escaped:
-                    # The display has put streams of its own in place, which print above the bars.
-                    escape_standard_streams()
-            return self._shown.add_task("", total=total, counted="", pruned="", left="")
-
-    def update(self, task: TaskID, **state: Any) -> None:
-        """Update a bar; its label is truncated to the width of the line."""
-        with self._lock:
-            if self._shown is not None:
-                figures = (str(state.get(name, "")) for name in ("counted", "pruned", "left"))
-                room = max(
-                    self._shown.console.width - sum(len(f) + 1 for f in figures) - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS
-                )
-                label = escape_controls(str(state["description"]))
-                label = label if len(label) <= room else f"{label[: room - 1].rstrip(' ,')}…"
-                self._shown.update(task, **state | {"description": label})
-
-    @property
-    def width(self) -> int:
-        """Columns of the terminal."""
-        with self._lock:
-            return 0 if self._shown is None else self._shown.console.width
-
-    def drop(self, task: TaskID) -> None:
-        """Remove a bar, and the display with the last one."""
-        with self._lock:
-            if self._shown is None:
-                return
-            if len(self._shown.tasks) > 1:
-                self._shown.remove_task(task)
-            else:
-                # Stopping paints the last state once more, which a bar that ended between two paintings needs.
-                self._shown.stop()
-                self._shown = None
+    stream: Any = sys.stderr
+    escaped = isinstance(stream, EscapedStream)
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[counted]}"),
+        TextColumn("{task.fields[pruned]}"),
+        TextColumn("{task.fields[left]}"),
+        console=Console(file=stream.stream) if escaped else Console(stderr=True),
+        transient=True,
+    )
+    bar.add_task("", total=None, counted="", pruned="", left="")
+    bar.start()
+    if escaped:
+        # The display has put streams of its own in place, which print above the bar.
+        escape_standard_streams()
+    return bar
 
 
 class Progress:
@@ -174,8 +134,8 @@ class Progress:
         self._label = label
         self._quiet = quiet or not sys.stderr.isatty()
         self._start = time.monotonic()
-        self._bars = _Bars()
-        self._task: TaskID | None = None
+        self._bar: RichProgress | None = None
+        self._lock = threading.Lock()
 
     def __enter__(self) -> Progress:
         return self
@@ -184,37 +144,25 @@ class Progress:
         """Show ``done`` of ``total`` candidates, ``pruned`` of them excluded early."""
         if self._quiet or time.monotonic() - self._start < BAR_DELAY_S or total == 0:
             return
-        if self._task is None:
-            self._task = self._bars.start(total)
         passed = max(time.monotonic() - self._start, 1e-9)
         counted = f"{100 * done // total:.0f} %"
         # Of work without a count of its own a person wants to know the share alone.
         if not isinstance(total, ShareTotal):
-            counted += f" of {total:,.0f}" if self._bars.width >= WIDE_TERMINAL_COLUMNS else ""
+            counted += f" of {total:,.0f}" if self._current_bar().console.width >= WIDE_TERMINAL_COLUMNS else ""
             counted += f" {done / passed:,.0f}/s"
         share = "" if pruned is None else f"{100 * pruned / max(done, 1):.1f} % pruned"
         left = format_time_left(passed * (total - done) / done) if 0 < done < total else ""
-        state = {"description": self._label, "counted": counted, "pruned": share, "left": left}
-        self._bars.update(self._task, completed=done, total=total, **state)
+        self._show(counted, share, left, completed=done, total=total)
         if done >= total:
             # The next search of the same job starts a bar of its own.
             self._stop()
-
-    def add_bar(self) -> Progress:
-        """Return another bar on the same display, for work in another thread."""
-        other = Progress(self._label, quiet=self._quiet)
-        other._bars = self._bars
-        return other
 
     def so_far(self, done: int, known: int) -> None:
         """Show progress of work whose total is not known."""
         passed = time.monotonic() - self._start
         if self._quiet or passed < BAR_DELAY_S:
             return
-        if self._task is None:
-            self._task = self._bars.start(None)
-        state = {"description": self._label, "counted": f"{done} of {known} so far", "left": f"after {passed:.0f} s"}
-        self._bars.update(self._task, **state)
+        self._show(f"{done} of {known} so far", left=f"after {passed:.0f} s")
 
     @property
     def quiet(self) -> bool:
@@ -237,15 +185,28 @@ class Progress:
         if not self._quiet:
             print(label, file=sys.stderr)
 
+    def _current_bar(self) -> RichProgress:
+        """Return the bar, which starts with the first figures."""
+        with self._lock:
+            self._bar = self._bar or _start_bar()
+            return self._bar
+
+    def _show(self, counted: str, pruned: str = "", left: str = "", **state: Any) -> None:
+        """Show figures; the label is truncated to the width of the line."""
+        bar, taken = self._current_bar(), len(counted) + len(pruned) + len(left) + 3
+        room = max(bar.console.width - taken - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS)
+        label = escape_controls(self._label)
+        label = label if len(label) <= room else f"{label[: room - 1].rstrip(' ,')}…"
+        bar.update(bar.task_ids[0], description=label, counted=counted, pruned=pruned, left=left, **state)
+
     def _stop(self) -> None:
-        if self._task is not None:
-            self._bars.drop(self._task)
-        self._task = None
+        with self._lock:
+            if self._bar is not None:
+                self._bar.stop()
+            self._bar = None
         self._start = time.monotonic()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop()
 
 

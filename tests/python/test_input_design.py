@@ -519,7 +519,7 @@ def test_it_prints_goes_into_a_frame_and_json_and_is_drawn(designed: ftlm.Design
     assert document["predicted_extremes"]["y"]["limit"] == 0.9
     figure = ftlm.plot.design(designed)
     assert [a.get_xlabel() for a in figure.axes] == ["time [s]", "time [s]", "frequency [Hz]"]
-    with pytest.raises(ftlm.ModelError, match="give what design_input returns"):
+    with pytest.raises(ftlm.ModelError, match="is a int; give DesignedInput"):
         ftlm.plot.design(3)
 
 

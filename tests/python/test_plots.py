@@ -77,13 +77,13 @@ def test_bode_is_the_frequency_response(found):
 def test_what_cannot_be_drawn_is_said(found, small_model):
     for call, words in (
         (lambda: ftlm.plot.fit(small_model), "give runs"),
-        (lambda: ftlm.plot.fit("x"), "result is str"),
+        (lambda: ftlm.plot.fit("x"), "is a str; give Identification or Model"),
         (lambda: ftlm.plot.residuals(replace(found, residuals=None)), "too short"),
-        (lambda: ftlm.plot.residuals(3), "tests is int"),
+        (lambda: ftlm.plot.residuals(3), "tests = 3 is a int; give Residuals"),
         (lambda: ftlm.plot.landscape(replace(found, searches={})), "searched no order grid"),
         (lambda: ftlm.plot.landscape(found, "z"), "there is no search 'z'; there are y"),
-        (lambda: ftlm.plot.landscape(found.model), "result is Model"),
-        (lambda: ftlm.plot.bode(None), "model is NoneType"),
+        (lambda: ftlm.plot.landscape(found.model), "is a Model; give Identification or Landscape"),
+        (lambda: ftlm.plot.bode(None), "model = None is a NoneType; give Model"),
     ):
         with pytest.raises(ftlm.ModelError, match=words):
             call()

@@ -78,25 +78,6 @@ def test_quiet_says_nothing(monkeypatch):
     assert terminal.getvalue() == ""
 
 
-def test_two_bars_share_one_display(monkeypatch):
-    monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
-    for name, value in {"COLUMNS": "80", "TERM": "xterm-256color"}.items():
-        monkeypatch.setenv(name, value)
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with Progress("whole") as bar, bar.add_bar() as first, bar.add_bar() as second:
-        first.name("stage 1")
-        second.name("stage 2")
-        for done in (1, 50, 100):
-            first(done, 100)
-            second(done // 2, 100)
-            time.sleep(0.12)
-    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
-    assert "stage 1" in plain
-    assert "stage 2" in plain
-    assert "\x1b[?25h" in terminal.getvalue()  # the cursor is back: the display has ended
-
-
 def test_stopping_ends_what_another_thread_reports():
     stop, seen = threading.Event(), []
     told = Stoppable(lambda done, total: seen.append((done, total)), stop)

@@ -30,6 +30,7 @@ from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Floats
 
 
@@ -225,10 +226,7 @@ def to_tf(model: Model) -> Any:
         A fractional order, friction, an input with saturation or dead zone, an input that passes the sensor filter, or
         python-control is not installed.
     """
-    try:
-        control = importlib.import_module("control")
-    except ImportError:
-        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+    control = python_control()
     check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
     filtered, top, bottom = _output_filter(model, transfer.inputs)
@@ -273,10 +271,7 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
     ModelError
         As :func:`to_tf`; a step that is not positive; an input that acts before its sample, in discrete time.
     """
-    try:
-        control = importlib.import_module("control")
-    except ImportError:
-        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+    control = python_control()
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     orders = {o.constant for item in model.equations for o in (item.order, *(term.order for term in item.terms))}

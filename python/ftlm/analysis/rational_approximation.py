@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import re
 import warnings
@@ -19,8 +18,8 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, as_floats, check_vector, frequency_pair, short_repr, whole_number
+from ftlm.utils.resources import python_control
+from ftlm.utils.validation import Floats, as_floats, check_vector, check_whole, frequency_pair
 
 #: Maximum errors of the approximation without a warning.
 MAX_GAIN_ERROR_DB, MAX_PHASE_ERROR_DEGREES = 1.0, 5.0
@@ -226,9 +225,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     low, high = frequency_pair(band)
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is not an interval; give 0 < low < high")
-    count = whole_number(order)
-    if count is None or not 1 <= count <= LARGEST_ORDER:
-        raise ModelError(f"{setting('order')} {short_repr(order)} is not a whole number from 1 to {LARGEST_ORDER}")
+    count = check_whole("order", order, 1, LARGEST_ORDER)
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     delays = model.structure.delay
@@ -360,10 +357,7 @@ def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> An
     ModelError
         python-control is not installed; see also :func:`approximate`.
     """
-    try:
-        control = importlib.import_module("control")
-    except ImportError:
-        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
+    control = python_control()
     near = approximate(model, band=band, order=order)
     for words in near.warnings:
         warnings.warn(words, UserWarning, stacklevel=2)

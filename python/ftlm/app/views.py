@@ -24,8 +24,7 @@ from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import chart_script, style_sheet
 from ftlm.svg.line_chart import chart_css
-from ftlm.utils.formatting import number
-from ftlm.validation.comparison import finite
+from ftlm.utils.formatting import finite, number
 
 #: Label of the form field of each Python argument.
 _FIELD_LABELS = {

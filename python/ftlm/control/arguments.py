@@ -9,7 +9,7 @@ import numpy as np
 
 from ftlm.errors import ModelError
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr, whole_number
+from ftlm.utils.validation import Floats, check_seed, check_whole, nearest, real_number, short_repr
 
 #: Sampling rates [Hz] at which margins can be computed in floating point.
 RATE_RANGE_HZ = (1e-9, 1e9)
@@ -75,10 +75,7 @@ def check_limit(limit: object) -> float:
 
 def check_samples(samples: object, seed: object) -> tuple[int, int]:
     """Return the number of parameter samples and their seed."""
-    count = whole_number(samples)
-    if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"{setting('samples')} {short_repr(samples)} is not a whole number from 0 to 10000")
-    return count, check_seed(seed)
+    return check_whole("samples", samples, 0, 10_000), check_seed(seed)
 
 
 def sum_row(what: str, text: object, outputs: tuple[str, ...]) -> Floats:

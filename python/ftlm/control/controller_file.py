@@ -209,20 +209,14 @@ def _limit(value: float) -> float | None:
 
 
 def _pid(controller: DiscretePid) -> PidFile:
-    pid = controller.pid
-    lags = [Lag(of, *values) for of, values in controller.lags()]
     return PidFile(
-        pid.kp,
-        pid.ki,
-        pid.kd,
-        pid.lam,
-        pid.mu,
-        controller.rate,
-        _limit(controller.limit),
-        controller.band,
-        controller.order,
-        controller.direct,
-        lags,
+        **controller.pid.to_dict(),
+        rate=controller.rate,
+        limit=_limit(controller.limit),
+        band=controller.band,
+        order=controller.order,
+        direct=controller.direct,
+        lags=[Lag(of, *values) for of, values in controller.lags()],
     )
 
 

@@ -23,11 +23,11 @@ from ftlm.utils.validation import (
     Floats,
     as_complex,
     check_vector,
+    check_whole,
     frequency_pair,
     nearest,
     real_number,
     short_repr,
-    whole_number,
 )
 
 #: Poles extend this factor beyond the band on both sides.
@@ -155,9 +155,7 @@ class DiscretePid:
                 "upper end "
                 f"is at most {MAX_BAND_RATIO:g} times the lower"
             )
-        count = whole_number(order)
-        if count is None or not 1 <= count <= LARGEST_ORDER:
-            raise ModelError(f"{setting('order')} {short_repr(order)} is not a whole number from 1 to {LARGEST_ORDER}")
+        count = check_whole("order", order, 1, LARGEST_ORDER)
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
         reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)

@@ -15,10 +15,10 @@ from ftlm.control.arguments import checked_rate
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import with_error
+from ftlm.utils.formatting import attributes, with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, short_repr, whole_number
+from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, check_whole, short_repr
 
 #: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
 SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
@@ -136,13 +136,8 @@ class Shaper:
 
     def to_dict(self) -> dict[str, Any]:
         """Return impulses and modes for JSON."""
-        return {
-            "kind": self.kind,
-            "times": list(self.times),
-            "amplitudes": list(self.amplitudes),
-            "modes": [[m.frequency, m.damping] for m in self.modes],
-            "worst": self.worst,
-        }
+        modes = [[m.frequency, m.damping] for m in self.modes]
+        return attributes(self, ("kind", "times", "amplitudes")) | {"modes": modes, "worst": self.worst}
 
     def __str__(self) -> str:
         steps = ", ".join(f"{a:.4g} at {t:.4g} s" for a, t in zip(self.amplitudes, self.times, strict=True))
@@ -190,9 +185,7 @@ def input_shaper(
     decays as a power of time, which no shaper cancels; it is not a vibration.
     """
     check_choice("kind", kind, SHAPER_REPETITIONS)
-    count = whole_number(modes)
-    if count is None or count < 1:
-        raise ModelError(f"{setting('modes')} {short_repr(modes)} is not a number of modes; give a whole number from 1")
+    count = check_whole("modes", modes, 1)
     if isinstance(model, (complex, float, int, np.number)):
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:

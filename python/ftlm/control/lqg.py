@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike
 
 from ftlm.control.arguments import check_limit, check_samples, positive, select_outputs, sum_row
 from ftlm.control.fractional_pid import MAX_BROKEN_SHARE, least_certain_parameter, plant_of
-from ftlm.control.realization import Realisation, catch_numerical_errors, fit_realization, python_control
+from ftlm.control.realization import Realisation, catch_numerical_errors, fit_realization
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model, check_model
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, check_vector, nearest, short_repr
 
 #: Name of the input disturbance in the estimates.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -16,16 +15,15 @@ from ftlm.analysis.poles import modes
 from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import setting
+from ftlm.utils.resources import python_control
 from ftlm.utils.validation import (
     Complex,
     Floats,
     as_floats,
     check_vector,
+    check_whole,
     error_text,
     frequency_pair,
-    short_repr,
-    whole_number,
 )
 
 #: Number of fitted frequencies; the error is also evaluated between them.
@@ -118,15 +116,7 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     errors. Discretized with a zero-order hold by python-control.
     """
     low, high = _band(band, plants[0].rate)
-    if poles is None:
-        counts = list(range(2, MAX_POLES + 1, 2))
-    else:
-        count = whole_number(poles)
-        if count is None or not MIN_POLES <= count <= MAX_POLES:
-            raise ModelError(
-                f"{setting('poles')} {short_repr(poles)} is not a whole number from {MIN_POLES} to {MAX_POLES}"
-            )
-        counts = [count]
+    counts = list(range(2, MAX_POLES + 1, 2)) if poles is None else [check_whole("poles", poles, MIN_POLES, MAX_POLES)]
     library = python_control()
     w = np.geomspace(low, high, FIT_FREQUENCIES)
     with catch_numerical_errors(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
@@ -171,14 +161,6 @@ def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
             raise
         except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeWarning) as error:
             raise ModelError(f"{what} ({error_text(error, 200)}); {way_out}") from None
-
-
-def python_control() -> Any:
-    """Import python-control; raise with the install command if it is absent."""
-    try:
-        return importlib.import_module("control")
-    except ImportError:
-        raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
 
 
 def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:

@@ -21,8 +21,9 @@ from ftlm.data.construction import RunArguments
 from ftlm.data.run import Run
 from ftlm.data.sampling import as_seconds, missing_mask, uniform_times
 from ftlm.data.units import is_time_name, parse_unit, time_unit_of
-from ftlm.errors import DataError, ModelError
+from ftlm.errors import DataError
 from ftlm.utils.files import RUN_MESSAGES, check_new, write_atomically
+from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, join_names, names_to_columns, nearest
 
 
@@ -132,7 +133,7 @@ def _is_time_index(name: Hashable, values: object) -> bool:
 
 def frame_of(run: Run) -> Any:
     """Return a run as a pandas frame indexed by time."""
-    pandas = _library("pandas")
+    pandas = optional_module("pandas", "pandas", "pandas")
     index = pandas.Index(run.start + run.time, name=CSV_TIME)
     frame = pandas.DataFrame({name: run[name].copy() for name in run.signals}, index=index)
     frame.attrs = {**_frame_attributes(run), "units": run.units, "intersample": dict(run.intersample)}
@@ -141,7 +142,7 @@ def frame_of(run: Run) -> Any:
 
 def dataset_of(run: Run) -> Any:
     """Return a run as an xarray dataset indexed by time."""
-    xarray = _library("xarray")
+    xarray = optional_module("xarray", "xarray", "xarray")
     signals = {}
     for name in run.signals:
         role = {"role": "input", "intersample": run.intersample[name]} if name in run.inputs else {"role": "output"}
@@ -153,13 +154,6 @@ def dataset_of(run: Run) -> Any:
 def _frame_attributes(run: Run) -> dict[str, Any]:
     told = {"name": run.name, "inputs": list(run.inputs), "outputs": list(run.outputs), "step": run.step}
     return {**told, "warnings": list(run.warnings)}
-
-
-def _library(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ModelError(f"{name} is not installed; pip install {name}") from None
 
 
 CSV_MARK = "# ftlm-run "

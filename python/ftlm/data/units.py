@@ -63,98 +63,50 @@ TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "
 
 #: Spellings of time units in column headers, case-folded.
 _TIME_UNIT_ALIASES = {
-    **{unit: unit for unit in TIME_UNITS},
-    "μs": "us",  # the letter mu, into which casefold turns the micro sign
-    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
-    "hr": "h",
-    "hour": "h",
-    "hours": "h",
-    **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"),
-    "minute": "min",
-    "minutes": "min",
-    **dict.fromkeys(("usec", "microsecond", "microseconds"), "us"),
-    **dict.fromkeys(("sekunde", "sekunden", "sek"), "s"),
-    "millisekunden": "ms",
-    "minuten": "min",
-    "stunden": "h",
-    **dict.fromkeys(("millisec", "millisecs", "msek"), "ms"),
-    "std": "h",
-    "mikrosekunden": "us",
+    name: unit
+    for unit, names in {
+        "s": "s sec secs second seconds sekunde sekunden sek",
+        "ms": "ms msec millisecond milliseconds millisekunden millisec millisecs msek",
+        # Of both the micro sign and the letter mu, into which casefold turns it.
+        "us": "us μs usec microsecond microseconds mikrosekunden",
+        "µs": "µs",
+        "min": "min minute minutes minuten",
+        "h": "h hr hour hours stunden std",
+    }.items()
+    for name in names.split()
 }
 #: Spellings of signal units in files, case-folded and without spaces; "" marks known units without conversion.
 _SIGNAL_UNIT_ALIASES = {
-    **{
-        name: unit
-        for unit, names in {
-            "deg": "degree degrees degs grad grd winkelgrad",
-            "rad": "radian radians radiant",
-            "deg/s": "°/s deg/sec dps grad/s grd/s degree/s degrees/s degrees/sec",
-            "rad/s": "rad/sec rads/s rad·s^-1",
-            "rpm": "rpm u/min 1/min r/min rev/min min^-1 min-1 upm u.p.m r.p.m",
-            "A": "amp amps ampere amperes",
-            "mA": "milliamp milliamps milliampere",
-            "V": "volt volts vdc",
-            "mV": "millivolt millivolts",
-            "m": "metre metres meter meters",
-            "cm": "centimetre centimeter zentimeter",
-            "mm": "millimetre millimetres millimeter millimeters",
-            "µm": "micron microns um",
-            "µA": "ua",
-            "µV": "uv",
-            "N": "newton newtons",
-            "N·m": "newtonmeter newtonmetre newtonmetres newtonmeters",
-            "degC": "celsius gradcelsius gradc degcelsius",
-            "K": "kelvin",
-            "W": "watt watts",
-            "Hz": "hertz",
-            "Pa": "pascal",
-            "m/s^2": "m/s2 m/s^2 m/s/s m/sec^2 m/sec2",
-            "m/s": "m/sec",
-        }.items()
-        for name in names.split()
-    },
-    **dict.fromkeys(
-        (
-            "%",
-            "-",
-            "db",
-            "mhz",
-            "mw",
-            "kg",
-            "l/min",
-            "m3/h",
-            "nm",
-            "ohm",
-            "ω",
-            "mω",
-            "kω",
-            "ma",
-            "1/s",
-            "s^-1",
-            "a.u",
-            "none",
-            "count",
-            "counts",
-            "lsb",
-            "j",
-            "kj",
-            "ah",
-            "vac",
-            "vrms",
-            "arms",
-            "degf",
-            "°f",
-            "ft",
-            "inch",
-            "psi",
-            "lbf",
-            "kgf",
-            "gauss",
-            "mpa",
-            "mn",
-        ),
-        "",
-    ),
+    name: unit
+    for unit, names in {
+        "deg": "degree degrees degs grad grd winkelgrad",
+        "rad": "radian radians radiant",
+        "deg/s": "°/s deg/sec dps grad/s grd/s degree/s degrees/s degrees/sec",
+        "rad/s": "rad/sec rads/s rad·s^-1",
+        "rpm": "rpm u/min 1/min r/min rev/min min^-1 min-1 upm u.p.m r.p.m",
+        "A": "amp amps ampere amperes",
+        "mA": "milliamp milliamps milliampere",
+        "V": "volt volts vdc",
+        "mV": "millivolt millivolts",
+        "m": "metre metres meter meters",
+        "cm": "centimetre centimeter zentimeter",
+        "mm": "millimetre millimetres millimeter millimeters",
+        "µm": "micron microns um",
+        "µA": "ua",
+        "µV": "uv",
+        "N": "newton newtons",
+        "N·m": "newtonmeter newtonmetre newtonmetres newtonmeters",
+        "degC": "celsius gradcelsius gradc degcelsius",
+        "K": "kelvin",
+        "W": "watt watts",
+        "Hz": "hertz",
+        "Pa": "pascal",
+        "m/s^2": "m/s2 m/s^2 m/s/s m/sec^2 m/sec2",
+        "m/s": "m/sec",
+        "": "% - db mhz mw kg l/min m3/h nm ohm ω mω kω ma 1/s s^-1 a.u none count counts lsb j kj ah vac vrms arms "
+        "degf °f ft inch psi lbf kgf gauss mpa mn",
+    }.items()
+    for name in names.split()
 }
 _BRACKETED_UNIT_PATTERN = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
 _UNBRACKETED_UNIT_PATTERN = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*[/,]\s*(\S+)|\s+in\s+(\S+)|_(\S+))")

@@ -94,9 +94,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     return [run_with_inputs(run, {n: a[k] for n, a in answers.items()}) for k, run in enumerate(runs)], findings
 
 
-def past_regressors(
-    signal: Floats, first: int, reach: int, *, dense: int = DENSE_PAST_SAMPLES, wider: float = BLOCK_GROWTH_FACTOR
-) -> list[Floats]:
+def past_regressors(signal: Floats, first: int, reach: int, *, dense: int = DENSE_PAST_SAMPLES) -> list[Floats]:
     """Return samples of a signal ``first`` to ``dense`` samples back, then means of growing blocks up to ``reach``.
 
     Samples before the first one are taken as equal to it, so ``reach`` may be at most the length of the signal.
@@ -110,7 +108,7 @@ def past_regressors(
     while start + width <= reach:
         end = count - start + 1
         columns.append((sums[end : end + count] - sums[end - width : end - width + count]) / width)
-        start, width = start + width, int(width * wider) + 1
+        start, width = start + width, int(width * BLOCK_GROWTH_FACTOR) + 1
     return columns
 
 

@@ -21,11 +21,11 @@ from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, format_bound
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.formatting import Cell, finite, format_bound
+from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
-from ftlm.utils.validation import Floats, whole_number
-from ftlm.validation.comparison import compare, finite
+from ftlm.utils.validation import Floats, check_whole
+from ftlm.validation.comparison import compare
 
 #: Default number of segments of one run.
 DEFAULT_SEGMENTS = 2
@@ -325,9 +325,7 @@ def consistency(
         A segment whose fit fails.
     """
     every = as_runs(runs)
-    given = None if segments is None else whole_number(segments)
-    if segments is not None and (given is None or given < DEFAULT_SEGMENTS):
-        raise ModelError(f"{setting('segments')} {segments!r}; use a whole number, at least {DEFAULT_SEGMENTS}")
+    given = None if segments is None else check_whole("segments", segments, DEFAULT_SEGMENTS)
     if len(every) > 1 and given is not None:
         raise ModelError(
             f"{len(every)} runs are segments by themselves; leave {parameter('segments')} out, or give one run"

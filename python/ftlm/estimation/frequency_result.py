@@ -30,7 +30,7 @@ from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, format_bound, number, symbol, wrap_text
+from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
@@ -51,17 +51,27 @@ def curve_frequencies(record: FrequencyData) -> Floats:
     return np.unique(np.concatenate([measured, between, smooth]))
 
 
+def _place_of(model: Model, record: FrequencyData) -> tuple[int, int]:
+    """Return the places of a record's output and input among those of the model."""
+    return model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
+
+
+def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats) -> Complex:
+    """Return the response of the model between the signals of a record."""
+    if isinstance(model, Circuit):
+        return model.impedance(omega)
+    response: Complex = frequency_response(model, omega)[_place_of(model, record)]
+    return response
+
+
 def model_curve(
     model: Model | Circuit, record: FrequencyData, omega: Floats
 ) -> tuple[Complex, Floats | None, Floats | None]:
     """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
-    if isinstance(model, Circuit):
-        return model.impedance(omega), None, None
-    at = model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
-    response = frequency_response(model, omega)[at]
-    if model.estimate is None or model.estimate.covariance is None:
+    response = model_response(model, record, omega)
+    if isinstance(model, Circuit) or model.estimate is None or model.estimate.covariance is None:
         return response, None, None
-    gain, phase = (part[at] for part in response_deviation(model, omega))
+    gain, phase = (part[_place_of(model, record)] for part in response_deviation(model, omega))
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
@@ -94,34 +104,41 @@ def bode_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Response
     )
 
 
+def curve_chart(
+    title: str, label: str, omega: Floats, lines: Sequence[tuple[str, Floats]], half_width: Floats | None
+) -> Figure:
+    """Return a chart over frequency: a model's curve with its 95 % band, and any measured points."""
+    values = lines[0][1]
+    return line_chart(
+        omega,
+        lines,
+        log_x=True,
+        bands=[] if half_width is None else [(values - half_width, values + half_width)],
+        title=title,
+        dots=("measured",),
+        width=SMALL_WIDTH_PX,
+        height=220,
+        x_label="frequency [rad/s]",
+        y_label=label,
+        caption="" if half_width is None else "Shade: 95 % band, from the covariance of the fit.",
+    )
+
+
 def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return gain and phase charts of a record and the model with its 95 % band."""
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
     figures = []
     for curve in bode_curves(model, record):
-        dots, half = np.full(curve.omega.size, np.nan), curve.half_width
+        dots = np.full(curve.omega.size, np.nan)
         dots[np.searchsorted(curve.omega, curve.measured_omega)] = curve.measured
-        figures.append(
-            line_chart(
-                curve.omega,
-                [("model", curve.values), ("measured", dots)],
-                log_x=True,
-                bands=[] if half is None else [(curve.values - half, curve.values + half)],
-                title=f"{title}: {curve.kind}",
-                dots=("measured",),
-                width=SMALL_WIDTH_PX,
-                height=220,
-                x_label="frequency [rad/s]",
-                y_label=curve.label,
-                caption="" if half is None else "Shade: 95 % band, from the covariance of the fit.",
-            )
-        )
+        lines = [("model", curve.values), ("measured", dots)]
+        figures.append(curve_chart(f"{title}: {curve.kind}", curve.label, curve.omega, lines, curve.half_width))
     return figures
 
 
 def nyquist_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Complex, Complex, str, str]:
     """Return the responses of the model and a record and both axis labels; impedances have -Im upwards."""
-    response, _, _ = model_curve(model, record, curve_frequencies(record))
+    response = model_response(model, record, curve_frequencies(record))
     unit = f" [{record.unit}]" if record.unit else ""
     if record.unit.endswith("Ω"):
         return response.conj(), record.response.conj(), f"Re Z{unit}", f"−Im Z{unit}"
@@ -145,7 +162,7 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> F
     """Return the chart of the residuals relative to the measured response, by frequency."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
-    response, _, _ = model_curve(model, record, omega)
+    response = model_response(model, record, omega)
     size = np.abs(record.response[order])
     missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
     return line_chart(
@@ -506,28 +523,13 @@ class FrequencyIdentification:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
-
-        def ends(pair: tuple[float, float]) -> list[float | None]:
-            return [v if math.isfinite(v) else None for v in pair]
-
-        return {
-            **(
-                {"circuit": str(self.system)}
-                if isinstance(self.system, Circuit)
-                else {"equations": [str(e) for e in self.system.equations]}
-            ),
-            "weights": self.weights,
-            "values": dict(self.values),
-            "standard_errors": {n: e if math.isfinite(e) else None for n, e in self.standard_errors.items()},
-            "intervals": {n: ends(pair) for n, pair in self.intervals.items()},
-            "chi_squared": self.chi_squared,
-            "errors": [vars(e) for e in self.errors],
-            "converged": self.converged,
-            "starts": list(self.start_counts),
-            "white": self.white,
-            "findings": [f.to_dict() for f in self.findings],
-            "warnings": list(self.warnings),
-        }
+        if isinstance(self.system, Circuit):
+            what: dict[str, Any] = {"circuit": str(self.system)}
+        else:
+            what = {"equations": [str(e) for e in self.system.equations]}
+        names = ("weights", "values", "standard_errors", "intervals", "chi_squared", "errors", "converged")
+        starts = {"starts": list(self.start_counts)}
+        return what | attributes(self, names) | starts | attributes(self, ("white", "findings", "warnings"))
 
     def __str__(self) -> str:
         return self.summary()
@@ -576,20 +578,12 @@ def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyDa
     return replace(record, output=out["output"], input=out["input"])
 
 
-def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats | None = None) -> Complex:
-    """Return the model response at the frequencies of a record, or at `omega`."""
-    if isinstance(model, Circuit):
-        return model.impedance(record.frequency if omega is None else omega)
-    response = frequency_response(model, record.frequency if omega is None else omega)
-    inputs = response_inputs(model, coupled=True)
-    values: Complex = response[model.outputs.index(record.output), inputs.index(record.input)]
-    return values
-
-
 def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
     """Return the error of a model on one record."""
     size = np.abs(record.response)
-    missed = np.abs(model_response(model, record) - record.response) / np.where(size > 0, size, np.max(size) or 1.0)
+    missed = np.abs(model_response(model, record, record.frequency) - record.response) / np.where(
+        size > 0, size, np.max(size) or 1.0
+    )
     at = int(np.argmax(missed))
     rms = 100 * float(np.sqrt(np.mean(missed**2)))
     return ResponseError(

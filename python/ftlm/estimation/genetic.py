@@ -30,6 +30,7 @@ from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_g
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import Floats, check_choice, check_threads, short_repr, whole_number
 
 #: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
@@ -216,21 +217,13 @@ def default_bounds(
 
 
 def load_pygad() -> Any:
-    """Return the module of the genetic algorithm; raise ModelError if PyGAD is not installed."""
-    try:
-        import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
-    except ImportError:
-        raise ModelError("the genetic baseline needs PyGAD; pip install 'ftlm[genetic]'") from None
-    return pygad
+    """Import PyGAD, which runs the genetic algorithm."""
+    return optional_module("pygad", "PyGAD", "'ftlm[genetic]'")
 
 
 def load_differential_evolution() -> Any:
-    """Return SciPy's differential evolution; raise ModelError if SciPy is not installed."""
-    try:
-        from scipy.optimize import differential_evolution  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this rival needs it
-    except ImportError:
-        raise ModelError("differential evolution needs SciPy; pip install 'ftlm[genetic]'") from None
-    return differential_evolution
+    """Import SciPy's differential evolution."""
+    return optional_module("scipy.optimize", "SciPy", "'ftlm[genetic]'").differential_evolution
 
 
 def genetic_search(

@@ -65,6 +65,7 @@ from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
 from ftlm.structure.structure import History, Offset, Structure, check_initial, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.formatting import finite
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import run_in_worker
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
@@ -73,7 +74,6 @@ from ftlm.validation.comparison import (
     MAX_NORMALIZED_RESIDUAL,
     Comparison,
     compare_samples,
-    finite,
     simulate_runs,
 )
 from ftlm.validation.data_advice import data_notes

@@ -21,11 +21,11 @@ from ftlm.order_search.result import SearchResult
 from ftlm.structure.order_grid import OrderGrid, restrict_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import format_bound
+from ftlm.utils.formatting import attributes, format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_threads
-from ftlm.validation.comparison import Comparison, Metrics, filter_state, finite
+from ftlm.validation.comparison import Comparison, Metrics, filter_state
 from ftlm.validation.information_criteria import InformationCriteria
 from ftlm.validation.residual_tests import Residuals, resid
 
@@ -337,24 +337,16 @@ class Identification:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
+        limits = ["limits"] if self.limits else []
         return {
-            "method": self.method,
-            "settings": self.settings,
+            **attributes(self, ("method", "settings")),
             "equations": {e.output: self.model.structure.equation_text(e) for e in self.model.equations},
-            "orders": self.orders,
-            "coefficients": self.coefficients,
-            "delays": self.delays,
-            **({"limits": self.limits} if self.limits else {}),
-            "standard_errors": {n: finite(e) for n, e in self.standard_errors.items()},
-            "intervals": {n: [finite(low), finite(high)] for n, (low, high) in self.intervals.items()},
+            **attributes(self, ("orders", "coefficients", "delays", *limits, "standard_errors", "intervals")),
             "profiled": list(self.profiles),
             **self.comparison.to_dict(),
-            "residuals": None if self.residuals is None else self.residuals.to_dict(),
-            "information": None if self.information is None else self.information.to_dict(),
-            "searches": {name: s.to_dict() for name, s in self.searches.items()},
+            **attributes(self, ("residuals", "information", "searches")),
             "choice": None if self.joint is None else self.joint.origin_text,
-            "findings": [f.to_dict() for f in self.findings],
-            "warnings": list(self.warnings),
+            **attributes(self, ("findings", "warnings")),
         }
 
     @property

@@ -15,10 +15,9 @@ from ftlm.experiment_design.problem import Kind
 from ftlm.experiment_design.spectrum import Spectrum
 from ftlm.findings import Finding, texts
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import format_bound
+from ftlm.utils.formatting import attributes, finite, format_bound, json_value
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import finite
 
 #: A limit counts as active from this fraction of it on.
 ACTIVE_LIMIT_FRACTION = 0.98
@@ -148,28 +147,24 @@ class DesignedInput:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-compatible dict without the run."""
+        spectrum = self.spectrum
         return {
-            "shape": self.shape,
-            "criterion": self.criterion,
-            "parameters": list(self.parameters),
+            **attributes(self, ("shape", "criterion", "parameters")),
             "duration": self.run.duration,
-            "step": self.step,
-            "values": dict(self.values),
-            "standard_errors": {k: {n: finite(v) for n, v in e.items()} for k, e in self.errors.items()},
+            **attributes(self, ("step", "values")),
+            "standard_errors": json_value(self.errors),
             "gain": finite(self.gain),
             "gains": dict(self.gains),
             "predicted_extremes": {
-                r.name: {"largest": r.largest, "limit": finite(r.limit), "is_active": r.is_active}
-                for r in self.predicted_extremes
+                r.name: attributes(r, ("largest", "limit", "is_active")) for r in self.predicted_extremes
             },
             "efficiency": finite(self.efficiency),
             "spectrum": {
-                "frequencies": self.spectrum.lines.frequencies.tolist(),
-                "power": self.spectrum.power.tolist(),
-                "gap": finite(self.spectrum.gap),
+                "frequencies": spectrum.lines.frequencies.tolist(),
+                "power": spectrum.power.tolist(),
+                "gap": finite(spectrum.gap),
             },
-            "findings": [f.to_dict() for f in self.findings],
-            "warnings": list(self.warnings),
+            **attributes(self, ("findings", "warnings")),
         }
 
     def __str__(self) -> str:

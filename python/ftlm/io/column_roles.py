@@ -27,83 +27,24 @@ class ColumnSelection:
     layout: Layout
 
 
-_INPUT_WORDS = frozenset(
-    (
-        "u",
-        "in",
-        "inp",
-        "input",
-        "eingang",
-        "cmd",
-        "command",
-        "current",
-        "strom",
-        "torque",
-        "drehmoment",
-        "pwm",
-        "duty",
-        "drive",
-        "force",
-        "kraft",
-        "power",
-        "leistung",
-        "heater",
-        "heating",
-        "excitation",
-        "anregung",
-        "actuator",
-        "i",
-        "im",
-        "valve",
-        "ventil",
-        "throttle",
-    )
-)
-_OUTPUT_WORDS = frozenset(
-    (
-        "y",
-        "out",
-        "output",
-        "ausgang",
-        "angle",
-        "winkel",
-        "position",
-        "pos",
-        "weg",
-        "displacement",
-        "deflection",
-        "auslenkung",
-        "theta",
-        "th",
-        "temp",
-        "temperature",
-        "temperatur",
-        "speed",
-        "velocity",
-        "drehzahl",
-        "geschwindigkeit",
-        "acceleration",
-        "accel",
-        "beschleunigung",
-        "level",
-        "pressure",
-        "druck",
-        "response",
-        "antwort",
-        "strain",
-        "dehnung",
-        "tip",
-    )
-)
-#: Voltage is an input of motors and an output of cells.
-_AMBIGUOUS_WORDS = frozenset(["voltage", "volt", "volts", "spannung", "v"])
-#: Words of reference signals, which neither enter a plant nor leave it.
-_REFERENCE_WORDS = frozenset(("ref", "reference", "setpoint", "target", "desired", "soll", "sollwert", "referenz"))
-#: Words by which a commanded input and its measurement differ.
-_COMMAND_WORDS = frozenset(("cmd", "command", "commanded"))
-_MEASUREMENT_WORDS = frozenset(("meas", "measured", "actual", "ist"))
-#: Words of temperature columns, whose degrees are not angles.
-_TEMPERATURE_WORDS = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
+#: Words of column names by what they say of a column: voltage is an input of motors and an output of cells; a reference
+#: neither enters a plant nor leaves it; a command and its measurement differ in a word; degrees of temperature are no
+#: angles.
+_WORDS_BY_ROLE = {
+    kind: frozenset(words.split())
+    for kind, words in {
+        "input": "u in inp input eingang cmd command current strom torque drehmoment pwm duty drive force kraft power "
+        "leistung heater heating excitation anregung actuator i im valve ventil throttle",
+        "output": "y out output ausgang angle winkel position pos weg displacement deflection auslenkung theta th temp "
+        "temperature temperatur speed velocity drehzahl geschwindigkeit acceleration accel beschleunigung level "
+        "pressure druck response antwort strain dehnung tip",
+        "input or output": "voltage volt volts spannung v",
+        "reference": "ref reference setpoint target desired soll sollwert referenz",
+        "command": "cmd command commanded",
+        "measurement": "meas measured actual ist",
+        "temperature": "temp temperature temperatur heat heater heating thermo",
+    }.items()
+}
 
 
 def words_of(column: str) -> set[str]:
@@ -117,12 +58,14 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
 
     References are left out, and a command beside its own measurement, if the other columns have both roles.
     """
-    measured = {_tokens(c) - _MEASUREMENT_WORDS for c in columns if _tokens(c) & _MEASUREMENT_WORDS}
+    measured = {
+        _tokens(c) - _WORDS_BY_ROLE["measurement"] for c in columns if _tokens(c) & _WORDS_BY_ROLE["measurement"]
+    }
     plant = [
         c
         for c in columns
-        if not words_of(c) & _REFERENCE_WORDS
-        and not (_tokens(c) & _COMMAND_WORDS and _tokens(c) - _COMMAND_WORDS in measured)
+        if not words_of(c) & _WORDS_BY_ROLE["reference"]
+        and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in measured)
     ]
     found = _roles_by_words(plant)
     return found if found[0] else _roles_by_words(columns)
@@ -136,9 +79,17 @@ def _tokens(column: str) -> frozenset[str]:
 def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the columns whose names have words of inputs, and those with words of outputs."""
     told = {column: words_of(column) for column in columns}
-    drives = [c for c, words in told.items() if words & _INPUT_WORDS and not words & _OUTPUT_WORDS]
-    follows = [c for c, words in told.items() if words & _OUTPUT_WORDS and not words & _INPUT_WORDS]
-    either = [c for c, words in told.items() if words & _AMBIGUOUS_WORDS and c not in drives and c not in follows]
+    drives = [
+        c for c, words in told.items() if words & _WORDS_BY_ROLE["input"] and not words & _WORDS_BY_ROLE["output"]
+    ]
+    follows = [
+        c for c, words in told.items() if words & _WORDS_BY_ROLE["output"] and not words & _WORDS_BY_ROLE["input"]
+    ]
+    either = [
+        c
+        for c, words in told.items()
+        if words & _WORDS_BY_ROLE["input or output"] and c not in drives and c not in follows
+    ]
     if either and not drives:
         drives, either = either, []
     rest = [c for c in columns if c not in drives and c not in follows]
@@ -153,7 +104,7 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
 def known_unit(stated: str, column: str = "") -> str:
     """Return the ftlm unit of a unit in a file; "" if unknown, or if degrees may mean a temperature."""
     unit = parse_unit(stated) or ""
-    return "" if unit in ("deg", "°") and words_of(column) & _TEMPERATURE_WORDS else unit
+    return "" if unit in ("deg", "°") and words_of(column) & _WORDS_BY_ROLE["temperature"] else unit
 
 
 def signal_names(columns: Mapping[str, str]) -> dict[str, str]:

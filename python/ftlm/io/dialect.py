@@ -238,7 +238,6 @@ class TableDialect:
     separator: str | None
     comma: bool
     names: list[str] | None
-    names_line: int
     units: list[str] | None
     begin: int
     width: int
@@ -323,11 +322,10 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
         _check_headless(cut[top], source, given)
     if names is not None and not own and given.separator is None:
         _check_mixed(cut, top, separator, comma, source)
-    line = cut[top - (2 if units else 1)].at if names is not None else 0
     begin = cut[top].at if top < len(cut) else cut[-1].at + 1
     if names is not None:
         width = len(names)
-    return TableDialect(separator, comma, names, line, units, begin, width, layout, assumed, mark)
+    return TableDialect(separator, comma, names, units, begin, width, layout, assumed, mark)
 
 
 def _check_width(kept: Sequence[tuple[int, str]], source: str) -> None:

@@ -29,7 +29,7 @@ _PART_WORDS = {
 #: Column names of each part, case-folded, without spaces and underscores; a leading minus inverts the sign.
 _PART_SYNONYMS = {
     part: (
-        *names,
+        *names.split(),
         *_PART_WORDS.get(part, ()),
         *(
             form.format(q, w)
@@ -39,78 +39,14 @@ _PART_SYNONYMS = {
         ),
     )
     for part, names in {
-        "frequency": (
-            "f",
-            "freq",
-            "frequency",
-            "frequenz",
-            "fréquence",
-            "frecuencia",
-            "frequenza",
-            "hz",
-            "w",
-            "omega",
-            "ω",
-            "angularfrequency",
-            "kreisfrequenz",
-            "rad/s",
-        ),
-        "real": ("realpart", "realteil", "z'", "z′", "z’", "zr", "z'(a)"),
-        "imag": (
-            "imagpart",
-            "imaginarypart",
-            "imaginärteil",
-            "imaginaerteil",
-            "z''",
-            "z″",
-            "z′′",
-            "zi",
-            "z''(b)",
-            "z’’",
-        ),
-        "magnitude": (
-            "magnitude",
-            "gain",
-            "amplitude",
-            "betrag",
-            "verstärkung",
-            "verstaerkung",
-            "modulus",
-            "|z|",
-            "|h|",
-            "|g|",
-            "amp",
-            "z",
-            "db",
-            "impedance",
-            "amplitudengang",
-        ),
-        "phase": (
-            "phi",
-            "φ",
-            "ϕ",
-            "angle",
-            "winkel",
-            "zphz",
-            "phz",
-            "theta",
-            "θ",
-            "deg",
-            "°",
-            "phasenwinkel",
-            "phasengang",
-        ),
-        "deviation": (
-            "std",
-            "sigma",
-            "σ",
-            "deviation",
-            "stddev",
-            "sd",
-            "stdev",
-            "standarddeviation",
-            "standardabweichung",
-        ),
+        "frequency": "f freq frequency frequenz fréquence frecuencia frequenza hz w omega ω angularfrequency "
+        "kreisfrequenz rad/s",
+        "real": "realpart realteil z' z′ z’ zr z'(a)",
+        "imag": "imagpart imaginarypart imaginärteil imaginaerteil z'' z″ z′′ zi z''(b) z’’",
+        "magnitude": "magnitude gain amplitude betrag verstärkung verstaerkung modulus |z| |h| |g| amp z db "
+        "impedance amplitudengang",
+        "phase": "phi φ ϕ angle winkel zphz phz theta θ deg ° phasenwinkel phasengang",
+        "deviation": "std sigma σ deviation stddev sd stdev standarddeviation standardabweichung",
     }.items()
 }
 _ANGULAR_FREQUENCY_NAMES = frozenset(("w", "omega", "ω", "angularfrequency", "kreisfrequenz", "rad/s"))

@@ -10,7 +10,7 @@ from ftlm import _core
 from ftlm.errors import ModelError
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import check_choice, real_number, whole_number
+from ftlm.utils.validation import check_choice, check_whole, real_number, whole_number
 
 Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
@@ -55,16 +55,12 @@ class SearchSettings:
         check_choice("norm", self.norm, get_args(Norm))
         check_choice("coefficients", self.coefficients, get_args(Coefficients))
         check_choice("row_basis", self.row_basis, get_args(RowBasis))
-        top, length = whole_number(self.top), whole_number(self.innovation_length)
+        top = whole_number(self.top)
         if top is None or not 1 <= top <= MAX_TOP:
             raise ModelError(
                 f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read"
             )
-        if length is None or not 1 <= length < 1 << 62:
-            raise ModelError(
-                f"{setting('innovation_length')} {self.innovation_length!r} is not a whole number of at least 1; the "
-                "paper's is 7"
-            )
+        length = check_whole("innovation_length", self.innovation_length, 1)
         given = self.prior_covariance
         covariance = None if given is None else real_number("prior_covariance", given)
         if covariance is not None and not 0 < covariance < math.inf:
@@ -92,8 +88,8 @@ class SearchSettings:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
-    def core_arguments(self, threads: int, memory: int | None = None) -> _core._Options:
-        """Return the settings as arguments of the core; the default memory limit is that of this machine."""
+    def core_arguments(self, threads: int) -> _core._Options:
+        """Return the settings as arguments of the core; the memory limit is that of this machine."""
         return {
             "criterion": self.criterion,
             "norm": self.norm,
@@ -104,7 +100,7 @@ class SearchSettings:
             "threads": threads,
             "pruning": self.pruning,
             "iterations": MAX_IV_ITERATIONS if self.coefficients == "instrumental-variables" else 0,
-            "memory": memory_limit() if memory is None else memory,
+            "memory": memory_limit(),
         }
 
     def to_dict(self) -> dict[str, Any]:

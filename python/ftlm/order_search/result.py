@@ -12,7 +12,7 @@ from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, Exact, number, symbol, symbol_html
+from ftlm.utils.formatting import Cell, Exact, attributes, number, symbol, symbol_html
 from ftlm.utils.parameters import choose_text, parameter
 
 if TYPE_CHECKING:
@@ -96,23 +96,10 @@ class OrderCertificate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        return {
-            "lower_bound": self.lower_bound,
-            "best": self.best if self.orders else None,
-            "proved_tolerance": self.proved_tolerance,
-            "requested_tolerance": self.requested_tolerance,
-            "orders": self.orders,
-            "intervals": {name: list(interval) for name, interval in self.intervals.items()},
-            "min_separation": self.min_separation,
-            "max_term_ratio": self.max_term_ratio,
-            "cells": self.cells,
-            "open_cells": self.open_cells,
-            "m": self.m,
-            "free_run_nr": self.free_run_nr if math.isfinite(self.free_run_nr) else None,
-            "start_errors": [error if math.isfinite(error) else None for error in self.start_errors],
-            "beatable": list(self.beatable),
-            "findings": [f.to_dict() for f in self.findings],
-        }
+        proof = ("lower_bound", "best", "proved_tolerance", "requested_tolerance", "orders", "intervals")
+        options = ("min_separation", "max_term_ratio", "cells", "open_cells", "m")
+        told = attributes(self, (*proof, *options, "free_run_nr", "start_errors", "beatable", "findings"))
+        return told if self.orders else told | {"best": None}
 
     def __str__(self) -> str:
         given = [
@@ -263,16 +250,9 @@ class SearchResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        return {
-            "candidates": self.candidates,
-            "exclusion_counts": self.exclusion_counts,
-            "excluded_by_box": self.excluded_by_box,
-            "m": self.m,
-            "settings": self.settings,
-            "table": [dict(vars(row)) for row in self.table],
-            "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
-            "at_grid_edge": self.at_grid_edge,
-        } | self._judgement_dict()
+        names = ("candidates", "exclusion_counts", "excluded_by_box", "m", "settings", "table")
+        failures = {"failures": [{"orders": o, "reason": reason} for o, reason in self.failures]}
+        return attributes(self, names) | failures | {"at_grid_edge": self.at_grid_edge} | self._judgement_dict()
 
     def _judgement_dict(self) -> dict[str, Any]:
         """Return verdict and findings for JSON; empty for a search without a verdict."""
@@ -405,7 +385,7 @@ class StoreStatus:
         return text
 
 
-def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What became of the candidates") -> Table:
+def search_summary(searches: Mapping[str, SearchResult]) -> Table:
     """Return a table of kept and excluded candidates, by reason; together they are all candidates."""
     reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.exclusion_counts))
     rows: list[list[Cell]] = [
@@ -419,7 +399,7 @@ def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What b
         for name, s in searches.items()
     ]
     return Table(
-        title,
+        "What became of the candidates",
         ("search", "ranked by", "candidates", "kept", *reasons),
         rows,
         groups=(("", 4), ("left out", len(reasons))) if reasons else (),
@@ -435,7 +415,7 @@ def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What b
     )
 
 
-def search_top(name: str, search: SearchResult, *, rows: int = 10, title: str = "") -> Table:
+def search_top(name: str, search: SearchResult, *, rows: int = 10) -> Table:
     """Return the first rows of an order search.
 
     Parameters
@@ -446,15 +426,13 @@ def search_top(name: str, search: SearchResult, *, rows: int = 10, title: str = 
         The search.
     rows
         Most rows.
-    title
-        Caption; by default it names the search.
     """
     law = len(search.model.equations) > 1
     score = {"l1": "error (45)", "l2": "RMSE"}.get(search.settings["norm"], "score")
     orders, coefficients = list(search.orders), list(search.coefficients)
     kept = search.table[:rows]
     return Table(
-        title or f"Best {len(kept)} of {number(search.candidates)} candidates: {_search_name(name)}",
+        f"Best {len(kept)} of {number(search.candidates)} candidates: {_search_name(name)}",
         ("rank", "score" if law else score, *map(symbol_html, orders), *map(symbol_html, coefficients)),
         [
             [r.rank, r.score, *(Exact(r.orders[n]) for n in orders), *(r.coefficients[n] for n in coefficients)]

@@ -34,6 +34,7 @@ from ftlm.svg.line_chart import LINE_STYLES
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.parameters import parameter
+from ftlm.utils.resources import optional_module
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, as_array, as_floats
 from ftlm.validation.comparison import Comparison
@@ -47,10 +48,7 @@ NOTEBOOK_DPI = 110
 
 def figure_of(rows: int, columns: int = 1, *, row: float = ROW_HEIGHT_INCH, **options: Any) -> tuple[Any, Any]:
     """Return a figure with a grid of axes, created without pyplot."""
-    try:
-        module = importlib.import_module("matplotlib.figure")
-    except ImportError:
-        raise ModelError("matplotlib is not installed; pip install 'ftlm[plot]'") from None
+    module = optional_module("matplotlib.figure", "matplotlib", "'ftlm[plot]'")
 
     class NotebookFigure(module.Figure):  # type: ignore[misc, name-defined]
         """Figure that notebooks show although pyplot does not manage it."""
@@ -150,10 +148,6 @@ def fit(
     units: Mapping[str, str] = {}
     if isinstance(result, Comparison):
         comparison = result
-    elif not isinstance(result, (Identification, Model)):
-        raise ModelError(
-            f"result is {type(result).__name__}; give an identification, a model with runs or a comparison"
-        )
     else:
         model = result.model if isinstance(result, Identification) else result
         units = model.units
@@ -243,8 +237,6 @@ def run(run: Run, *, ax: Any = None) -> Any:
     ModelError
         Something that is not a run, axes that are none or too many or few, or no matplotlib.
     """
-    if not isinstance(run, Run):
-        raise ModelError(f"run is {type(run).__name__}; give a run, such as ftlm.load returns")
     names = [*run.outputs, *run.inputs]
     figure, axes = axes_for(ax, len(names), row=ROW_HEIGHT_INCH * 0.6)
     for axis, name in zip(axes[:, 0], names, strict=True):
@@ -277,8 +269,6 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     found = tests.residuals if isinstance(tests, Identification) else tests
     if found is None:
         raise ModelError("the runs were too short for residual tests, so there is nothing to draw")
-    if not isinstance(found, Residuals):
-        raise ModelError(f"tests is {type(found).__name__}; give what resid returns, or an identification")
     drawn = {output: [("itself", part.whiteness), *part.inputs.items()] for output, part in found.outputs.items()}
     columns = max(map(len, drawn.values()))
     figure, axes = axes_for(ax, len(drawn), columns)
@@ -320,12 +310,11 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     ModelError
         An identification without a search, or without that one; fewer than two free orders; no matplotlib.
     """
-    found: Landscape | Identification | None = result
-    if isinstance(result, Identification) and result.joint is not None:
+    if not isinstance(result, Identification):
+        found: Landscape | None = result
+    elif result.joint is not None:
         found = output_error_landscape(result)
-        if found is None:
-            raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
-    elif isinstance(result, Identification):
+    else:
         if not result.searches or result.task is None:
             raise ModelError("this identification searched no order grid, so it has no landscape")
         name = next(iter(result.searches)) if output is None else output
@@ -333,8 +322,8 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
             raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")
         part = result.task.structure if name == "stage" else result.task.structure.equation(name)
         found = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
-    if not isinstance(found, Landscape):
-        raise ModelError(f"result is {type(found).__name__}; give an identification or a landscape")
+    if found is None:
+        raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
     figure, axes = axes_for(ax, 1, row=3.2)
     axis = axes[0, 0]
     scores = np.where(np.isfinite(found.scores) & (found.scores > 0), found.scores, np.nan)
@@ -391,11 +380,8 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
 
 
 def _model_of(model: Model | Identification) -> Model:
-    """Return the model of an argument; raise for another type."""
-    found = model.model if isinstance(model, Identification) else model
-    if not isinstance(found, Model):
-        raise ModelError(f"model is {type(model).__name__}; give a model or an identification")
-    return found
+    """Return the model of an argument."""
+    return model.model if isinstance(model, Identification) else model
 
 
 @check_arguments
@@ -504,8 +490,6 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     ModelError
         Something that is not an identification, one without a joint covariance, axes that are none, or no matplotlib.
     """
-    if not isinstance(result, Identification):
-        raise ModelError(f"result is {type(result).__name__}; give an identification")
     if result.joint is None:
         raise ModelError(
             f"method {result.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
@@ -547,8 +531,6 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
         Something that is not a result, axes that are none or too many or few, or no matplotlib.
     """
     comparison = result.comparison if isinstance(result, Identification) else result
-    if not isinstance(comparison, Comparison):
-        raise ModelError(f"result is {type(result).__name__}; give an identification or a comparison")
     units = result.model.units if isinstance(result, Identification) else {}
     pairs = [(k, name) for k in range(len(comparison.per_run)) for name in comparison.output_error]
     figure, axes = axes_for(ax, len(pairs), 2, **({} if ax is not None else {"width_ratios": [2.0, 1.0]}))
@@ -585,11 +567,8 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     ModelError
         No model, something that is not a comparison, models with other outputs, axes that are none, or no matplotlib.
     """
-    if not isinstance(compared, Mapping) or not compared:
+    if not compared:
         raise ModelError("bars need at least one model; give comparisons by name, such as {'integer': a, 'free': b}")
-    for name, comparison in compared.items():
-        if not isinstance(comparison, Comparison):
-            raise ModelError(f"{name!r} is {type(comparison).__name__}; give a comparison, such as compare returns")
     outputs = list(next(iter(compared.values())).output_error)
     for name, comparison in compared.items():
         if list(comparison.output_error) != outputs:
@@ -638,8 +617,6 @@ def design(result: DesignedInput, *, ax: Any = None) -> Any:
     ModelError
         Another type of result, the wrong number of axes, or no matplotlib.
     """
-    if not isinstance(result, DesignedInput):
-        raise ModelError(f"result is {type(result).__name__}; give what design_input returns")
     run, square = result.run, result.reference
     figure, axes = axes_for(ax, len(run.inputs) + len(run.outputs) + 1, row=1.9)
     limits = {r.name: r.limit for r in result.predicted_extremes}

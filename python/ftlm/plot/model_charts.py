@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs, transfer_functions
 from ftlm.analysis.poles import modes
 from ftlm.analysis.time_response import Response, response
-from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER
+from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER, curve_chart
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import COULOMB_PREFIX
 from ftlm.svg.complex_plane import plane_chart
@@ -56,26 +56,9 @@ def bode_figures(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
     figures = []
     for curve in curves:
         title = f"{symbol(curve.output)} from {symbol(curve.input)}"
-        shade = "Shade: 95 % band, from the covariance of the fit." if curve.gain_spread is not None else ""
-        for kind, values, spread, label in (
-            ("gain", curve.gain, curve.gain_spread, "gain [dB]"),
-            ("phase", curve.phase, curve.phase_spread, "phase [degrees]"),
-        ):
-            bands = [] if spread is None else [(values - spread, values + spread)]
-            figures.append(
-                line_chart(
-                    omega,
-                    [("", values)],
-                    log_x=True,
-                    bands=bands,
-                    title=f"{title}: {kind}",
-                    width=SMALL_WIDTH_PX,
-                    height=220,
-                    x_label="frequency [rad/s]",
-                    y_label=label,
-                    caption=shade,
-                )
-            )
+        gain, phase = [("", curve.gain)], [("", curve.phase)]
+        figures.append(curve_chart(f"{title}: gain", "gain [dB]", omega, gain, curve.gain_spread))
+        figures.append(curve_chart(f"{title}: phase", "phase [degrees]", omega, phase, curve.phase_spread))
     return figures
 
 

@@ -212,22 +212,8 @@ def identification_page(
     ----------
     result
         From :func:`ftlm.identify`.
-    path
-        File to write.
-    validation
-        Runs that the model was not identified from.
-    force
-        Overwrite an existing file.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be written.
+    path, validation, force
+        See :meth:`ftlm.Identification.report`.
     """
     check_free(path, force=force)
     model = result.model
@@ -506,15 +492,15 @@ def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
     ]
 
 
-def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
+def starts_table(joint: JointFit, *, rows: int = 10) -> Table:
     """Return the initial guesses and their costs on decimated samples, best first."""
     kept = joint.starts[:rows]
     cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
     note = f"{joint.origin_text}. The best ones went on on all samples." if joint.starts else ""
-    return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
+    return Table("Automatic initial guesses", ("rank", "start from", "cost per residual"), cells, note=note)
 
 
-def settings_table(result: Identification, *, title: str = "What the result depends on") -> Table:
+def settings_table(result: Identification) -> Table:
     """Return a table of the settings of a result: estimator, criterion, M, p, K0, initial terms and runs."""
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
@@ -535,7 +521,7 @@ def settings_table(result: Identification, *, title: str = "What the result depe
         [Markup("run <q>{}</q>").format(name), f"{number(step * comparison.m)} s, pulses of {number(step * 1e3)} ms"]
         for (name, _, _), step in zip(comparison.per_run, comparison.step, strict=True)
     ]
-    return Table(title, ("setting", "used"), rows)
+    return Table("What the result depends on", ("setting", "used"), rows)
 
 
 #: Phrases for the result of the independence test.
@@ -581,17 +567,7 @@ def model_page(
     model
         From :func:`ftlm.load_model`.
     path, validation, force
-        See :func:`identification_page`.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        See :func:`identification_page`.
+        See :meth:`ftlm.Identification.report`.
     """
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)

@@ -209,7 +209,7 @@ def derivative_html(order: Order, signal: str) -> Markup:
     return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
 
 
-def parameter_table(model: Model, joint: JointFit | None = None, *, title: str = "Orders and coefficients") -> Table:
+def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
     """Return a table of orders and coefficients with their terms, standard errors and reference values.
 
     Parameters
@@ -218,8 +218,6 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
         Model; its ``estimate`` is used without a fit.
     joint
         Output-error fit of the model with its standard errors.
-    title
-        Caption.
     """
     reference = model.structure.reference
     units = parameter_units(model)
@@ -290,7 +288,7 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
     kept = [i for i in range(len(columns)) if i not in left_out]
     groups = (("", 3), ("95 % interval", 2), ("", len(kept) - 5)) if known else ()
     shown_rows = [[cells[i] for i in kept] for cells in rows]
-    return Table(title, tuple(columns[i] for i in kept), shown_rows, groups=groups, note=note)
+    return Table("Orders and coefficients", tuple(columns[i] for i in kept), shown_rows, groups=groups, note=note)
 
 
 def unit_html(unit: str) -> Markup:

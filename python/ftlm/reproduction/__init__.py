@@ -8,22 +8,16 @@ from ftlm.reproduction.cross_validation import (
     cross_validate_orders,
     cross_validation_page,
 )
-from ftlm.reproduction.demo import Demo, run_demo
 from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads, printed_saturation
-from ftlm.reproduction.reproduction import Reproduction, reproduce
 from ftlm.reproduction.simulated_arm import demo_plant, demo_run
 from ftlm.reproduction.stage_result import Candidate, Rival, Stage
-from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
 
 __all__ = [
     "AsPrinted",
     "Candidate",
     "Check",
     "Deflection",
-    "Demo",
     "OrderCrossValidation",
-    "PaperRow",
-    "Reproduction",
     "Rival",
     "Stage",
     "Verdict",
@@ -33,11 +27,6 @@ __all__ = [
     "demo_plant",
     "demo_run",
     "implied_spreads",
-    "paper_row",
-    "paper_table",
-    "paper_table_text",
     "printed_saturation",
-    "reproduce",
-    "run_demo",
     "table_3_coefficients",
 ]

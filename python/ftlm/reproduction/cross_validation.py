@@ -27,11 +27,11 @@ from ftlm.structure.structure import Structure
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, symbol_html
+from ftlm.utils.formatting import Cell, Exact, finite, format_bound, json_value, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, join_names
-from ftlm.validation.comparison import Comparison, finite, json_value
+from ftlm.validation.comparison import Comparison
 
 #: Free orders of each structure; the other orders are integer.
 INTEGER_KIND = "whole orders"
@@ -568,20 +568,8 @@ def cross_validation_page(found: OrderCrossValidation, path: str | os.PathLike[s
     ----------
     found
         From :func:`cross_validate_orders`.
-    path
-        File to write.
-    force
-        Overwrite.
-
-    Returns
-    -------
-    pathlib.Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        The file exists and ``force`` is not set, or cannot be written.
+    path, force
+        See :meth:`ftlm.Identification.report`.
     """
     check_free(path, force=force)
     each = {kind: [_verdict(o, d.verdict(kind)) for o, d in found.deflections.items()] for kind in VERDICT_SUBJECTS}

@@ -32,8 +32,7 @@ from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_tab
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
-from ftlm.utils.formatting import Cell, symbol, wrap_text
-from ftlm.validation.comparison import json_value
+from ftlm.utils.formatting import Cell, json_value, symbol, wrap_text
 
 #: Candidates that the result of an order search keeps.
 TOP_CANDIDATES = 20
@@ -253,13 +252,7 @@ def demo_details(demo: Demo) -> str:
 
 
 def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the demonstration as one HTML page: verdicts, fits on the validation run, then the tables of each stage.
-
-    Raises
-    ------
-    DataError
-        The file exists and ``force`` is not set, or cannot be written.
-    """
+    """Write the demonstration as one HTML page: verdicts, fits on the validation run, then the tables of each stage."""
     boxes = Markup("").join(
         verdict_box(checked.verdict, f"Stage {stage}, output error: ")
         for stage, checked in demo.validations.items()

@@ -43,10 +43,10 @@ from ftlm.reproduction.stage_result import (
 )
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
+from ftlm.utils.formatting import attributes, json_value
 from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
-from ftlm.utils.validation import check_threads, join_names, nearest, real_number, short_repr, whole_number
-from ftlm.validation.comparison import attributes, json_value
+from ftlm.utils.validation import check_threads, check_whole, join_names, nearest, real_number
 
 #: Name of the given runs in verdicts.
 MEASURED_LABEL = "as measured"
@@ -118,20 +118,7 @@ class Reproduction:
         return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
 
     def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the reproduction as one offline HTML file.
-
-        Parameters
-        ----------
-        path
-            File to write.
-        force
-            Overwrite an existing file.
-
-        Raises
-        ------
-        DataError
-            The file exists and ``force`` is not set, or cannot be written.
-        """
+        """Write the reproduction as one HTML file; arguments and errors as in :meth:`ftlm.Identification.report`."""
         return reproduction_page(self, path, force=force)
 
     def save(self, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
@@ -336,8 +323,7 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
     for name in arms or ():
         if name not in ARM_VARIANTS:
             raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
-    if not 1 <= (whole_number(records) or 0) <= MAX_RECORDS:
-        raise ModelError(f"{setting('records')} {short_repr(records)} is not a whole number from 1 to {MAX_RECORDS}")
+    check_whole("records", records, 1, MAX_RECORDS)
     return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 

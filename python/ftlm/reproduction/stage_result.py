@@ -28,9 +28,9 @@ from ftlm.simulation.simulate import explicit_euler
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
-from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, symbol
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, attributes, json_value, symbol
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Comparison, Metrics, attributes, compare_means, json_value, metrics
+from ftlm.validation.comparison import Comparison, Metrics, compare_means, metrics
 
 #: Steps between two points of a convergence curve; the effect of p is limited to the first steps.
 TRACE_EVERY = 2

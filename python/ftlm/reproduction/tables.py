@@ -207,7 +207,7 @@ def printed_head(words: str) -> Markup:
 def printed_cells(words: str, row: printed.PublishedRow, *, criteria: bool = True) -> list[Cell]:
     """Cells of a printed row."""
     cells = [printed_head(words), *number_cells(row.orders, row.coefficients)]
-    return [*cells, row.error, row.rmse, row.nr] if criteria else cells
+    return [*cells, *row.criteria] if criteria else cells
 
 
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
@@ -422,7 +422,7 @@ def printed_reading_table(found: Reproduction, stage: Stage) -> Table:
         for p, row in found.as_printed[output].rows.items():
             stated = printed.FRACTIONAL_ROWS[output][p]
             ours = [*map(row.coefficients.get, COEFFICIENT_LETTERS), *criteria_cells(row.equation)]
-            theirs = [*map(stated.coefficients.get, COEFFICIENT_LETTERS), stated.error, stated.rmse, stated.nr]
+            theirs = [*map(stated.coefficients.get, COEFFICIENT_LETTERS), *stated.criteria]
             pairs = zip(ours, theirs, strict=True)
             ratios = [number(float(a) / b, 3) if a is not None and b else None for a, b in pairs]
             yield [f"p = {p}", *ours]

@@ -85,13 +85,13 @@ def _no_library(error: OSError) -> RigFault:
     )
 
 
-def driver_state(card: str = "0") -> str:
+def driver_state() -> str:
     """Describe whether a board is usable: vendor package, library, and a test that opens the board."""
     try:
         _driver()
     except RigFault as fault:
         return f"not found: {fault}"
-    board = QuanserBoard(card)
+    board = QuanserBoard()
     try:
         board.open()
     except RigFault as fault:

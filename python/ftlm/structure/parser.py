@@ -219,15 +219,6 @@ def _friction_of(words: EquationParser, output: str, leading: float) -> Friction
     return replace(scaled, more=replace(words.stribeck[0], factor=words.stribeck[0].factor / leading))
 
 
-def parse_equation(text: str) -> Equation:
-    """Parse one equation without offset and input nonlinearities; see :func:`equation`."""
-    (words,) = _parse_lines([text])
-    if words.offset or words.limits:
-        what = "an offset" if words.offset else "a limit of an input"
-        raise ModelError(f"equation {text!r}: {what} belongs to a structure; use equation(…)")
-    return _equation_of(words)
-
-
 def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
     """Merge the input nonlinearities of all equations; each input must have the same one in every term."""
     found: dict[tuple[str, str], Value] = {}

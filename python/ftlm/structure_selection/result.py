@@ -19,9 +19,8 @@ from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell
+from ftlm.utils.formatting import Cell, finite
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import finite
 
 #: Maximum number of printed rows, and the fit [%] below which values are not distinguished.
 MAX_PRINTED_ROWS, MIN_PRINTED_FIT_PERCENT = 12, -1000.0

@@ -165,8 +165,8 @@ class Section:
         Further warnings in a collapsed list.
     fold
         Title of the collapsed part; it is open in print.
-    folded_paragraphs, folded_tables
-        Text and tables of the collapsed part.
+    folded_tables
+        Tables of the collapsed part.
     collapsed
         Whether only the heading is shown until it is clicked; the section is open in print.
     """
@@ -179,13 +179,12 @@ class Section:
     small: bool = False
     more: Sequence[str] = ()
     fold: str = "Numbers"
-    folded_paragraphs: Sequence[str] = ()
     folded_tables: Sequence[Table] = ()
     collapsed: bool = False
 
     def __post_init__(self) -> None:
         # A str is a sequence of characters; treat it as one paragraph.
-        for name in ("paragraphs", "warnings", "more", "folded_paragraphs"):
+        for name in ("paragraphs", "warnings", "more"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, (getattr(self, name),))
 
@@ -285,24 +284,6 @@ class ReportMixin(ABC):
         """Content of the report."""
 
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the result as one HTML file that opens offline.
-
-        Parameters
-        ----------
-        path
-            File to write.
-        force
-            Overwrite an existing file.
-
-        Returns
-        -------
-        pathlib.Path
-            The file.
-
-        Raises
-        ------
-        DataError
-            The file exists and ``force`` is not set, or cannot be written.
-        """
+        """Write the result as one HTML file; arguments and errors as in :meth:`ftlm.Identification.report`."""
         page = self._page()
         return write_page(path, title=page.title, sections=page.sections, lead=page.lead, force=force)

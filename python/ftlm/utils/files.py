@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import logging
 import os
 import re
@@ -18,8 +17,9 @@ import msgspec
 import msgspec.toml
 
 from ftlm._core import __version__
-from ftlm.errors import DataError, ModelError
+from ftlm.errors import DataError
 from ftlm.utils.parameters import parameter
+from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import error_text, nearest, short_repr
 
 #: INFO: files read and written, start and end of fits. WARNING: findings that make a result doubtful.
@@ -313,15 +313,12 @@ class JsonFormat(Generic[T]):
         Type of the content.
     latest_schema
         Latest schema that this version reads.
-    max_bytes
-        Largest file that is read.
     """
 
     what: str
     source: str
     kind: type[T]
     latest_schema: int
-    max_bytes: int = MAX_SMALL_FILE_BYTES
 
     def read(self, path: str | os.PathLike[str]) -> T:
         """Read and decode a file.
@@ -331,7 +328,7 @@ class JsonFormat(Generic[T]):
         DataError
             A file that cannot be read, is too large, has another format, or is of a later version.
         """
-        content = read_small_file(path, self.what, self.source, self.max_bytes)
+        content = read_small_file(path, self.what, self.source, MAX_SMALL_FILE_BYTES)
         file = Path(path)
         try:
             return msgspec.json.decode(content, type=self.kind)
@@ -382,8 +379,5 @@ def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:
     ModelError
         pandas is not installed.
     """
-    try:
-        pandas = importlib.import_module("pandas")
-    except ImportError:
-        raise ModelError("pandas is not installed; pip install pandas") from None
+    pandas = optional_module("pandas", "pandas", "pandas")
     return pandas.DataFrame.from_records(list(rows)).set_index(list(index))

@@ -1,4 +1,4 @@
-"""Formatting: Greek symbols, subscripts, significant digits, word wrap, control characters."""
+"""Formatting: Greek symbols, subscripts, significant digits, word wrap, control characters, values for JSON."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import re
 import shutil
 import sys
 import textwrap
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from numbers import Integral
 from typing import Any, TextIO, cast
 
@@ -161,3 +163,26 @@ def escape_standard_streams() -> None:
         stream = getattr(sys, name)
         if not isinstance(stream, EscapedStream):
             setattr(sys, name, cast("TextIO", EscapedStream(stream)))
+
+
+def finite(value: float) -> float | None:
+    """Return a float for JSON, or None if it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def attributes(value: object, names: Iterable[str]) -> dict[str, Any]:
+    """Return some attributes of an object for JSON."""
+    return {name: json_value(getattr(value, name)) for name in names}
+
+
+def json_value(value: Any) -> Any:
+    """Return a value for JSON: mappings, sequences, and dataclasses by their fields. Infinity is None."""
+    if isinstance(value, Mapping):
+        return {f"{k:g}" if isinstance(k, float) else str(k): json_value(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_value(each) for each in value]
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if is_dataclass(value):
+        return attributes(value, [each.name for each in fields(value)])
+    return finite(value) if isinstance(value, float) else value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import sys
@@ -219,3 +220,16 @@ def _end_with_parent(_process: int) -> None:
             os._exit(1)
 
         threading.Thread(target=wait, name="ftlm parent", daemon=True).start()
+
+
+def optional_module(name: str, package: str, install: str) -> Any:
+    """Import a module of a package that ftlm does not require; raise ModelError with the command that installs it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ModelError(f"{package} is not installed; pip install {install}") from None
+
+
+def python_control() -> Any:
+    """Import python-control."""
+    return optional_module("control", "python-control", "'ftlm[control]'")

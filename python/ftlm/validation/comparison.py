@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields, is_dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -40,31 +40,8 @@ from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, Exact, symbol_html
+from ftlm.utils.formatting import Cell, Exact, attributes, json_value, symbol_html
 from ftlm.utils.validation import Floats, as_floats
-
-
-def finite(value: float) -> float | None:
-    """Return a float for JSON, or None if it is not finite."""
-    return float(value) if math.isfinite(value) else None
-
-
-def attributes(value: object, names: Iterable[str]) -> dict[str, Any]:
-    """Return some attributes of an object for JSON."""
-    return {name: json_value(getattr(value, name)) for name in names}
-
-
-def json_value(value: Any) -> Any:
-    """Return a value for JSON: mappings, sequences, and dataclasses by their fields. Infinity is None."""
-    if isinstance(value, Mapping):
-        return {f"{k:g}" if isinstance(k, float) else str(k): json_value(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_value(each) for each in value]
-    if hasattr(value, "to_dict"):
-        return value.to_dict()
-    if is_dataclass(value):
-        return attributes(value, [each.name for each in fields(value)])
-    return finite(value) if isinstance(value, float) else value
 
 
 @dataclass(frozen=True)
@@ -90,7 +67,7 @@ class Metrics:
 
     def to_dict(self) -> dict[str, float | None]:
         """Return a dictionary for JSON."""
-        return {name: finite(getattr(self, name)) for name in ("error", "rmse", "nr", "fit")}
+        return attributes(self, ("error", "rmse", "nr", "fit"))
 
 
 #: Metrics of an unknown error.
@@ -225,21 +202,12 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
+        parts = ("run", "equation_error", "output_error")
         return {
-            "m": self.m,
-            "output_error": {n: f.to_dict() for n, f in self.output_error.items()},
-            "equation_error": {n: f.to_dict() for n, f in self.equation_error.items()},
-            "runs": [
-                {
-                    "run": name,
-                    "equation_error": {n: f.to_dict() for n, f in equation.items()},
-                    "output_error": {n: f.to_dict() for n, f in output.items()},
-                }
-                for name, equation, output in self.per_run
-            ],
-            **({"offsets": list(self.offsets)} if self.offsets else {}),
-            "findings": [f.to_dict() for f in self.findings],
-            "warnings": list(self.warnings),
+            **attributes(self, ("m", "output_error", "equation_error")),
+            "runs": [dict(zip(parts, json_value(part), strict=True)) for part in self.per_run],
+            **attributes(self, ["offsets"] if self.offsets else []),
+            **attributes(self, ("findings", "warnings")),
         }
 
     def __str__(self) -> str:
@@ -583,9 +551,7 @@ def validation_fit_findings(before: Mapping[str, float], validation: Comparison)
 _METRIC_LABELS = ("error (45)", "RMSE", "NR", "fit %")
 
 
-def errors_table(
-    compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None, title: str = "Both errors"
-) -> Table:
+def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None) -> Table:
     """Return equation error and output error side by side, a row for each output of each comparison.
 
     Parameters
@@ -595,16 +561,13 @@ def errors_table(
         several runs follow with their own rows.
     units
         Units of the outputs.
-    title
-        Caption.
     """
+    title = "Both errors"
     rows: list[list[Cell]] = []
     headings: dict[int, str] = {}
     unequated: dict[str, str] = {}
 
-    def add(
-        heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics], without: Container[str]
-    ) -> None:
+    def add(heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics]) -> None:
         headings[len(rows)] = heading
         for name in output:
             unit = (units or {}).get(name, "")
@@ -615,12 +578,12 @@ def errors_table(
             )
 
     for label, comparison in compared:
-        runs, without = comparison.per_run, comparison.without_equation_error
-        unequated |= without
+        runs = comparison.per_run
+        unequated |= comparison.without_equation_error
         if len(runs) > 1:
-            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error, without)
+            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error)
         for name, equation, output in runs:
-            add(f"{label}: {name}", equation, output, without)
+            add(f"{label}: {name}", equation, output)
     reasons = [f"{words}." for words in describe_missing_equation_errors(unequated)]
     own = 1 + len(_METRIC_LABELS)
     if unequated and all(cell is None for row in rows for cell in row[1:own]):

@@ -6,7 +6,7 @@ import html
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from ftlm.findings import Finding, make_finding, unique
 from ftlm.kernels import pulse_means
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import attributes
 from ftlm.utils.linalg import orthonormal
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import estimate_noise, is_rest
@@ -518,10 +519,7 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        parts = {n: getattr(self, n) for n in ("run", "rows", "step", "duration")}
-        signals = [asdict(s) for s in self.signals]
-        findings = [f.to_dict() for f in self.findings]
-        return {**parts, "signals": signals, "findings": findings, "warnings": list(self.warnings)}
+        return attributes(self, ("run", "rows", "step", "duration", "signals", "findings", "warnings"))
 
     def __str__(self) -> str:
         width = max(len(name) for name in ("signal", *(s.name for s in self.signals))) + 2

@@ -12,6 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ftlm import _core
+from ftlm.utils.formatting import attributes
 from ftlm.utils.linalg import minimum_norm_solution
 from ftlm.utils.statistics import chi_squared, robust_deviation
 from ftlm.utils.validation import Floats
@@ -100,8 +101,7 @@ class FeedbackTest:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        figures = {"ratio": self.ratio, "share": self.share, "rows": self.rows, "bias": self.bias}
-        return {"state": self.state, "reason": self.reason, "has_feedback": self.has_feedback, **figures}
+        return attributes(self, ("state", "reason", "has_feedback", "ratio", "share", "rows", "bias"))
 
 
 def feedback_test(

@@ -6,13 +6,10 @@ import math
 from dataclasses import dataclass
 
 from ftlm.data.sampling import drop_missing
-from ftlm.errors import ModelError
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, Exact
-from ftlm.utils.parameters import setting
-from ftlm.utils.validation import whole_number
-from ftlm.validation.comparison import finite
+from ftlm.utils.formatting import Cell, Exact, attributes
+from ftlm.utils.validation import check_whole
 from ftlm.validation.residual_tests import Residuals
 
 
@@ -41,8 +38,7 @@ class InformationCriteria:
 
     def to_dict(self) -> dict[str, float | int | None]:
         """Return a dictionary for JSON."""
-        shown = {n: finite(getattr(self, n)) for n in ("log_likelihood", "aic", "aicc", "bic")}
-        return {"parameters": self.parameters, "samples": self.samples, **shown}
+        return attributes(self, ("parameters", "samples", "log_likelihood", "aic", "aicc", "bic"))
 
     def __str__(self) -> str:
         return (
@@ -77,11 +73,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     -----
     doi:10.1109/TAC.1974.1100705, doi:10.1093/biomet/76.2.297, doi:10.1214/aos/1176344136.
     """
-    given = whole_number(parameters)
-    if given is None or given < 0:
-        raise ModelError(
-            f"{setting('parameters')} {parameters!r} is not a number of parameters; give a whole number, at least 0"
-        )
+    given = check_whole("parameters", parameters, 0)
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = given + tests.initial_terms + len(tests.outputs)
@@ -96,7 +88,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     return InformationCriteria(k, samples, likelihood, aic, aicc, k * math.log(samples) - 2 * likelihood)
 
 
-def information_table(information: InformationCriteria, *, title: str = "Information criteria") -> Table:
+def information_table(information: InformationCriteria) -> Table:
     """Return AIC, AICc and BIC with the numbers of parameters and samples."""
     criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
     # Differences count, not sizes: all digits before the point.
@@ -106,4 +98,4 @@ def information_table(information: InformationCriteria, *, title: str = "Informa
         "Lower is better, among models of the same outputs on the same runs. Orders, coefficients, initial terms and "
         "one noise level an output count as numbers."
     )
-    return Table(title, ("criterion", "value"), rows, note=note)
+    return Table("Information criteria", ("criterion", "value"), rows, note=note)

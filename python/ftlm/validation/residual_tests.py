@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import interpolate_gaps
-from ftlm.errors import DataError, ModelError
+from ftlm.errors import DataError
 from ftlm.findings import Finding, make_finding, texts
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, symbol_html
+from ftlm.utils.formatting import Cell, attributes, json_value, symbol_html
 from ftlm.utils.linalg import dot, minimum_norm_solution
-from ftlm.utils.parameters import setting
 from ftlm.utils.statistics import (
     NORMAL_99,
     SIGNIFICANCE_LEVEL,
@@ -34,8 +33,8 @@ from ftlm.utils.statistics import (
     portmanteau,
     whiten_series,
 )
-from ftlm.utils.validation import Floats, whole_number
-from ftlm.validation.comparison import finite, simulate_runs
+from ftlm.utils.validation import Floats, check_whole
+from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import FeedbackTest, feedback_test
 
 #: Difference below which two orders count as equal.
@@ -107,13 +106,8 @@ class CorrelationTest:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        return {
-            "lags": self.lags.tolist(),
-            "values": list(map(finite, self.values.tolist())),
-            **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
-            "passed": self.passed,
-            "conclusive": self.conclusive,
-        }
+        rows = {"lags": self.lags.tolist(), "values": json_value(self.values.tolist())}
+        return rows | attributes(self, ("band", "statistic", "limit", "passed", "conclusive"))
 
 
 @dataclass(frozen=True)
@@ -137,8 +131,8 @@ class OutputResiduals:
         Feedback test of each input of the equation.
     direction
         Test of the cross-correlations with the sign of the simulated velocity; None for equations with friction.
-    friction
-        Term of dry friction to add to the equation.
+    sign_slope
+        Slope of tanh in the friction term of the output; infinite for sign(D y), the term of an order above 1.
     """
 
     residuals: list[Floats]
@@ -148,7 +142,7 @@ class OutputResiduals:
     inputs: dict[str, CorrelationTest]
     feedback_tests: dict[str, FeedbackTest] = field(default_factory=dict)
     direction: CorrelationTest | None = None
-    friction: str = ""
+    sign_slope: float = math.inf
 
     @property
     def follows_direction(self) -> bool:
@@ -177,14 +171,8 @@ class OutputResiduals:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        return {
-            "rms": finite(self.rms),
-            "nr": finite(self.nr),
-            "whiteness": self.whiteness.to_dict(),
-            "inputs": {n: t.to_dict() for n, t in self.inputs.items()},
-            "feedback": list(self.feedback),
-            "loops": {n: t.to_dict() for n, t in self.feedback_tests.items()},
-        }
+        tests = attributes(self, ("rms", "nr", "whiteness", "inputs", "feedback"))
+        return tests | {"loops": json_value(self.feedback_tests)}
 
 
 @dataclass(frozen=True)
@@ -261,13 +249,7 @@ class Residuals:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        return {
-            "passed": self.passed,
-            "conclusive": self.conclusive,
-            "runs": list(self.runs),
-            "refinement": self.refinement,
-            "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
-        }
+        return attributes(self, ("passed", "conclusive", "runs", "refinement", "outputs"))
 
     def __str__(self) -> str:
         tests = [(f"{output} and {signal}" if signal else f"{output} alone", t) for output, signal, t in self.tests]
@@ -339,9 +321,7 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     """
     check_model(model)
     several = as_runs(runs)
-    count = whole_number(lags)
-    if count is None or count < 1:
-        raise ModelError(f"{setting('lags')} {lags!r} is not a number of lags; give a whole number, at least 1")
+    count = check_whole("lags", lags, 1)
     check_run_lengths(several, count)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
@@ -396,7 +376,7 @@ def run_residual_tests(
         if item.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
             row = model.outputs.index(name)
             moves = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
-            outputs[name] = _test_direction(outputs[name], name, moves, lags, item.order.constant)
+            outputs[name] = _test_direction(outputs[name], moves, lags, item.order.constant)
         if sensitivities is not None and outputs[name].has_colored_correlation:
             outputs[name] = _test_beyond_parameters(outputs[name], sensitivities().get(name, []), signals, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
@@ -442,17 +422,14 @@ def _test_output(
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
 
-def _test_direction(
-    output: OutputResiduals, name: str, velocities: Sequence[Floats], lags: int, order: float
-) -> OutputResiduals:
+def _test_direction(output: OutputResiduals, velocities: Sequence[Floats], lags: int, order: float) -> OutputResiduals:
     """Test whether residuals depend on the sign of a simulated velocity, as they do if dry friction is missing."""
     largest = max(float(np.max(np.abs(v))) for v in velocities)
     if not 0.0 < largest < math.inf:
         return output
     signs = [np.where(np.abs(v) > MAX_REST_VELOCITY_RATIO * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
     test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
-    term = f"- fc*sign(D {name})" if order > 1.0 else f"- fc*tanh({SIGN_TANH_SLOPE / largest:.2g} {name})"
-    return replace(output, direction=test, friction=term)
+    return replace(output, direction=test, sign_slope=math.inf if order > 1.0 else SIGN_TANH_SLOPE / largest)
 
 
 def _test_beyond_parameters(
@@ -599,7 +576,9 @@ def failed_tests(tests: Residuals) -> list[Finding]:
                 found.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
         if output.follows_direction and output.direction is not None:
             numbers = {"value": output.direction.largest[1], "limit": output.direction.limit}
-            found.append(make_finding("residuals_follow_direction", output=name, term=output.friction, **numbers))
+            slope = output.sign_slope
+            term = f"- fc*sign(D {name})" if math.isinf(slope) else f"- fc*tanh({slope:.2g} {name})"
+            found.append(make_finding("residuals_follow_direction", output=name, term=term, **numbers))
         found += [feedback_finding(name, signal, output) for signal in output.feedback]
     return found
 
