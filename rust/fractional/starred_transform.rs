@@ -15,7 +15,7 @@ use crate::fft::{self, Bin, Plan, Workspace};
 /// Damping σ times the duration: about the geometric mean of the errors by e^{−2σT} and by rounding, e^{σT} ε.
 const DAMPING_DURATIONS: f64 = 12.0;
 /// Panels of the base band, and Chebyshev nodes in each: 34^−8 is 6e−13 if no pole is near the Nyquist frequency.
-const PANELS: usize = 8;
+const BAND_PANEL_COUNT: usize = 8;
 const PANEL_NODES: usize = 8;
 /// Order n from which on the terms are summed by an integral.
 const MAX_DIRECT_ORDER: usize = 32;
@@ -25,8 +25,8 @@ const THIRD_DIFFERENCE: f64 = 17.0 / 5760.0;
 const LEGENDRE_RULE: [(f64, f64); 4] = [
     (0.069_431_844_202_973_71, 0.173_927_422_568_726_93),
     (0.330_009_478_207_571_87, 0.326_072_577_431_273_07),
-    (0.669_990_521_792_428_13, 0.326_072_577_431_273_07),
-    (0.930_568_155_797_026_29, 0.173_927_422_568_726_93),
+    (0.669_990_521_792_428_1, 0.326_072_577_431_273_07),
+    (0.930_568_155_797_026_3, 0.173_927_422_568_726_93),
 ];
 
 /// Contour and transforms of a number of uniform samples.
@@ -51,9 +51,14 @@ impl StarredTransform {
         let sigma = DAMPING_DURATIONS / (rows as f64 * step);
         let logarithm = |omega: f64| Bin::new(libm::log(sigma.hypot(omega)), libm::atan2(omega, sigma));
         let spacing = 2.0 * PI / (plan.len() as f64 * step);
-        let width = PI / step / PANELS as f64;
-        let panels =
-            (0..=PANELS).map(|p| if p == PANELS { plan.bins() } else { (p as f64 * width / spacing).ceil() as usize });
+        let width = PI / step / BAND_PANEL_COUNT as f64;
+        let panels = (0..=BAND_PANEL_COUNT).map(|p| {
+            if p == BAND_PANEL_COUNT {
+                plan.bins()
+            } else {
+                (p as f64 * width / spacing).ceil() as usize
+            }
+        });
         let period = 2.0 * PI / step;
         let mut weights = vec![1.0; MAX_DIRECT_ORDER];
         weights.extend([0.0; 2]);
@@ -79,7 +84,7 @@ impl StarredTransform {
             damping: (0..rows).map(|k| libm::exp(-sigma * step * k as f64)).collect(),
             logarithms: (0..plan.bins()).map(|j| logarithm(j as f64 * spacing)).collect(),
             panels: panels.collect(),
-            aliases: (0..PANELS * PANEL_NODES).map(node).collect(),
+            aliases: (0..BAND_PANEL_COUNT * PANEL_NODES).map(node).collect(),
             plan,
         }
     }
@@ -102,11 +107,11 @@ impl StarredTransform {
         time
     }
 
-    /// Starred transforms of functions with these samples at t = 0: `functions` sets their values at ln s.
-    pub(crate) fn starred(&self, starts: &[f64], mut functions: impl FnMut(Bin, &mut [Bin])) -> Vec<Vec<Bin>> {
+    /// Compute the starred transforms of functions with these samples at t = 0: `functions` sets their values at ln s.
+    pub(crate) fn spectra(&self, starts: &[f64], mut functions: impl FnMut(Bin, &mut [Bin])) -> Vec<Vec<Bin>> {
         let count = starts.len();
         let mut values = vec![Bin::default(); count];
-        let mut sums = vec![[Bin::default(); PANELS * PANEL_NODES]; count];
+        let mut sums = vec![[Bin::default(); BAND_PANEL_COUNT * PANEL_NODES]; count];
         for (place, aliases) in self.aliases.iter().enumerate() {
             for &(weight, logarithm) in aliases {
                 functions(logarithm, &mut values);
@@ -133,7 +138,7 @@ impl StarredTransform {
     /// Add the interpolated terms n ≠ 0 to the term n = 0 of a function.
     #[allow(clippy::cast_precision_loss)]
     fn add_aliases(&self, spectrum: &mut [Bin], sums: &[Bin]) {
-        let share = 2.0 * PANELS as f64 / (self.plan.len() / 2) as f64;
+        let share = 2.0 * BAND_PANEL_COUNT as f64 / (self.plan.len() / 2) as f64;
         for (p, nodes) in sums.chunks_exact(PANEL_NODES).enumerate() {
             // Chebyshev coefficients.
             let mut c = [Bin::default(); PANEL_NODES];
@@ -143,13 +148,14 @@ impl StarredTransform {
                     *c += value * (scale * libm::cos(m as f64 * node_angle(k)));
                 }
             }
-            for j in self.panels[p]..self.panels[p + 1] {
+            let first = self.panels[p];
+            for (j, value) in (first..).zip(&mut spectrum[first..self.panels[p + 1]]) {
                 let x = j as f64 * share - (2 * p + 1) as f64;
                 let (mut above, mut here) = (Bin::default(), Bin::default());
                 for c in c[1..].iter().rev() {
                     (above, here) = (here, here * (2.0 * x) - above + c);
                 }
-                spectrum[j] += here * x - above + c[0];
+                *value += here * x - above + c[0];
             }
         }
     }
@@ -180,7 +186,7 @@ mod tests {
     /// Step response of a function of s, without feedthrough.
     fn step_response(rows: usize, step: f64, function: impl Fn(Bin) -> Bin) -> Vec<f64> {
         let transform = StarredTransform::new(rows, step);
-        let found = transform.starred(&[0.0], |logarithm, values| {
+        let found = transform.spectra(&[0.0], |logarithm, values| {
             values[0] = function(logarithm) * integration(logarithm, 1.0);
         });
         found.into_iter().map(|spectrum| transform.samples(spectrum)).next().unwrap_or_default()

@@ -354,7 +354,7 @@ impl Run {
         starts.resize(functions.len() + exponents.len(), 0.0);
         let mut powers = Vec::new();
         let units: Vec<f64> = exponents.iter().map(|e| libm::tgamma(e + 1.0)).collect();
-        let spectra = self.transform.starred(&starts, |logarithm, values| {
+        let spectra = self.transform.spectra(&starts, |logarithm, values| {
             let response = terms.powers(logarithm, &mut powers);
             let held = response * integration(logarithm, 1.0);
             let (driven, free) = values.split_at_mut(functions.len());
@@ -368,7 +368,7 @@ impl Run {
         let mut spectra = spectra.into_iter();
         let sources = functions.iter().map(|(place, c)| (*place, Some(c.input)));
         let driven = self.columns(experiment, asked.len(), sources.zip(spectra.by_ref()));
-        let free = spectra.map(|spectrum| self.compared(experiment, spectrum)).collect();
+        let free = spectra.map(|spectrum| self.compared_samples(experiment, spectrum)).collect();
         (driven, free)
     }
 
@@ -395,7 +395,7 @@ impl Run {
         };
         let starts: Vec<f64> = functions.iter().map(start).collect();
         let mut powers = Vec::new();
-        let spectra = self.transform.starred(&starts, |logarithm, values| {
+        let spectra = self.transform.spectra(&starts, |logarithm, values| {
             let response = terms.powers(logarithm, &mut powers);
             let held = integration(logarithm, 1.0);
             for (value, &(place, input)) in values.iter_mut().zip(&functions) {
@@ -414,8 +414,9 @@ impl Run {
         self.columns(experiment, asked.len(), functions.iter().copied().zip(spectra))
     }
 
-    /// Compared samples of columns from functions, each with its column and its input, or with none for a response of
-    /// its own.
+    /// Compute the compared samples of columns from functions, each with its column and its input.
+    ///
+    /// A function without an input is a response of its own.
     fn columns(
         &self,
         experiment: &Experiment,
@@ -433,13 +434,13 @@ impl Run {
             }
         }
         let samples = |sum: Option<Vec<Bin>>| {
-            sum.map_or_else(|| vec![0.0; experiment.compared_count()], |sum| self.compared(experiment, sum))
+            sum.map_or_else(|| vec![0.0; experiment.compared_count()], |sum| self.compared_samples(experiment, sum))
         };
         sums.into_iter().map(samples).collect()
     }
 
-    /// Compared samples of a transform.
-    fn compared(&self, experiment: &Experiment, spectrum: Vec<Bin>) -> Vec<f64> {
+    /// Compute the compared samples of a transform.
+    fn compared_samples(&self, experiment: &Experiment, spectrum: Vec<Bin>) -> Vec<f64> {
         let every = experiment.pulses_per_sample;
         let samples = self.transform.samples(spectrum);
         samples.into_iter().skip(every).step_by(every).take(experiment.compared_count()).collect()
