@@ -448,6 +448,7 @@ impl Run {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::cast_precision_loss)]
 mod tests {
     use super::super::evaluation_cache::EvaluationCache;
     use super::super::integer_orders::IntegerOrders;
