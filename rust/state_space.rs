@@ -390,31 +390,31 @@ struct Recursion<'a> {
 
 impl Recursion<'_> {
     /// Samples of the outputs from an initial state.
-    fn run(&self, mut state: Vec<f64>, rows: usize, stop: &Stop) -> Result<Vec<f64>> {
-        let n = self.states;
-        let mut out = vec![0.0; self.outputs * rows];
-        if rows == 0 {
-            return Ok(out);
+    fn run(&self, state: Vec<f64>, rows: usize, stop: &Stop) -> Result<Vec<f64>> {
+        // Common numbers of states get loops of constant length.
+        match self.states {
+            1 => self.run_states(1, state, rows, stop),
+            2 => self.run_states(2, state, rows, stop),
+            3 => self.run_states(3, state, rows, stop),
+            4 => self.run_states(4, state, rows, stop),
+            n => self.run_states(n, state, rows, stop),
         }
-        let mut forcing = vec![0.0; BLOCK_ROWS * n];
+    }
+
+    #[inline(always)]
+    fn run_states(&self, n: usize, mut state: Vec<f64>, rows: usize, stop: &Stop) -> Result<Vec<f64>> {
+        let mut out = vec![0.0; self.outputs * rows];
         let mut history = vec![0.0; BLOCK_ROWS * n];
         let mut values = vec![0.0; BLOCK_ROWS + 1];
         for begin in (0..rows).step_by(BLOCK_ROWS) {
             stop.check()?;
             let count = BLOCK_ROWS.min(rows - begin);
-            forcing.fill(0.0);
+            history.fill(0.0);
             for channel in &self.channels {
-                for (row, value) in values.iter_mut().enumerate() {
-                    *value = match delayed_row(begin + row, channel.lag) {
-                        Some(k) => channel.samples.get(k).or(channel.samples.last()).copied().unwrap_or(0.0),
-                        None => channel.before,
-                    };
-                }
+                channel.read(begin, &mut values);
                 for (gains, shift) in [(&channel.now, 0), (&channel.later, 1)] {
                     if gains.iter().any(|&gain| gain != 0.0) {
-                        for (sums, &value) in forcing.chunks_exact_mut(n).zip(&values[shift..]) {
-                            sums.iter_mut().zip(gains).for_each(|(sum, gain)| *sum += gain * value);
-                        }
+                        add_forcing(n, gains, &values[shift..], &mut history);
                     }
                 }
                 for (samples, &gain) in out.chunks_exact_mut(rows).zip(&channel.direct).filter(|&(_, &g)| g != 0.0) {
@@ -422,21 +422,9 @@ impl Recursion<'_> {
                     samples.iter_mut().zip(&values).for_each(|(y, value)| *y += gain * value);
                 }
             }
-            // Common sizes get loops of constant length.
-            match n {
-                0 => {}
-                1 => advance(1, &self.growth, &mut state, &forcing, &mut history),
-                2 => advance(2, &self.growth, &mut state, &forcing, &mut history),
-                3 => advance(3, &self.growth, &mut state, &forcing, &mut history),
-                4 => advance(4, &self.growth, &mut state, &forcing, &mut history),
-                _ => advance(n, &self.growth, &mut state, &forcing, &mut history),
-            }
-            for (i, samples) in out.chunks_exact_mut(rows).enumerate() {
-                for (j, &gain) in self.read[i * n..][..n].iter().enumerate().filter(|&(_, &gain)| gain != 0.0) {
-                    let samples = &mut samples[begin..begin + count];
-                    let column = history.iter().skip(j).step_by(n);
-                    samples.iter_mut().zip(column).for_each(|(y, x)| *y += gain * x);
-                }
+            advance(n, &self.growth, &mut state, &mut history);
+            for (samples, gains) in out.chunks_exact_mut(rows).zip(self.read.chunks_exact(n.max(1))) {
+                add_outputs(n, gains, &history, &mut samples[begin..begin + count]);
             }
             state.iter_mut().filter(|x| x.abs() < SMALLEST_STATE).for_each(|x| *x = 0.0);
         }
@@ -444,18 +432,54 @@ impl Recursion<'_> {
     }
 }
 
-/// Advance the state by one block of rows; `history` are the states before each row's step.
+impl Channel<'_> {
+    /// Read the values that act in the rows from `begin` on; the last sample holds beyond the record.
+    fn read(&self, begin: usize, values: &mut [f64]) {
+        let held = self.samples.last().copied().unwrap_or(0.0);
+        let early = (0..values.len()).take_while(|row| delayed_row(begin + row, self.lag).is_none()).count();
+        let (early, rest) = values.split_at_mut(early);
+        early.fill(self.before);
+        let first = delayed_row(begin + early.len(), self.lag).unwrap_or(usize::MAX);
+        let known = self.samples.get(first..).unwrap_or_default();
+        let (own, beyond) = rest.split_at_mut(known.len().min(rest.len()));
+        own.copy_from_slice(&known[..own.len()]);
+        beyond.fill(held);
+    }
+}
+
+/// Add the effect of an input with these gains on each of the `n` states to a block of rows.
 #[inline(always)]
-fn advance(n: usize, growth: &[f64], state: &mut [f64], forcing: &[f64], history: &mut [f64]) {
-    let (growth, state) = (&growth[..n * n], &mut state[..n]);
-    for (force, past) in forcing.chunks_exact(n).zip(history.chunks_exact_mut(n)) {
-        past.copy_from_slice(state);
+fn add_forcing(n: usize, gains: &[f64], values: &[f64], forcing: &mut [f64]) {
+    let gains = &gains[..n];
+    for (sums, &value) in forcing.chunks_exact_mut(n.max(1)).zip(values) {
         for i in 0..n {
-            state[i] += force[i];
+            sums[i] += gains[i] * value;
+        }
+    }
+}
+
+/// Add the output with these gains on the `n` states of each row.
+#[inline(always)]
+fn add_outputs(n: usize, gains: &[f64], history: &[f64], samples: &mut [f64]) {
+    // An output does not depend on a state without gain, which may overflow.
+    for (j, &gain) in gains.iter().enumerate().filter(|&(_, &gain)| gain != 0.0) {
+        samples.iter_mut().zip(history.chunks_exact(n.max(1))).for_each(|(y, states)| *y += gain * states[j]);
+    }
+}
+
+/// Advance the state by one block of rows; the forcing of each row is replaced by the state before its step.
+#[inline(always)]
+fn advance(n: usize, growth: &[f64], state: &mut [f64], history: &mut [f64]) {
+    let (growth, state) = (&growth[..n * n], &mut state[..n]);
+    for row in history.chunks_exact_mut(n.max(1)) {
+        for i in 0..n {
+            let past = state[i];
+            state[i] += row[i];
+            row[i] = past;
         }
         for j in 0..n {
             for i in 0..n {
-                state[i] += growth[j * n + i] * past[j];
+                state[i] += growth[j * n + i] * row[j];
             }
         }
     }

@@ -5,3 +5,4 @@ mod integer_powers;
 pub mod integral;
 pub mod kernels;
 pub mod operational_matrices;
+pub(crate) mod starred_transform;

@@ -161,11 +161,15 @@ fn correction_ends_where_finer_grids_do(size: f64) {
     let (step, decay, rows) = (0.05, (-0.1_f64).exp(), 33_000);
     let mut random = Random::new(3);
     let u = random.steps(rows, 15);
+    // The input is linear between its samples.
+    let later = 1.0 - (1.0 - decay) / 0.1;
+    let now = 1.0 - decay - later;
     let mut state = 0.0;
-    let y: Vec<f64> = (u.iter().zip(random.signal(rows)))
-        .map(|(u, noise)| {
+    let y: Vec<f64> = (0..rows)
+        .zip(random.signal(rows))
+        .map(|(k, noise)| {
             let here = state;
-            state = decay * state + (1.0 - decay) * u;
+            state = decay * state + now * u[k] + later * u[(k + 1).min(rows - 1)];
             here + size * noise
         })
         .collect();
@@ -173,7 +177,9 @@ fn correction_ends_where_finer_grids_do(size: f64) {
     let terms = vec![(0, none(), alone(0)), (1, none(), alone(1))];
     let equation = FreeEquation { output: 0, order: order(0.0, &[1.0]), terms };
     let problem = problem(equation, &[(0.05, 3.0)], 2, Initial::Rest);
-    let (source, stop) = (sampled(step, &[y], &[u]), Stop::default());
+    let (y, u) = (Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Linear)));
+    let run = Recording::new("run", step, None, vec![y, u], vec![0]).unwrap();
+    let (source, stop) = (Recordings::new(vec![run]).unwrap(), Stop::default());
     let grid = Objective::new((&problem, &source, &stop), weighing(1.0 / size), sampling(1, 1), false).unwrap();
     let (best, grid) = fit_reweighted(&place(&[1.1], &[-2.2, 2.2]), grid, Loss::Squares).unwrap();
     let corrected = correct_step(&best, &grid, Loss::Squares).unwrap().unwrap().into_statistics();

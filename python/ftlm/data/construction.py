@@ -281,9 +281,11 @@ class RunArguments:
                 gaps=gaps,
                 instead=f"{instead}, or avoid them with {parameter('window')}",
             )
-            with np.errstate(over="ignore"):
-                data[signal] = vector * scale if scale != 1.0 else vector
-            check_values(data[signal], f"{self.label_of(signal)} in {unit}", first, gaps=gaps)
+            data[signal] = vector
+            if scale != 1.0:
+                with np.errstate(over="ignore"):
+                    data[signal] = vector * scale
+                check_values(data[signal], f"{self.label_of(signal)} in {unit}", first, gaps=gaps)
         return data
 
 

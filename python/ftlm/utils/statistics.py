@@ -60,9 +60,10 @@ def white_noise(samples: Floats) -> float:
     White noise is in the differences of every order. A swing of few samples per period, which second differences take
     for noise, is in the low orders alone (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521).
     """
-    least = estimate_noise(samples)
+    start = samples[:NOISE_SAMPLES]
+    least = estimate_noise(start)
     for order in DIFFERENCE_ORDERS:
-        bends = np.diff(samples[:NOISE_SAMPLES], order)
+        bends = np.diff(start, order)
         bends = bends[~np.isnan(bends)]
         if bends.size < MIN_DIFFERENCES:
             break

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::problem::{Iterate, OptimizationResult, Problem};
 use crate::error::{check_length, Error, Result};
+use crate::estimation::output_error::fractional_orders::FractionalOrders;
 use crate::estimation::output_error::integer_orders::IntegerOrders;
 use crate::estimation::output_error::{Experiment, MinimizationSettings};
 use crate::parallel::Stop;
@@ -167,7 +168,8 @@ impl<'a> Objective<'a> {
         turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
-    /// True if the simulation does not depend on the step: integer orders, and no held input that switches within one.
+    /// True if the simulation does not depend on the step: exact samples of integer orders, or of any orders on long
+    /// records, and no held input that switches within a pulse.
     #[must_use]
     pub fn is_exact(&self, place: &Iterate) -> bool {
         let whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
@@ -177,7 +179,8 @@ impl<'a> Objective<'a> {
             && runs
                 .flat_map(|(run, (step, _))| run.channels().iter().map(move |c| (c.delay, step)))
                 .all(|(delay, step)| delay.is_none_or(|delay| whole(delay, step)))
-            && IntegerOrders::of(&self.problem.model, &self.experiments, &place.point).is_some()
+            && (IntegerOrders::of(&self.problem.model, &self.experiments, &place.point).is_some()
+                || FractionalOrders::accepts(&self.problem.model, &self.experiments, &place.point))
     }
 
     /// True if halving the step changes the simulated samples significantly relative to the residuals.

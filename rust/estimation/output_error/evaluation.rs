@@ -2,6 +2,7 @@
 
 use super::parameterization::ParameterPoint;
 use crate::error::{Error, Result};
+use crate::estimation::least_squares;
 use crate::linalg::dense;
 use crate::linalg::orthogonal::{norm, project_out};
 use crate::linalg::small::back_substitute;
@@ -26,6 +27,50 @@ impl<P> Evaluation<P> {
     pub(crate) fn empty(point: ParameterPoint) -> Self {
         let (residuals, initial, exponents) = (Vec::new(), Vec::new(), Vec::new());
         Self { point, residuals, size: 0.0, initial, exponents, parts: Vec::new() }
+    }
+
+    /// Eliminate the linear coefficients and the initial terms from the residuals of each experiment.
+    ///
+    /// `columns` are the weighted responses to the initial terms, each with its equation, or with none for a level. `of`
+    /// returns the orthonormal basis of these and the effects of the linear coefficients.
+    pub(crate) fn eliminate(
+        &mut self,
+        linear: &[usize],
+        equations: usize,
+        mut residuals: Vec<Vec<f64>>,
+        columns: Vec<Vec<(Option<usize>, Vec<f64>)>>,
+        of: impl Fn(&P) -> (&[Vec<f64>], &[Vec<f64>]),
+    ) -> Result<()> {
+        if !linear.is_empty() {
+            let mut sides: Vec<LinearSide<'_>> = Vec::with_capacity(residuals.len());
+            for (left, part) in residuals.iter().zip(&self.parts) {
+                let (basis, effects) = of(part);
+                sides.push((left, basis, effects.iter().map(Vec::as_slice).collect()));
+            }
+            let moves = solve_linear_steps(&sides)?;
+            linear.iter().zip(&moves).for_each(|(&j, by)| self.point.coefficients[j] += by);
+            for (left, part) in residuals.iter_mut().zip(&self.parts) {
+                for (effect, by) in of(part).1.iter().zip(&moves) {
+                    left.iter_mut().zip(effect).for_each(|(e, v)| *e -= by * v);
+                }
+            }
+        }
+        for (mut left, columns) in residuals.into_iter().zip(columns) {
+            let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
+            if !columns.is_empty() {
+                let (places, columns): (Vec<_>, Vec<_>) = columns.into_iter().unzip();
+                let (values, _) = least_squares::solve(&columns, &left, 0)?;
+                for ((place, column), x) in places.iter().zip(&columns).zip(&values) {
+                    if let Some(i) = place {
+                        initial[*i].push(*x);
+                    }
+                    left.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
+                }
+            }
+            self.residuals.extend(left);
+            self.initial.push(initial);
+        }
+        Ok(())
     }
 }
 

@@ -5,6 +5,7 @@ use std::cell::RefCell;
 use super::evaluation::Evaluation;
 use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
+use super::fractional_orders::{FractionalOrders, SampledSimulation};
 use super::integer_orders::{ExactSimulation, IntegerOrders};
 use super::parameterization::{Coordinate, FreeInput, FreeModel, ParameterPoint, TimeUnit};
 use super::residuals::Linearization;
@@ -36,10 +37,11 @@ pub struct OutputErrorFit {
     pub status: Status,
 }
 
-/// Evaluation on block pulses, or of exact samples.
+/// Evaluation on block pulses, or of exact samples: of integer orders by their states, of others by their transforms.
 enum Simulation<'a> {
     Pulses(Evaluation<Linearization>),
     Exact(Evaluation<ExactSimulation<'a>>),
+    Sampled(Evaluation<SampledSimulation>),
 }
 
 impl Simulation<'_> {
@@ -47,6 +49,7 @@ impl Simulation<'_> {
         match self {
             Self::Pulses(evaluation) => &evaluation.point,
             Self::Exact(evaluation) => &evaluation.point,
+            Self::Sampled(evaluation) => &evaluation.point,
         }
     }
 
@@ -54,6 +57,7 @@ impl Simulation<'_> {
         match self {
             Self::Pulses(evaluation) => evaluation.size,
             Self::Exact(evaluation) => evaluation.size,
+            Self::Sampled(evaluation) => evaluation.size,
         }
     }
 
@@ -61,6 +65,7 @@ impl Simulation<'_> {
         match self {
             Self::Pulses(evaluation) => &evaluation.residuals,
             Self::Exact(evaluation) => &evaluation.residuals,
+            Self::Sampled(evaluation) => &evaluation.residuals,
         }
     }
 
@@ -69,6 +74,7 @@ impl Simulation<'_> {
         match self {
             Self::Pulses(evaluation) => (&evaluation.initial, &evaluation.exponents),
             Self::Exact(evaluation) => (&evaluation.initial, &evaluation.exponents),
+            Self::Sampled(evaluation) => (&evaluation.initial, &evaluation.exponents),
         }
     }
 }
@@ -89,6 +95,8 @@ struct OutputErrorProblem<'a> {
     linear: Vec<usize>,
     /// Exact simulation, if all orders are integers.
     exact: Option<IntegerOrders>,
+    /// Exact simulation of other orders on long records.
+    sampled: Option<FractionalOrders>,
     /// Caches of the evaluations, by experiment.
     caches: RefCell<Vec<EvaluationCache>>,
     /// Cancellation flag.
@@ -103,6 +111,9 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         self.stop.check()?;
         if let Some(exact) = &self.exact {
             return exact.evaluate(self.model, self.experiments, point, &self.linear).map(Simulation::Exact);
+        }
+        if let Some(sampled) = &self.sampled {
+            return sampled.evaluate(self.model, self.experiments, point, &self.linear).map(Simulation::Sampled);
         }
         let (linear, caches) = (&self.linear, &mut self.caches.borrow_mut());
         self.model.evaluate(self.experiments, caches, point, linear).map(Simulation::Pulses)
@@ -126,6 +137,10 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
             Simulation::Exact(evaluation) => match &self.exact {
                 Some(exact) => exact.jacobian(self.model, self.experiments, &self.linear, evaluation),
                 None => Err(Error::Internal { what: "exact samples of orders that are no integers".into() }),
+            },
+            Simulation::Sampled(evaluation) => match &self.sampled {
+                Some(sampled) => sampled.jacobian(self.model, self.experiments, &self.linear, evaluation),
+                None => Err(Error::Internal { what: "samples without their transforms".into() }),
             },
             Simulation::Pulses(evaluation) => {
                 self.model.jacobian(self.experiments, &mut self.caches.borrow_mut(), &self.linear, evaluation)
@@ -333,7 +348,9 @@ pub fn fit_until(
     };
     let experiments = passed.as_deref().unwrap_or(experiments);
     let exact = IntegerOrders::of(&model, experiments, &point);
-    let shelves = RefCell::new(if exact.is_some() { Vec::new() } else { EvaluationCache::of(experiments, stop)? });
+    let sampled = if exact.is_some() { None } else { FractionalOrders::of(&model, experiments, &point) };
+    let needs_pulses = exact.is_none() && sampled.is_none();
+    let shelves = RefCell::new(if needs_pulses { EvaluationCache::of(experiments, stop)? } else { Vec::new() });
     let clock = TimeUnit::from_experiments(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
     let problem = OutputErrorProblem {
@@ -345,6 +362,7 @@ pub fn fit_until(
         allows_extrapolation: plain,
         linear,
         exact,
+        sampled,
         caches: shelves,
         stop,
     };

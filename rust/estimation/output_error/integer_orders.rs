@@ -11,12 +11,11 @@ use std::borrow::Cow;
 use std::cell::RefCell;
 use std::rc::Rc;
 
-use super::evaluation::{solve_linear_steps, Evaluation, LinearSide, RANK_TOLERANCE};
+use super::evaluation::{Evaluation, RANK_TOLERANCE};
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, InputLaw, ParameterPoint};
 
 use crate::error::{Error, Result};
-use crate::estimation::least_squares;
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 use crate::linalg::small::spectral_radius;
 use crate::signal::block_pulse::{delayed_row, Intersample};
@@ -380,33 +379,7 @@ impl IntegerOrders {
             columns.push(initial);
             out.parts.push(simulation);
         }
-        if !linear.is_empty() {
-            let sides: Vec<LinearSide<'_>> = (residuals.iter().zip(&out.parts))
-                .map(|(left, s)| (&left[..], &s.basis[..], s.effects.iter().map(Vec::as_slice).collect()))
-                .collect();
-            let moves = solve_linear_steps(&sides)?;
-            linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
-            for (left, simulation) in residuals.iter_mut().zip(&out.parts) {
-                for (effect, by) in simulation.effects.iter().zip(&moves) {
-                    left.iter_mut().zip(effect).for_each(|(e, v)| *e -= by * v);
-                }
-            }
-        }
-        for (mut left, columns) in residuals.into_iter().zip(columns) {
-            let mut initial: Vec<Vec<f64>> = vec![Vec::new(); self.equations.len()];
-            if !columns.is_empty() {
-                let (places, columns): (Vec<_>, Vec<_>) = columns.into_iter().unzip();
-                let (values, _) = least_squares::solve(&columns, &left, 0)?;
-                for ((place, column), x) in places.iter().zip(&columns).zip(&values) {
-                    if let Some(i) = place {
-                        initial[*i].push(*x);
-                    }
-                    left.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
-                }
-            }
-            out.residuals.extend(left);
-            out.initial.push(initial);
-        }
+        out.eliminate(linear, self.equations.len(), residuals, columns, |part| (&part.basis[..], &part.effects[..]))?;
         Ok(out)
     }
 

@@ -89,7 +89,7 @@ impl FreeModel {
                     }
                     if parameter < orders.len()
                         && let Some(moved) =
-                            initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
+                            initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, shelf))
                     {
                         let series = || Cow::Owned(shelf.filter_series(&moved));
                         rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
@@ -139,6 +139,36 @@ impl FreeModel {
     }
 }
 
+/// Derivatives of the initial exponents of equation i with respect to a free order.
+///
+/// None if they do not depend on the order, or if the set of `count` exponents changes here.
+pub(crate) fn initial_exponent_slopes(
+    model: &FreeModel,
+    (i, parameter): (usize, usize),
+    orders: &[f64],
+    count: usize,
+    experiment: &Experiment,
+) -> Option<Vec<f64>> {
+    // Exponents are linear in the orders, so any shift gives their derivative.
+    const SHIFT: f64 = 1e-4;
+    if count == 0 || !model.initial.follows_orders() {
+        return None;
+    }
+    let exponents = |shift: f64| {
+        let mut moved = orders.to_vec();
+        moved[parameter] += shift;
+        model.exponents(experiment, i, &model.structures(&moved)[i])
+    };
+    let (below, here, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
+    if [&below, &here, &above].iter().any(|list| list.len() != count) {
+        // The projection adapts in the next evaluation.
+        return None;
+    }
+    let slopes = below.iter().zip(&above).map(|(below, above)| (above - below) / (2.0 * SHIFT));
+    // Smaller differences are rounding.
+    Some(slopes.map(|slope| if slope.abs() < SHIFT { 0.0 } else { slope }).collect())
+}
+
 /// Derivative of the weighted initial terms of equation i with respect to a free order, before the filter.
 ///
 /// None if they do not depend on the order.
@@ -148,31 +178,17 @@ fn initial_term_derivative(
     orders: &[f64],
     values: &[f64],
     (experiment, shelf): (&Experiment, &EvaluationCache),
-) -> Result<Option<Vec<f64>>> {
-    // Exponents are linear in the orders, so any shift gives their derivative.
-    const SHIFT: f64 = 1e-4;
-    if values.is_empty() || !model.initial.follows_orders() {
-        return Ok(None);
-    }
-    let exponents = |shift: f64| {
-        let mut moved = orders.to_vec();
-        moved[parameter] += shift;
-        model.exponents(experiment, i, &model.structures(&moved)[i])
-    };
-    let (below, here, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
-    if [&below, &here, &above].iter().any(|list| list.len() != values.len()) {
-        // The set of exponents changes here; the projection adapts in the next evaluation.
-        return Ok(None);
-    }
+) -> Option<Vec<f64>> {
+    let slopes = initial_exponent_slopes(model, (i, parameter), orders, values.len(), experiment)?;
+    let exponents = model.exponents(experiment, i, &model.structures(orders)[i]);
     let mut out = Vec::new();
-    for (k, (&exponent, &x)) in here.iter().zip(values).enumerate() {
-        let follows = (above[k] - below[k]) / (2.0 * SHIFT);
-        if follows.abs() < 1e-4 || x == 0.0 {
+    for ((&exponent, &x), slope) in exponents.iter().zip(values).zip(&slopes) {
+        if *slope == 0.0 || x == 0.0 {
             continue;
         }
         out.resize(experiment.record.m(), 0.0);
         let power = shelf.initial_term(exponent);
-        out.iter_mut().zip(power.slope()).for_each(|(v, slope)| *v += x * follows * slope);
+        out.iter_mut().zip(power.slope()).for_each(|(v, by)| *v += x * slope * by);
     }
-    Ok(Some(out).filter(|out| !out.is_empty()))
+    Some(out).filter(|out| !out.is_empty())
 }

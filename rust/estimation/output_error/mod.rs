@@ -6,13 +6,15 @@
 //! spectra of A⁻¹ it costs one inverse transform per parameter and output. Initial terms are linear and projected out
 //! (variable projection in Kaufman's form, doi:10.1007/BF01932995). A sample y_k is compared with the mean of the
 //! pulses on either side of kh, on a grid that can be finer than the samples, plus the direct feedthrough of the
-//! inputs. Missing samples have zero weight. Nonuniform samples are compared at their own times.
+//! inputs. Missing samples have zero weight. Nonuniform samples are compared at their own times. Integer orders, and any
+//! orders on long records, have exact samples without pulses.
 
 pub(crate) mod evaluation;
 mod evaluation_cache;
 pub mod experiment;
 mod feedthrough;
 pub mod fit;
+pub(crate) mod fractional_orders;
 pub(crate) mod integer_orders;
 mod jacobian;
 mod kink_correction;

@@ -23,7 +23,7 @@ use crate::regressors::Record;
 use crate::series::{Buffers, RunningSumSystem, SumOfProducts};
 
 /// Smallest difference of α and the order of an autoregressive term; at 0 the equation would be an identity.
-const MIN_INTEGRATION_ORDER: f64 = 1e-3;
+pub(crate) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
 /// Response of an experiment to an initial term: equation, weighted samples, pulse means.
 ///

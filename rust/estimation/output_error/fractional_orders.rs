@@ -1,0 +1,560 @@
+//! Exact output samples of equations of any orders, and their derivatives.
+//!
+//! With the integration orders η of its terms an equation is y = Σ c s^−η u/D, D = 1 − Σ c s^−η over its own terms. A
+//! held input is a sum of steps, so the starred transform of the samples of y is that of c s^−η/(D s) times the transform
+//! of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D. Derivatives with respect to orders and
+//! coefficients are functions of s as well. Samples at jumps are the mean of both sides: the direct feedthrough is
+//! corrected as for block pulses.
+
+use std::collections::HashMap;
+use std::rc::Rc;
+
+use super::evaluation::{Evaluation, RANK_TOLERANCE};
+use super::experiment::Experiment;
+use super::feedthrough::{add_feedthrough_derivative, Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
+use super::jacobian::initial_exponent_slopes;
+use super::parameterization::{FreeModel, Monomial, ParameterPoint};
+use super::residuals::MIN_INTEGRATION_ORDER;
+use crate::equation::AffineOrder;
+use crate::error::{Error, Result};
+use crate::fft::Bin;
+use crate::fractional::kernels::digamma;
+use crate::fractional::starred_transform::{integration, StarredTransform};
+use crate::linalg::orthogonal::{extend_orthonormal, project_out};
+
+/// Fewest pulses of an experiment with exact samples: shorter ones are simulated faster by pulses.
+pub(crate) const MIN_EXACT_PULSES: usize = 1 << 12;
+
+/// Equations of any orders with held inputs, on experiments with uniform samples.
+pub(crate) struct FractionalOrders {
+    runs: Vec<Run>,
+}
+
+/// Transforms of one experiment.
+struct Run {
+    transform: Rc<StarredTransform>,
+    /// Transforms of the jumps of the inputs.
+    jumps: HashMap<usize, Vec<Bin>>,
+}
+
+/// Effects of the linear coefficients and of the initial terms on the weighted samples of an experiment.
+pub(crate) struct SampledSimulation {
+    /// Orthonormal basis of the weighted responses to the initial terms.
+    pub(crate) basis: Vec<Vec<f64>>,
+    /// Effect per unit of each linear coefficient.
+    pub(crate) effects: Vec<Vec<f64>>,
+}
+
+/// Terms of an equation at a point.
+struct Terms {
+    /// Distinct integration orders, and the place of each term in them.
+    etas: Vec<f64>,
+    places: Vec<usize>,
+    coefficients: Vec<f64>,
+    /// Input signal of each term; None for a term of the output itself.
+    inputs: Vec<Option<usize>>,
+}
+
+/// Derivatives of the coefficient and of the integration order of each term with respect to a parameter.
+type Slopes = Vec<(f64, f64)>;
+
+/// Functions of one column: its samples are Σ of function × source.
+struct Column {
+    /// Weight of each term, which replaces its coefficient, for a column of the response from rest.
+    weights: Vec<f64>,
+    input: usize,
+}
+
+impl Terms {
+    fn of(model: &FreeModel, i: usize, point: &ParameterPoint) -> Result<Self> {
+        let structure = &model.structures(&point.orders)[i];
+        let mut found = Self { etas: Vec::new(), places: Vec::new(), coefficients: Vec::new(), inputs: Vec::new() };
+        for (k, term) in structure.terms.iter().enumerate() {
+            let eta = structure.order - term.order;
+            let own = model.output_index(i, term.signal).is_some();
+            if eta < if own { MIN_INTEGRATION_ORDER } else { 0.0 } {
+                // This is reported as divergence, so that the optimization shortens its step.
+                return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
+            }
+            let known = found.etas.iter().position(|e| e.to_bits() == eta.to_bits());
+            found.places.push(known.unwrap_or(found.etas.len()));
+            if known.is_none() {
+                found.etas.push(eta);
+            }
+            found.coefficients.push(model.equations[i].terms[k].2.at(&point.coefficients));
+            found.inputs.push((!own).then_some(term.signal));
+        }
+        Ok(found)
+    }
+
+    /// Distinct inputs.
+    fn signals(&self) -> Vec<usize> {
+        let mut found: Vec<usize> = self.inputs.iter().flatten().copied().collect();
+        found.sort_unstable();
+        found.dedup();
+        found
+    }
+
+    /// Σ weight s^−η over the terms of an input, or over those of the output itself.
+    fn sum(&self, input: Option<usize>, powers: &[Bin], weight: impl Fn(usize) -> Bin) -> Bin {
+        let terms = (0..self.places.len()).filter(|&k| self.inputs[k] == input);
+        terms.map(|k| weight(k) * powers[self.places[k]]).sum()
+    }
+
+    /// s^−η of each distinct integration order, and 1/D.
+    fn powers(&self, logarithm: Bin, powers: &mut Vec<Bin>) -> Bin {
+        powers.clear();
+        powers.extend(self.etas.iter().map(|&eta| integration(logarithm, eta)));
+        (Bin::from(1.0) - self.sum(None, powers, |k| self.coefficients[k].into())).inv()
+    }
+
+    /// Mean of both sides at t = 0 of the step response with weights of the terms of an input.
+    fn start(&self, input: usize, weights: impl Fn(usize) -> f64) -> f64 {
+        let at_once =
+            |k: &usize| self.inputs[*k] == Some(input) && self.etas[self.places[*k]] < FEEDTHROUGH_ORDER_TOLERANCE;
+        0.5 * (0..self.places.len()).filter(at_once).map(weights).sum::<f64>()
+    }
+}
+
+/// Initial terms c t^e of one equation: Laplace transform and its derivative with respect to each exponent.
+struct InitialTerms<'a> {
+    exponents: &'a [f64],
+    values: &'a [f64],
+}
+
+impl InitialTerms<'_> {
+    /// Σ c Γ(e + 1) s^−(e + 1), and its derivative with these derivatives of the exponents.
+    fn transform(&self, logarithm: Bin, slopes: &[f64]) -> (Bin, Bin) {
+        let (mut sum, mut slope) = (Bin::default(), Bin::default());
+        for (n, (&e, &c)) in self.exponents.iter().zip(self.values).enumerate() {
+            let term = integration(logarithm, e + 1.0) * (c * libm::tgamma(e + 1.0));
+            sum += term;
+            if let Some(by) = slopes.get(n).filter(|by| **by != 0.0) {
+                slope += term * (Bin::from(digamma(e + 1.0)) - logarithm) * by;
+            }
+        }
+        (sum, slope)
+    }
+}
+
+impl FractionalOrders {
+    /// True if a model has exact samples on every experiment: stable equations without coupling, inputs that are held
+    /// and have no free parameter, and uniform samples without a sensor filter.
+    pub(crate) fn accepts(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> bool {
+        let held = |experiment: &Experiment| {
+            experiment.record.m() >= MIN_EXACT_PULSES
+                && experiment.nonuniform.is_none()
+                && experiment.filter.is_none()
+                && !experiment.record.is_filtered()
+                && model.equations.iter().enumerate().all(|(i, equation)| {
+                    equation.terms.iter().all(|(signal, _, _)| {
+                        model.output_index(i, *signal).map_or_else(
+                            || experiment.point_values.get(*signal).is_some_and(|values| values.is_zero_order_hold),
+                            |j| j == i,
+                        )
+                    })
+                })
+        };
+        (!model.coupled || model.equations.len() == 1)
+            && model.inputs.is_empty()
+            && experiments.iter().all(held)
+            && !model.is_unstable(point)
+    }
+
+    /// Transforms of the experiments; None if a model is not accepted.
+    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
+        if !Self::accepts(model, experiments, point) {
+            return None;
+        }
+        let mut known: HashMap<(usize, u64), Rc<StarredTransform>> = HashMap::new();
+        let run = |experiment: &Experiment| {
+            let record = &experiment.record;
+            let (m, step) = (record.m(), record.step());
+            let made = || Rc::new(StarredTransform::new(m, step));
+            let transform = known.entry((m, step.to_bits())).or_insert_with(made).clone();
+            let terms = model.equations.iter().enumerate().flat_map(|(i, e)| e.terms.iter().map(move |t| (i, t.0)));
+            let inputs = terms.filter(|&(i, signal)| model.output_index(i, signal).is_none());
+            let spectrum = |signal: usize| {
+                let means = record.signal(signal);
+                let jumps = means.iter().zip(std::iter::once(&0.0).chain(means)).map(|(now, before)| now - before);
+                transform.transform(jumps)
+            };
+            let mut jumps = HashMap::new();
+            inputs.for_each(|(_, signal)| {
+                jumps.entry(signal).or_insert_with(|| spectrum(signal));
+            });
+            Run { transform: transform.clone(), jumps }
+        };
+        Some(Self { runs: experiments.iter().map(run).collect() })
+    }
+
+    /// Residuals at a point with the `linear` coefficients and the initial terms eliminated.
+    pub(crate) fn evaluate(
+        &self,
+        model: &FreeModel,
+        experiments: &[Experiment],
+        point: &ParameterPoint,
+        linear: &[usize],
+    ) -> Result<Evaluation<SampledSimulation>> {
+        if model.is_unstable(point) {
+            // e^{−σt} does not damp a response that grows.
+            return Err(Error::Diverged { what: "free run".into(), index: 0 });
+        }
+        let structures = model.structures(&point.orders);
+        let mut out = Evaluation::empty(point.clone());
+        let (mut residuals, mut columns) = (Vec::new(), Vec::new());
+        for (run, experiment) in self.runs.iter().zip(experiments) {
+            out.exponents = structures.iter().enumerate().map(|(i, s)| model.exponents(experiment, i, s)).collect();
+            let mut left = experiment.measured_samples();
+            out.size = out.size.hypot(left.iter().map(|v| v * v).sum::<f64>().sqrt());
+            let direct = Feedthrough::of(model, experiment, &structures, point, &[])?;
+            let mut simulation = SampledSimulation { basis: Vec::new(), effects: Vec::new() };
+            let mut initial = Vec::new();
+            let size = left.len();
+            simulation.effects.resize(linear.len(), vec![0.0; size]);
+            for i in 0..structures.len() {
+                let terms = Terms::of(model, i, point)?;
+                let mut asked = vec![terms.coefficients.clone()];
+                asked.extend(linear.iter().map(|&j| {
+                    let slope = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
+                    (0..terms.places.len()).map(slope).collect()
+                }));
+                let (sums, units) = run.responses(experiment, &terms, &asked, &out.exponents[i]);
+                let targets = std::iter::once(&mut left).chain(&mut simulation.effects);
+                for (place, (target, samples)) in targets.zip(sums).enumerate() {
+                    let sign = if place == 0 { -1.0 } else { 1.0 };
+                    add_weighted(experiment, i, sign, &samples, target);
+                }
+                for samples in units {
+                    let mut column = vec![0.0; size];
+                    add_weighted(experiment, i, 1.0, &samples, &mut column);
+                    extend_orthonormal(&mut simulation.basis, column.clone(), RANK_TOLERANCE);
+                    initial.push((Some(i), column));
+                }
+            }
+            if let Some(direct) = &direct {
+                left.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
+                for (&j, effect) in linear.iter().zip(&mut simulation.effects) {
+                    add_feedthrough_derivative(model, experiment, direct, point, point.orders.len() + j, effect);
+                }
+            }
+            if let Some(index) = left.iter().position(|e| !e.is_finite()) {
+                return Err(Error::Diverged { what: "free run".into(), index });
+            }
+            for i in 0..if model.initial.has_level() { structures.len() } else { 0 } {
+                let mut column = vec![0.0; size];
+                add_weighted(experiment, i, 1.0, &vec![1.0; experiment.compared_count()], &mut column);
+                extend_orthonormal(&mut simulation.basis, column.clone(), RANK_TOLERANCE);
+                initial.push((None, column));
+            }
+            residuals.push(left);
+            columns.push(initial);
+            out.parts.push(simulation);
+        }
+        out.eliminate(linear, structures.len(), residuals, columns, |part| (&part.basis[..], &part.effects[..]))?;
+        Ok(out)
+    }
+
+    /// Derivatives of the residuals, with the initial terms projected out.
+    pub(crate) fn jacobian(
+        &self,
+        model: &FreeModel,
+        experiments: &[Experiment],
+        linear: &[usize],
+        at: &Evaluation<SampledSimulation>,
+    ) -> Result<Vec<Vec<f64>>> {
+        let point = &at.point;
+        let orders = point.orders.len();
+        let count = orders + point.coefficients.len();
+        let structures = model.structures(&point.orders);
+        let open: Vec<usize> =
+            (0..count).filter(|p| !p.checked_sub(orders).is_some_and(|j| linear.contains(&j))).collect();
+        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
+        for (index, (run, experiment)) in self.runs.iter().zip(experiments).enumerate() {
+            let mut columns = vec![vec![0.0; structures.len() * experiment.compared_count()]; count];
+            for (&j, effect) in linear.iter().zip(&at.parts[index].effects) {
+                columns[orders + j].clone_from(effect);
+            }
+            for (i, structure) in structures.iter().enumerate() {
+                let terms = Terms::of(model, i, point)?;
+                let exponents = model.exponents(experiment, i, structure);
+                let initial = InitialTerms { exponents: &exponents, values: &at.initial[index][i] };
+                let asked: Vec<(Slopes, Vec<f64>)> = open
+                    .iter()
+                    .map(|&p| {
+                        let moved = if p < orders {
+                            initial_exponent_slopes(model, (i, p), &point.orders, initial.values.len(), experiment)
+                        } else {
+                            None
+                        };
+                        (term_slopes(model, i, point, p), moved.unwrap_or_default())
+                    })
+                    .collect();
+                for (&parameter, samples) in open.iter().zip(run.sensitivities(experiment, &terms, &initial, &asked)) {
+                    add_weighted(experiment, i, 1.0, &samples, &mut columns[parameter]);
+                }
+            }
+            if let Some(direct) = Feedthrough::of(model, experiment, &structures, point, &[])? {
+                for &parameter in &open {
+                    add_feedthrough_derivative(model, experiment, &direct, point, parameter, &mut columns[parameter]);
+                }
+            }
+            for (mut column, out) in columns.into_iter().zip(&mut jacobian) {
+                project_out(&at.parts[index].basis, &mut column);
+                if column.iter().any(|v| !v.is_finite()) {
+                    return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+                }
+                // Residuals are measured minus simulated samples.
+                out.extend(column.iter().map(|v| -v));
+            }
+        }
+        Ok(jacobian)
+    }
+}
+
+/// Add samples of equation i to weighted samples of all equations.
+fn add_weighted(experiment: &Experiment, i: usize, sign: f64, samples: &[f64], sum: &mut [f64]) {
+    let count = experiment.compared_count();
+    let own = sum[i * count..(i + 1) * count].iter_mut();
+    own.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v += sign * w * y);
+}
+
+/// Derivatives of the coefficients and integration orders of the terms of equation i with respect to a parameter.
+fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: usize) -> Slopes {
+    let equation = &model.equations[i];
+    let of = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
+    let slope = |(_, order, monomial): &(usize, AffineOrder, Monomial)| match parameter.checked_sub(point.orders.len())
+    {
+        Some(j) => (monomial.slope(&point.coefficients, j), 0.0),
+        None => (0.0, of(&equation.order) - of(order)),
+    };
+    equation.terms.iter().map(slope).collect()
+}
+
+impl Run {
+    /// Samples of an equation from rest with each of these lists of weights of its input terms, and of its response to
+    /// each initial term.
+    fn responses(
+        &self,
+        experiment: &Experiment,
+        terms: &Terms,
+        asked: &[Vec<f64>],
+        exponents: &[f64],
+    ) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
+        let mut functions: Vec<(usize, Column)> = Vec::new();
+        for (place, weights) in asked.iter().enumerate() {
+            for input in terms.signals() {
+                let acts = |k: usize| terms.inputs[k] == Some(input) && weights[k] != 0.0;
+                if (0..weights.len()).any(acts) {
+                    functions.push((place, Column { weights: weights.clone(), input }));
+                }
+            }
+        }
+        let mut starts: Vec<f64> = functions.iter().map(|(_, c)| terms.start(c.input, |k| c.weights[k])).collect();
+        starts.resize(functions.len() + exponents.len(), 0.0);
+        let mut powers = Vec::new();
+        let units: Vec<f64> = exponents.iter().map(|e| libm::tgamma(e + 1.0)).collect();
+        let spectra = self.transform.spectra(&starts, |logarithm, values| {
+            let response = terms.powers(logarithm, &mut powers);
+            let held = response * integration(logarithm, 1.0);
+            let (driven, free) = values.split_at_mut(functions.len());
+            for (value, (_, c)) in driven.iter_mut().zip(&functions) {
+                *value = terms.sum(Some(c.input), &powers, |k| c.weights[k].into()) * held;
+            }
+            for ((value, unit), e) in free.iter_mut().zip(&units).zip(exponents) {
+                *value = response * integration(logarithm, e + 1.0) * unit;
+            }
+        });
+        let mut spectra = spectra.into_iter();
+        let sources = functions.iter().map(|(place, c)| (*place, Some(c.input)));
+        let driven = self.columns(experiment, asked.len(), sources.zip(spectra.by_ref()));
+        let free = spectra.map(|spectrum| self.compared_samples(experiment, spectrum)).collect();
+        (driven, free)
+    }
+
+    /// Derivatives of the samples of an equation, each with the derivatives of its terms and of its initial exponents.
+    fn sensitivities(
+        &self,
+        experiment: &Experiment,
+        terms: &Terms,
+        initial: &InitialTerms<'_>,
+        asked: &[(Slopes, Vec<f64>)],
+    ) -> Vec<Vec<f64>> {
+        let mut functions: Vec<(usize, Option<usize>)> = Vec::new();
+        for (place, (slopes, moved)) in asked.iter().enumerate() {
+            let acts =
+                |input: Option<usize>| (0..slopes.len()).any(|k| terms.inputs[k] == input && slopes[k] != (0.0, 0.0));
+            let inputs = terms.signals().into_iter().map(Some);
+            functions.extend(inputs.filter(|&input| acts(None) || acts(input)).map(|input| (place, input)));
+            if !initial.values.is_empty() && (acts(None) || moved.iter().any(|v| *v != 0.0)) {
+                functions.push((place, None));
+            }
+        }
+        let start = |&(place, input): &(usize, Option<usize>)| {
+            input.map_or(0.0, |input| terms.start(input, |k| asked[place].0[k].0))
+        };
+        let starts: Vec<f64> = functions.iter().map(start).collect();
+        let mut powers = Vec::new();
+        let spectra = self.transform.spectra(&starts, |logarithm, values| {
+            let response = terms.powers(logarithm, &mut powers);
+            let held = integration(logarithm, 1.0);
+            for (value, &(place, input)) in values.iter_mut().zip(&functions) {
+                let (slopes, moved) = &asked[place];
+                let weight = |k: usize| Bin::from(slopes[k].0) - logarithm * (terms.coefficients[k] * slopes[k].1);
+                let (driven, changed) = match input {
+                    None => initial.transform(logarithm, moved),
+                    Some(_) => {
+                        let sum = terms.sum(input, &powers, |k| terms.coefficients[k].into());
+                        (sum * held, terms.sum(input, &powers, weight) * held)
+                    }
+                };
+                *value = (driven * response * terms.sum(None, &powers, weight) + changed) * response;
+            }
+        });
+        self.columns(experiment, asked.len(), functions.iter().copied().zip(spectra))
+    }
+
+    /// Compute the compared samples of columns from functions, each with its column and its input.
+    ///
+    /// A function without an input is a response of its own.
+    fn columns(
+        &self,
+        experiment: &Experiment,
+        count: usize,
+        functions: impl Iterator<Item = ((usize, Option<usize>), Vec<Bin>)>,
+    ) -> Vec<Vec<f64>> {
+        let mut sums: Vec<Option<Vec<Bin>>> = vec![None; count];
+        for ((place, input), mut spectrum) in functions {
+            if let Some(jumps) = input.and_then(|input| self.jumps.get(&input)) {
+                spectrum.iter_mut().zip(jumps).for_each(|(v, jump)| *v *= jump);
+            }
+            match &mut sums[place] {
+                None => sums[place] = Some(spectrum),
+                Some(sum) => sum.iter_mut().zip(spectrum).for_each(|(sum, v)| *sum += v),
+            }
+        }
+        let samples = |sum: Option<Vec<Bin>>| {
+            sum.map_or_else(|| vec![0.0; experiment.compared_count()], |sum| self.compared_samples(experiment, sum))
+        };
+        sums.into_iter().map(samples).collect()
+    }
+
+    /// Compute the compared samples of a transform.
+    fn compared_samples(&self, experiment: &Experiment, spectrum: Vec<Bin>) -> Vec<f64> {
+        let every = experiment.pulses_per_sample;
+        let samples = self.transform.samples(spectrum);
+        samples.into_iter().skip(every).step_by(every).take(experiment.compared_count()).collect()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::cast_precision_loss)]
+mod tests {
+    use super::super::evaluation_cache::EvaluationCache;
+    use super::super::integer_orders::IntegerOrders;
+    use super::super::parameterization::{Coordinate, FreeEquation};
+    use super::*;
+    use crate::equation::Initial;
+    use crate::parallel::Stop;
+    use crate::recording::{Channel, Recording, Role, Sampling};
+    use crate::signal::block_pulse::Intersample;
+
+    const STEP: f64 = 0.02;
+
+    /// D^α y = a1 D^ν y + a0 y + b1 D^ν u + b0 u + c D^α v.
+    fn model(bounds: (f64, f64), order: f64, initial: Initial) -> FreeModel {
+        let own = |constant: f64| AffineOrder { constant, weights: vec![0.0] };
+        let highest = || AffineOrder { constant: 0.0, weights: vec![1.0] };
+        let orders = [(0, own(order)), (0, own(0.0)), (1, own(order)), (1, own(0.0)), (2, highest())];
+        let alone = |k: usize| Monomial { factor: 1.0, powers: vec![(k, 1)] };
+        let terms = orders.into_iter().enumerate().map(|(k, (signal, order))| (signal, order, alone(k))).collect();
+        FreeModel {
+            equations: vec![FreeEquation { output: 0, order: highest(), terms }],
+            order_bounds: vec![bounds],
+            coordinates: vec![Coordinate::Plain; 5],
+            inputs: Vec::new(),
+            coupled: false,
+            initial,
+        }
+    }
+
+    fn experiment(pulses_per_sample: usize) -> Experiment {
+        let rows = MIN_EXACT_PULSES + 2;
+        let held = |every: usize, seed: usize| -> Vec<f64> {
+            (0..rows).map(|k| ((k / every * 7919 + seed) % 11) as f64 / 5.0 - 1.0).collect()
+        };
+        let y = (0..rows).map(|k| (0.1 * k as f64).cos()).collect();
+        let input = |name: &str, samples| Channel::new(name, samples, Role::Input(Intersample::Hold));
+        let channels = vec![Channel::new("y", y, Role::Output), input("u", held(9, 1)), input("v", held(23, 5))];
+        let run = Recording::new("run", STEP, None, channels, vec![0]).unwrap();
+        run.experiment(Sampling { pulses_per_sample, ..Sampling::default() })
+            .unwrap()
+            .with_weights(&[2.0], None)
+            .unwrap()
+    }
+
+    fn point(order: f64) -> ParameterPoint {
+        ParameterPoint { orders: vec![order], coefficients: vec![-0.8, -9.0, 0.5, 7.0, 0.3], inputs: Vec::new() }
+    }
+
+    /// Largest difference, relative to the largest value.
+    fn distance(found: &[f64], exact: &[f64]) -> f64 {
+        assert_eq!(found.len(), exact.len());
+        let peak = exact.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
+        found.iter().zip(exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / peak
+    }
+
+    #[test]
+    fn integer_orders_have_the_samples_and_derivatives_of_their_states() {
+        let (experiments, at) = ([experiment(1)], point(2.0));
+        for initial in [Initial::Rest, Initial::Caputo] {
+            let model = model((2.0, 2.0), 1.0, initial);
+            let found = FractionalOrders::of(&model, &experiments, &at).unwrap();
+            let states = IntegerOrders::of(&model, &experiments, &at).unwrap();
+            let here = found.evaluate(&model, &experiments, &at, &[2, 3]).unwrap();
+            let there = states.evaluate(&model, &experiments, &at, &[2, 3]).unwrap();
+            assert!(distance(&here.residuals, &there.residuals) < 1e-8);
+            assert!(distance(&here.point.coefficients, &there.point.coefficients) < 1e-8);
+            let slopes = found.jacobian(&model, &experiments, &[2, 3], &here).unwrap();
+            let exact = states.jacobian(&model, &experiments, &[2, 3], &there).unwrap();
+            // The order is fixed in the states.
+            slopes.iter().zip(&exact).skip(1).for_each(|(a, b)| assert!(distance(a, b) < 1e-7));
+        }
+    }
+
+    #[test]
+    fn derivatives_are_limits_of_differences() {
+        let (experiments, at, model) = ([experiment(1)], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
+        let found = FractionalOrders::of(&model, &experiments, &at).unwrap();
+        let here = found.evaluate(&model, &experiments, &at, &[]).unwrap();
+        let slopes = found.jacobian(&model, &experiments, &[], &here).unwrap();
+        for (parameter, slope) in slopes.iter().enumerate() {
+            let moved = |by: f64| {
+                let mut at = at.clone();
+                match parameter.checked_sub(1) {
+                    None => at.orders[0] += by,
+                    Some(j) => at.coefficients[j] += by,
+                }
+                found.evaluate(&model, &experiments, &at, &[]).unwrap().residuals
+            };
+            let differences: Vec<f64> = moved(1e-4).iter().zip(moved(-1e-4)).map(|(a, b)| (a - b) / 2e-4).collect();
+            assert!(distance(slope, &differences) < 1e-5, "parameter {parameter}");
+        }
+    }
+
+    #[test]
+    fn pulses_have_the_same_limit() {
+        let (at, model) = (point(1.7), model((1.0, 3.0), 0.6, Initial::Caputo));
+        let (experiments, fine) = ([experiment(1)], [experiment(8)]);
+        let found = FractionalOrders::of(&model, &experiments, &at).unwrap();
+        let here = found.evaluate(&model, &experiments, &at, &[2, 3]).unwrap();
+        let mut caches = EvaluationCache::of(&fine, &Stop::default()).unwrap();
+        let there = model.evaluate(&fine, &mut caches, &at, &[2, 3]).unwrap();
+        assert!(distance(&here.residuals, &there.residuals) < 1e-4);
+        assert!(distance(&here.point.coefficients, &there.point.coefficients) < 1e-4);
+        assert!(distance(&here.initial[0][0], &there.initial[0][0]) < 1e-2);
+        let slopes = found.jacobian(&model, &experiments, &[2, 3], &here).unwrap();
+        let pulses = model.jacobian(&fine, &mut caches, &[2, 3], &there).unwrap();
+        slopes.iter().zip(&pulses).for_each(|(a, b)| assert!(distance(a, b) < 1e-3));
+    }
+}

@@ -1,0 +1,226 @@
+//! Transforms of samples from Laplace transforms, by Poisson's summation formula.
+//!
+//! Samples f(kh) have the starred transform F*(s) = Σ f(kh) e^{−skh} = 1/h Σ_n F(s + 2πi n/h), in which the sample at a
+//! jump is the mean of both sides. For Re s = σ > 0 it is the discrete Fourier transform of the samples times e^{−σkh},
+//! which are periodic up to e^{−σLh} over L samples. So a function of s of any orders has exact samples without a grid of
+//! pulses, and a convolution with held inputs is a product of two transforms.
+//!
+//! The terms n ≠ 0 are smooth in the base band |Im s| ≤ π/h, where they are interpolated. Their sum is an
+//! Euler–Maclaurin sum up to a constant, which the sample at t = 0 determines.
+
+use std::f64::consts::PI;
+
+use crate::fft::{self, Bin, Plan, Workspace};
+
+/// Damping σ times the duration: about the geometric mean of the errors by e^{−2σT} and by rounding, e^{σT} ε.
+const DAMPING_DURATIONS: f64 = 12.0;
+/// Panels of the base band, and Chebyshev nodes in each: 34^−8 is 6e−13 if no pole is near the Nyquist frequency.
+const BAND_PANEL_COUNT: usize = 8;
+const PANEL_NODES: usize = 8;
+/// Order n from which on the terms are summed by an integral.
+const MAX_DIRECT_ORDER: usize = 32;
+/// Coefficient of the third difference in the Euler–Maclaurin sum between two orders.
+const THIRD_DIFFERENCE: f64 = 17.0 / 5760.0;
+/// Gauss–Legendre rule on [0, 1] as (point, weight).
+const LEGENDRE_RULE: [(f64, f64); 4] = [
+    (0.069_431_844_202_973_71, 0.173_927_422_568_726_93),
+    (0.330_009_478_207_571_87, 0.326_072_577_431_273_07),
+    (0.669_990_521_792_428_1, 0.326_072_577_431_273_07),
+    (0.930_568_155_797_026_3, 0.173_927_422_568_726_93),
+];
+
+/// Contour and transforms of a number of uniform samples.
+pub(crate) struct StarredTransform {
+    step: f64,
+    plan: Plan,
+    /// e^{−σkh} of each sample.
+    damping: Vec<f64>,
+    /// ln s of each bin.
+    logarithms: Vec<Bin>,
+    /// Bin from which on each panel follows, and the number of bins at last.
+    panels: Vec<usize>,
+    /// Weights and ln s of the terms n ≠ 0 of each node.
+    aliases: Vec<Vec<(f64, Bin)>>,
+}
+
+impl StarredTransform {
+    /// Transforms of `rows` samples with this step.
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(crate) fn new(rows: usize, step: f64) -> Self {
+        let plan = fft::plan(fft::fast_length(2 * rows));
+        let sigma = DAMPING_DURATIONS / (rows as f64 * step);
+        let logarithm = |omega: f64| Bin::new(libm::log(sigma.hypot(omega)), libm::atan2(omega, sigma));
+        let spacing = 2.0 * PI / (plan.len() as f64 * step);
+        let width = PI / step / BAND_PANEL_COUNT as f64;
+        let panels = (0..=BAND_PANEL_COUNT).map(|p| {
+            if p == BAND_PANEL_COUNT {
+                plan.bins()
+            } else {
+                (p as f64 * width / spacing).ceil() as usize
+            }
+        });
+        let period = 2.0 * PI / step;
+        let mut weights = vec![1.0; MAX_DIRECT_ORDER];
+        weights.extend([0.0; 2]);
+        weights[MAX_DIRECT_ORDER] += 1.0 / 24.0 + 3.0 * THIRD_DIFFERENCE;
+        weights[MAX_DIRECT_ORDER - 1] -= 1.0 / 24.0 + 3.0 * THIRD_DIFFERENCE;
+        weights[MAX_DIRECT_ORDER + 1] -= THIRD_DIFFERENCE;
+        weights[MAX_DIRECT_ORDER - 2] += THIRD_DIFFERENCE;
+        let edge = (MAX_DIRECT_ORDER as f64 - 0.5) * period;
+        let node = |place: usize| {
+            let omega = width * (0.5 + (place / PANEL_NODES) as f64 + 0.5 * chebyshev_node(place % PANEL_NODES));
+            let direct =
+                weights.iter().enumerate().skip(1).flat_map(|(n, &weight)| {
+                    [1.0, -1.0].map(|sign| (weight, logarithm(omega + sign * n as f64 * period)))
+                });
+            // d/dω of the integral from the edge to infinity is the function at the edge.
+            let beyond = LEGENDRE_RULE.iter().flat_map(|&(point, weight)| {
+                [1.0, -1.0].map(|sign| (-sign * weight * omega / period, logarithm(point * omega + sign * edge)))
+            });
+            direct.chain(beyond).collect()
+        };
+        Self {
+            step,
+            damping: (0..rows).map(|k| libm::exp(-sigma * step * k as f64)).collect(),
+            logarithms: (0..plan.bins()).map(|j| logarithm(j as f64 * spacing)).collect(),
+            panels: panels.collect(),
+            aliases: (0..BAND_PANEL_COUNT * PANEL_NODES).map(node).collect(),
+            plan,
+        }
+    }
+
+    /// Transform of samples.
+    pub(crate) fn transform(&self, samples: impl Iterator<Item = f64>) -> Vec<Bin> {
+        let mut time: Vec<f64> = samples.zip(&self.damping).map(|(v, damping)| v * damping).collect();
+        time.resize(self.plan.len(), 0.0);
+        let mut spectrum = vec![Bin::default(); self.plan.bins()];
+        self.plan.transform(&mut time, &mut spectrum, &mut Workspace::new());
+        spectrum
+    }
+
+    /// Samples of a transform.
+    pub(crate) fn samples(&self, mut spectrum: Vec<Bin>) -> Vec<f64> {
+        let mut time = vec![0.0; self.plan.len()];
+        self.plan.inverse(&mut spectrum, &mut time, &mut Workspace::new());
+        time.truncate(self.damping.len());
+        time.iter_mut().zip(&self.damping).for_each(|(v, damping)| *v /= damping);
+        time
+    }
+
+    /// Compute the starred transforms of functions with these samples at t = 0: `functions` sets their values at ln s.
+    pub(crate) fn spectra(&self, starts: &[f64], mut functions: impl FnMut(Bin, &mut [Bin])) -> Vec<Vec<Bin>> {
+        let count = starts.len();
+        let mut values = vec![Bin::default(); count];
+        let mut sums = vec![[Bin::default(); BAND_PANEL_COUNT * PANEL_NODES]; count];
+        for (place, aliases) in self.aliases.iter().enumerate() {
+            for &(weight, logarithm) in aliases {
+                functions(logarithm, &mut values);
+                sums.iter_mut().zip(&values).for_each(|(sum, value)| sum[place] += value * weight);
+            }
+        }
+        let mut spectra = vec![Vec::with_capacity(self.logarithms.len()); count];
+        for &logarithm in &self.logarithms {
+            functions(logarithm, &mut values);
+            spectra.iter_mut().zip(&values).for_each(|(spectrum, &value)| spectrum.push(value));
+        }
+        for ((spectrum, sums), start) in spectra.iter_mut().zip(&sums).zip(starts) {
+            self.add_aliases(spectrum, sums);
+            let (bins, inner) =
+                (spectrum.len(), spectrum[1..spectrum.len() - 1].iter().map(|v| 2.0 * v.re).sum::<f64>());
+            #[allow(clippy::cast_precision_loss)]
+            let mean = (spectrum[0].re + inner + spectrum[bins - 1].re) / self.plan.len() as f64;
+            let scale = 1.0 / self.step;
+            spectrum.iter_mut().for_each(|v| *v = (*v - mean) * scale + start);
+        }
+        spectra
+    }
+
+    /// Add the interpolated terms n ≠ 0 to the term n = 0 of a function.
+    #[allow(clippy::cast_precision_loss)]
+    fn add_aliases(&self, spectrum: &mut [Bin], sums: &[Bin]) {
+        let share = 2.0 * BAND_PANEL_COUNT as f64 / (self.plan.len() / 2) as f64;
+        for (p, nodes) in sums.chunks_exact(PANEL_NODES).enumerate() {
+            // Chebyshev coefficients.
+            let mut c = [Bin::default(); PANEL_NODES];
+            for (m, c) in c.iter_mut().enumerate() {
+                let scale = if m == 0 { 1.0 } else { 2.0 } / PANEL_NODES as f64;
+                for (k, value) in nodes.iter().enumerate() {
+                    *c += value * (scale * libm::cos(m as f64 * node_angle(k)));
+                }
+            }
+            let first = self.panels[p];
+            for (j, value) in (first..).zip(&mut spectrum[first..self.panels[p + 1]]) {
+                let x = j as f64 * share - (2 * p + 1) as f64;
+                let (mut above, mut here) = (Bin::default(), Bin::default());
+                for c in c[1..].iter().rev() {
+                    (above, here) = (here, here * (2.0 * x) - above + c);
+                }
+                *value += here * x - above + c[0];
+            }
+        }
+    }
+}
+
+/// Angle of a Chebyshev node.
+#[allow(clippy::cast_precision_loss)]
+fn node_angle(k: usize) -> f64 {
+    (2 * k + 1) as f64 * PI / (2 * PANEL_NODES) as f64
+}
+
+/// Chebyshev node on [−1, 1].
+fn chebyshev_node(k: usize) -> f64 {
+    libm::cos(node_angle(k))
+}
+
+/// s^−η from ln s.
+pub(crate) fn integration(logarithm: Bin, eta: f64) -> Bin {
+    let size = libm::exp(-eta * logarithm.re);
+    let (sine, cosine) = libm::sincos(-eta * logarithm.im);
+    Bin::new(size * cosine, size * sine)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Step response of a function of s, without feedthrough.
+    fn step_response(rows: usize, step: f64, function: impl Fn(Bin) -> Bin) -> Vec<f64> {
+        let transform = StarredTransform::new(rows, step);
+        let found = transform.spectra(&[0.0], |logarithm, values| {
+            values[0] = function(logarithm) * integration(logarithm, 1.0);
+        });
+        found.into_iter().map(|spectrum| transform.samples(spectrum)).next().unwrap_or_default()
+    }
+
+    fn distance(found: &[f64], exact: impl Fn(f64) -> f64, step: f64) -> f64 {
+        found.iter().enumerate().map(|(k, v)| (v - exact(k as f64 * step)).abs()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn step_responses_of_closed_form_are_exact() {
+        for (rows, step) in [(200, 0.05), (5000, 0.01)] {
+            // 1/(s + 3), 9/(s² + 0.6 s + 9), 1/(s^0.5 + 1) and s^−0.01.
+            let fall = step_response(rows, step, |l| (integration(l, -1.0) + 3.0).inv());
+            assert!(distance(&fall, |t| (1.0 - (-3.0 * t).exp()) / 3.0, step) < 1e-9);
+            let (decay, omega) = (0.3, (9.0_f64 - 0.09).sqrt());
+            let ring =
+                step_response(rows, step, |l| (integration(l, -2.0) + integration(l, -1.0) * 0.6 + 9.0).inv() * 9.0);
+            let exact = |t: f64| 1.0 - (-decay * t).exp() * ((omega * t).cos() + decay / omega * (omega * t).sin());
+            assert!(distance(&ring, exact, step) < 1e-9);
+            let slow = step_response(rows, step, |l| integration(l, 0.01));
+            let gamma = libm::tgamma(1.01);
+            assert!(distance(&slow, |t| t.powf(0.01) / gamma, step) < 1e-9);
+            let half = step_response(rows, step, |l| (integration(l, -0.5) + 1.0).inv());
+            let exact = |t: f64| 1.0 - t.exp() * libm::erfc(t.sqrt());
+            assert!(distance(&half[..200], exact, step) < 1e-9);
+        }
+    }
+
+    #[test]
+    fn samples_return_from_their_transform() {
+        let samples: Vec<f64> = (0..77).map(|k| f64::from(k).sin()).collect();
+        let transform = StarredTransform::new(77, 0.1);
+        let back = transform.samples(transform.transform(samples.iter().copied()));
+        assert!(back.iter().zip(&samples).all(|(a, b)| (a - b).abs() < 1e-9));
+    }
+}
