@@ -104,7 +104,7 @@ const MAX_LEVEL_BLOCKS: usize = 32;
 /// Values of one tile of a spectrum: [`LANE_COUNT`] real parts, then as many imaginary ones.
 const TILE_PARTS: usize = 2 * LANE_COUNT;
 
-/// Solved blocks of one length, and the pieces of the n² series that join them to later blocks of that length.
+/// Spectra of the solved blocks of one length, and of the pieces of the n² series that join them to later blocks.
 ///
 /// Piece d holds the terms d·len to (d + 2)·len of a series. The second half of its cyclic product with a block is what
 /// the block contributes to the one d + 1 further on. Contributions of several blocks are summed as spectra, tile by
@@ -112,7 +112,7 @@ const TILE_PARTS: usize = 2 * LANE_COUNT;
 struct Level {
     plan: Plan,
     len: usize,
-    /// Most blocks, so many that the last one ends where the series end.
+    /// Number of blocks that there is memory for.
     capacity: usize,
     blocks: Vec<f64>,
     pieces: Vec<f64>,
