@@ -465,7 +465,7 @@ class Candidates:
 
         Notes
         -----
-        About 40 us a candidate of 2048 pulses and four terms, a fraction of it with a limit that few reach.
+        O(k M + M log^2 M) a candidate beyond its coefficients, and a fraction of it with a limit that few reach.
         """
         table = self._orders(orders)
         check_choice("norm", norm, ("l1", "l2"))
