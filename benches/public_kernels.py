@@ -22,6 +22,8 @@ from search import plant_a_run
 M, STEP, ORDER, SIGNALS = 2048, 10.0 / 2048, 0.85, 256
 #: Candidates that are scored without a limit.
 SCORED = 512
+#: Samples of a recursion with four terms and p = 7.
+SAMPLES = 20_000
 
 
 def shortest(work: Callable[[], object], seconds: float = 0.5) -> float:
@@ -60,9 +62,9 @@ def main() -> None:
     ours, numpy_time = shortest(lambda: kernels.integrate(x, ORDER, step=STEP)), shortest(prepared)
     scipy_time = shortest(lambda: fftconvolve(x, kernel[None], axes=-1)[:, :M])
     say(
-        f"integrate, {SIGNALS} signals of {M}: {ours / SIGNALS * 1e6:.1f} us a signal; NumPy with a prepared spectrum "
-        f"{numpy_time / SIGNALS * 1e6:.1f} us, ratio {ours / numpy_time:.2f}; SciPy's fftconvolve "
-        f"{scipy_time / SIGNALS * 1e6:.1f} us"
+        f"P19, integrate, {SIGNALS} signals of {M}: {ours / SIGNALS * 1e6:.1f} us each; NumPy, spectrum prepared, "
+        f"{numpy_time / SIGNALS * 1e6:.1f} (ratio {ours / numpy_time:.2f}, promised 1); fftconvolve "
+        f"{scipy_time / SIGNALS * 1e6:.1f}"
     )
     first, row = np.concatenate([[1.0], random.standard_normal(M - 1) / M]), np.zeros(M)
     row[0] = first[0]
@@ -70,21 +72,21 @@ def main() -> None:
     ours = shortest(lambda: kernels.toeplitz_solve(first, x[0]))
     scipy_time = shortest(lambda: solve_toeplitz((first, row), x[0]))
     say(
-        f"toeplitz_solve, {M}: {ours * 1e6:.0f} us; SciPy's solve_toeplitz {scipy_time * 1e6:.0f} us, "
-        f"{scipy_time / ours:.0f} times ours"
+        f"P19, toeplitz_solve, {M}: {ours * 1e6:.0f} us; SciPy {scipy_time * 1e6:.0f}, {scipy_time / ours:.0f} times "
+        "ours (promised 50)"
     )
     ours, dense = (shortest(lambda of=of: _core.operational_matrix(ORDER, M, STEP, dense=of)) for of in (False, True))
     phi, square = ftlm.haar_matrix(M), ftlm.block_pulse_matrix(ORDER, M, step=STEP)
     numpy_time = shortest(lambda: phi @ square @ phi.T)
     say(
-        f"operational matrix of {M} Haar functions, which the Toeplitz structure gives: {ours * 1e3:.0f} ms; dense "
-        f"products by faer {dense * 1e3:.0f} ms, {dense / ours:.0f} times ours; by NumPy {numpy_time * 1e3:.0f} ms"
+        f"Haar operational matrix of {M} by Toeplitz structure: {ours * 1e3:.0f} ms; dense by faer {dense * 1e3:.0f}, "
+        f"by NumPy {numpy_time * 1e3:.0f}"
     )
     ours, dense = shortest(lambda: kernels.integrate(x, ORDER, step=STEP)), shortest(lambda: x @ square)
     assert np.allclose(kernels.integrate(x, ORDER, step=STEP), x @ square, atol=1e-10)
     say(
-        f"operational matrix of {M} block pulses times {SIGNALS} signals: {ours * 1e3:.1f} ms as Toeplitz products; "
-        f"dense product by NumPy {dense * 1e3:.1f} ms, {dense / ours:.1f} times ours"
+        f"block-pulse matrix of {M} times {SIGNALS} signals by Toeplitz products: {ours * 1e3:.1f} ms; dense by NumPy "
+        f"{dense * 1e3:.1f}"
     )
     run = plant_a_run()
     means = np.stack([kernels.pulse_means(run[name], M, hold=name == "I1") for name in ("theta12", "theta11", "I1")])
@@ -94,8 +96,14 @@ def main() -> None:
     orders = np.column_stack([alpha, alpha * shares[:, 1], alpha * shares[:, 0], alpha * shares[:, 0] * 0.5, 0 * alpha])
     plan.score(orders)
     ours = shortest(lambda: plan.score(orders))
-    say(f"Candidates.score without a limit, {SCORED} order tuples of four terms: {ours / SCORED * 1e6:.1f} us each")
+    say(f"P19, Candidates.score without a limit, four terms: {ours / SCORED * 1e6:.1f} us a candidate (promised 40)")
+    rows = np.cumsum(random.standard_normal((SAMPLES, 3)), axis=0) / 100
 
+    def recursion() -> None:
+        orders, hold = [1.9, 0.8, 0.5, 0.3, 0.0], [False, False, True]
+        kernels.Recursion(orders, [0, 1, 0, 2], step=STEP, hold=hold, longest=SAMPLES).push(rows)
+
+    say(f"Recursion, four terms, p = 7: {shortest(recursion) / SAMPLES * 1e6:.2f} us a sample (promised 1)")
     if given.write:
         save([f"- {line}" for line in lines])
 

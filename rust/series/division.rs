@@ -1,5 +1,8 @@
 //! Division of series by forward substitution in blocks that are joined by FFT products, O(m log² m).
 //!
+//! Blocks of 64 terms, of 2048 and so on each form a level. Within it the spectra of solved blocks and of the divisor's
+//! pieces are computed once, and only their products are summed for each later block.
+//!
 //! Exact for every divisor with a nonzero leading coefficient, stable or not. [`Division`] returns the quotient block
 //! by block, so that a search can drop a candidate early.
 
@@ -9,33 +12,27 @@ use super::product::Kernel;
 use crate::error::{check_length, Error, Result};
 use crate::fft::{self, Bin, Plan, Workspace};
 use crate::linalg::small;
-use crate::simd;
+use crate::simd::{self, LANE_COUNT};
 
-/// Length of a block of forward substitution. 64 was the fastest of 16, 32, 64, 128 at m = 2048.
+/// Length of a block of forward substitution, the shortest that is joined to others by transforms.
 pub const BLOCK_TERMS: usize = 64;
-
-/// Longest half length of blocks that are joined directly, which is faster there and has no transform rounding.
-const JOINED_DIRECTLY: usize = 64;
 
 /// Terms whose sums stay in registers while the products with a tile are subtracted.
 const TILE_TERMS: usize = 8;
 
-/// `open[i] −= Σ_s series[start − s + i]·solved[s]`, s from 0 on, with the same operations for every term.
+/// `open[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`, with the same operations for every term.
 #[inline(always)]
-fn take_off(open: &mut [f64], series: &[f64], start: usize, solved: &[f64]) {
-    let mut at = start;
-    let mut tiles = open.chunks_exact_mut(2 * TILE_TERMS);
-    for tile in &mut tiles {
-        let mut sums = [0.0; 2 * TILE_TERMS];
-        sums.copy_from_slice(tile);
-        for (s, &y) in solved.iter().enumerate() {
-            let part = &series[at - s..at - s + 2 * TILE_TERMS];
-            for i in 0..2 * TILE_TERMS {
-                sums[i] -= part[i] * y;
-            }
-        }
-        tile.copy_from_slice(&sums);
+fn take_off(open: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
+    let mut at = TILE_TERMS;
+    let mut pairs = open.chunks_exact_mut(2 * TILE_TERMS);
+    for pair in &mut pairs {
+        take_off_tile::<{ 2 * TILE_TERMS }>(pair, &series[at - TILE_TERMS..], solved);
         at += 2 * TILE_TERMS;
+    }
+    let mut tiles = pairs.into_remainder().chunks_exact_mut(TILE_TERMS);
+    for tile in &mut tiles {
+        take_off_tile::<TILE_TERMS>(tile, &series[at - TILE_TERMS..], solved);
+        at += TILE_TERMS;
     }
     let rest = tiles.into_remainder();
     for (s, &y) in solved.iter().enumerate() {
@@ -43,6 +40,20 @@ fn take_off(open: &mut [f64], series: &[f64], start: usize, solved: &[f64]) {
             *term -= v * y;
         }
     }
+}
+
+/// [`take_off`] of L terms, whose sums stay in registers.
+#[inline(always)]
+fn take_off_tile<const L: usize>(open: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
+    let mut sums = [0.0; L];
+    sums.copy_from_slice(open);
+    for (s, &y) in solved.iter().enumerate() {
+        let part = &series[TILE_TERMS - s..][..L];
+        for i in 0..L {
+            sums[i] -= part[i] * y;
+        }
+    }
+    open.copy_from_slice(&sums);
 }
 
 /// Forward substitution within a block of one unknown, in place, tile by tile.
@@ -57,13 +68,13 @@ impl simd::SimdKernel for Substitution<'_> {
 
     #[inline(always)]
     fn run(self) {
+        let mut head = [0.0; TILE_TERMS];
+        let known = self.divisor.len().min(TILE_TERMS);
+        head[..known].copy_from_slice(&self.divisor[..known]);
         let mut open = self.block;
         while open.len() >= TILE_TERMS {
             let (tile, later) = open.split_at_mut(TILE_TERMS);
             // With a constant length the loop is unrolled and its values stay in registers.
-            let mut head = [0.0; TILE_TERMS];
-            let known = self.divisor.len().min(TILE_TERMS);
-            head[..known].copy_from_slice(&self.divisor[..known]);
             let mut solved = [0.0; TILE_TERMS];
             solved.copy_from_slice(tile);
             for k in 0..TILE_TERMS {
@@ -73,7 +84,7 @@ impl simd::SimdKernel for Substitution<'_> {
                 }
             }
             tile.copy_from_slice(&solved);
-            take_off(later, self.divisor, TILE_TERMS, &solved);
+            take_off(later, self.divisor, &solved);
             open = later;
         }
         for k in 0..open.len() {
@@ -86,68 +97,146 @@ impl simd::SimdKernel for Substitution<'_> {
     }
 }
 
-/// Contribution of a solved block to the terms right after it.
-struct Join<'a> {
-    series: &'a [f64],
-    solved: &'a [f64],
-    open: &'a mut [f64],
+/// Most blocks of one level. The blocks of the next level are as long as all of them together. 32 was the fastest of 8,
+/// 16 and 32 at m = 2048.
+const MAX_LEVEL_BLOCKS: usize = 32;
+
+/// Values of one tile of a spectrum: [`LANE_COUNT`] real parts, then as many imaginary ones.
+const TILE_PARTS: usize = 2 * LANE_COUNT;
+
+/// Spectra of the solved blocks of one length, and of the pieces of the n² series that join them to later blocks.
+///
+/// Piece d holds the terms d·len to (d + 2)·len of a series. The second half of its cyclic product with a block is what
+/// the block contributes to the one d + 1 further on. Contributions of several blocks are summed as spectra, tile by
+/// tile, so the spectra of one tile are stored side by side: blocks forwards, pieces backwards.
+struct Level {
+    plan: Plan,
+    len: usize,
+    /// Number of blocks that there is memory for.
+    capacity: usize,
+    blocks: Vec<f64>,
+    pieces: Vec<f64>,
+    known_pieces: usize,
 }
 
-impl simd::SimdKernel for Join<'_> {
+impl Level {
+    fn new(len: usize, n: usize, m: usize) -> Self {
+        let plan = fft::plan(2 * len);
+        let capacity = m.div_ceil(len).min(MAX_LEVEL_BLOCKS);
+        let size = plan.bins().div_ceil(LANE_COUNT) * TILE_PARTS * capacity * n;
+        Self { plan, len, capacity, blocks: vec![0.0; size], pieces: vec![0.0; size * n], known_pieces: 0 }
+    }
+}
+
+/// Buffers of the transforms of one level at a time.
+#[derive(Default)]
+struct LevelBuffers {
+    time: Vec<f64>,
+    spectrum: Vec<Bin>,
+    /// Tiles of a sum of spectra.
+    sum: Vec<f64>,
+    workspace: Workspace,
+}
+
+impl LevelBuffers {
+    fn fit(&mut self, plan: &Plan) {
+        self.time.resize(plan.len(), 0.0);
+        self.spectrum.resize(plan.bins(), Bin::new(0.0, 0.0));
+        self.sum.resize(plan.bins().div_ceil(LANE_COUNT) * TILE_PARTS, 0.0);
+    }
+
+    /// Spectrum of the values followed by zeros.
+    fn transform(&mut self, plan: &Plan, values: &[f64]) {
+        self.time[..values.len()].copy_from_slice(values);
+        self.time[values.len()..].fill(0.0);
+        plan.transform(&mut self.time, &mut self.spectrum, &mut self.workspace);
+    }
+
+    /// Write the spectrum into its place among `count` spectra of [`Level`].
+    fn store_spectrum(&self, place: usize, count: usize, parts: &mut [f64]) {
+        for (bins, tiles) in self.spectrum.chunks(LANE_COUNT).zip(parts.chunks_exact_mut(count * TILE_PARTS)) {
+            let (re, im) = tiles[place * TILE_PARTS..][..TILE_PARTS].split_at_mut(LANE_COUNT);
+            for ((bin, re), im) in bins.iter().zip(re).zip(im) {
+                (*re, *im) = (bin.re, bin.im);
+            }
+        }
+    }
+
+    /// Cyclic product whose spectrum is the sum.
+    fn invert_sum(&mut self, plan: &Plan) -> &[f64] {
+        for (bins, tile) in self.spectrum.chunks_mut(LANE_COUNT).zip(self.sum.chunks_exact(TILE_PARTS)) {
+            let (re, im) = tile.split_at(LANE_COUNT);
+            for ((bin, &re), &im) in bins.iter_mut().zip(re).zip(im) {
+                *bin = Bin::new(re, im);
+            }
+        }
+        plan.inverse(&mut self.spectrum, &mut self.time, &mut self.workspace);
+        &self.time
+    }
+}
+
+/// Spectrum of what the first `count` blocks of a level contribute to equation `i` in the next block.
+struct Contributions<'a> {
+    n: usize,
+    i: usize,
+    count: usize,
+    level: &'a Level,
+    sum: &'a mut [f64],
+}
+
+impl simd::SimdKernel for Contributions<'_> {
     type Output = ();
 
     #[inline(always)]
     fn run(self) {
-        take_off(self.open, self.series, self.solved.len(), self.solved);
+        let Self { n, i, count, level: Level { capacity, blocks, pieces, .. }, sum } = self;
+        let (block, piece) = (n * TILE_PARTS, n * n * TILE_PARTS);
+        let blocks = blocks.chunks_exact(capacity * block);
+        let pieces = pieces.chunks_exact(capacity * piece);
+        for ((parts, blocks), pieces) in sum.chunks_exact_mut(TILE_PARTS).zip(blocks).zip(pieces) {
+            let (mut re, mut im) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
+            let pieces = pieces[(capacity - count) * piece..].chunks_exact(piece);
+            for (block, piece) in blocks.chunks_exact(block).zip(pieces) {
+                let factors = piece[i * block.len()..].chunks_exact(TILE_PARTS);
+                for (x, k) in block.chunks_exact(TILE_PARTS).zip(factors) {
+                    for l in 0..LANE_COUNT {
+                        re[l] += x[l] * k[l] - x[LANE_COUNT + l] * k[LANE_COUNT + l];
+                        im[l] += x[l] * k[LANE_COUNT + l] + x[LANE_COUNT + l] * k[l];
+                    }
+                }
+            }
+            parts[..LANE_COUNT].copy_from_slice(&re);
+            parts[LANE_COUNT..].copy_from_slice(&im);
+        }
     }
-}
-
-/// Transform of one length in a division: plan and spectra of the n² series, computed on demand.
-struct Level {
-    plan: Plan,
-    ready: bool,
-    spectra: Vec<Vec<Bin>>,
 }
 
 /// State of an n × n division that computes the quotients block by block.
 ///
 /// Right-hand sides are added block by block ([`Division::add`]). [`Division::advance`] then solves the next block and
-/// adds its contributions to the rest. After block b the only finished left half of the recursion has the largest power
-/// of two that divides b + 1 as its length, so one transform pair a block is enough.
+/// adds the contributions of solved blocks to one later block, of the longest level whose blocks end there. Every block
+/// is transformed once, so one transform pair a block is enough.
 pub struct Division {
     n: usize,
     m: usize,
     solved: usize,
     /// Right-hand side minus the contributions of solved blocks, then the quotient, per unknown.
     rest: Vec<Vec<f64>>,
-    /// Transforms, one per power of two of blocks.
+    /// Levels with their solved blocks, the shortest first.
     levels: Vec<Level>,
-    spectra: Vec<Vec<Bin>>,
-    product: Vec<Bin>,
-    time: Vec<f64>,
-    workspace: Workspace,
+    buffers: LevelBuffers,
 }
 
 impl Division {
     /// Division of n unknown series of m terms.
     #[must_use]
     pub fn new(n: usize, m: usize) -> Self {
-        Self {
-            n,
-            m,
-            solved: 0,
-            rest: vec![vec![0.0; m]; n],
-            levels: Vec::new(),
-            spectra: vec![Vec::new(); n],
-            product: Vec::new(),
-            time: Vec::new(),
-            workspace: Workspace::new(),
-        }
+        Self { n, m, solved: 0, rest: vec![vec![0.0; m]; n], levels: Vec::new(), buffers: LevelBuffers::default() }
     }
 
     /// Reset everything except allocated memory.
     pub fn reset(&mut self) {
-        self.levels.iter_mut().for_each(|level| level.ready = false);
+        self.levels.iter_mut().for_each(|level| level.known_pieces = 0);
         self.restart();
     }
 
@@ -209,7 +298,8 @@ impl Division {
         if hi == self.m {
             return hi - self.solved;
         }
-        (2 * (BLOCK_TERMS << (hi / BLOCK_TERMS).trailing_zeros())).min(self.m)
+        let (_, len, place) = level_of(hi);
+        ((place + 1) * len).min(self.m)
     }
 
     /// Total number of terms.
@@ -241,48 +331,33 @@ impl Division {
         if hi == self.m {
             return;
         }
-        let lo = hi.saturating_sub(BLOCK_TERMS);
-        let blocks = hi / BLOCK_TERMS;
-        let level = blocks.trailing_zeros() as usize;
-        let half = BLOCK_TERMS << level;
-        let end = (hi + half).min(self.m);
-        if half <= JOINED_DIRECTLY {
-            for i in 0..n {
-                for j in 0..n {
-                    let a = series(i, j, (2 * half).min(self.m));
-                    // Split borrows: the solved part of j contributes to the open part of i.
-                    let mut solved = [0.0; BLOCK_TERMS];
-                    solved[..hi - lo].copy_from_slice(&self.rest[j][lo..hi]);
-                    let open = &mut self.rest[i][hi..end];
-                    simd::dispatch_simd(Join { series: a, solved: &solved[..hi - lo], open });
-                }
-            }
-            return;
+        let (level, len, place) = level_of(hi);
+        let end = (hi + len).min(self.m);
+        while self.levels.len() <= level {
+            let len = self.levels.last().map_or(BLOCK_TERMS, |level| level.len * MAX_LEVEL_BLOCKS);
+            self.levels.push(Level::new(len, n, self.m));
         }
-        self.prepare(level, &series);
-        let zero = Bin::new(0.0, 0.0);
-        let Level { plan, spectra: kernels, .. } = &self.levels[level];
-        self.time.resize(self.time.len().max(plan.len()), 0.0);
-        self.product.resize(self.product.len().max(plan.bins()), zero);
-        for j in 0..n {
-            let time = &mut self.time[..plan.len()];
-            time[..half].copy_from_slice(&self.rest[j][hi - half..hi]);
-            time[half..].fill(0.0);
-            let bins = plan.bins().max(self.spectra[j].len());
-            self.spectra[j].resize(bins, zero);
-            plan.transform(time, &mut self.spectra[j][..plan.bins()], &mut self.workspace);
-        }
-        for i in 0..n {
-            let product = &mut self.product[..plan.bins()];
-            product.fill(zero);
-            for j in 0..n {
-                for ((p, x), k) in product.iter_mut().zip(&self.spectra[j]).zip(&kernels[i * n + j]) {
-                    *p += x * k;
-                }
+        let Self { rest, levels, buffers, m, .. } = self;
+        let level = &mut levels[level];
+        buffers.fit(&level.plan);
+        for piece in level.known_pieces..place {
+            for k in 0..n * n {
+                let terms = ((piece + 2) * len).min(*m);
+                buffers.transform(&level.plan, &series(k / n, k % n, terms)[piece * len..]);
+                let at = (level.capacity - 1 - piece) * n * n + k;
+                buffers.store_spectrum(at, level.capacity * n * n, &mut level.pieces);
             }
+        }
+        level.known_pieces = level.known_pieces.max(place);
+        for (j, rest) in rest.iter().enumerate() {
+            buffers.transform(&level.plan, &rest[hi - len..hi]);
+            buffers.store_spectrum((place - 1) * n + j, level.capacity * n, &mut level.blocks);
+        }
+        for (i, rest) in rest.iter_mut().enumerate() {
+            simd::dispatch_simd(Contributions { n, i, count: place, level, sum: &mut buffers.sum });
             // Wrapped-around terms of the cyclic product fall on the first half, which is not read.
-            plan.inverse(product, &mut self.time[..plan.len()], &mut self.workspace);
-            for (rest, &v) in self.rest[i][hi..end].iter_mut().zip(&self.time[half..]) {
+            let product = buffers.invert_sum(&level.plan);
+            for (rest, &v) in rest[hi..end].iter_mut().zip(&product[len..]) {
                 *rest -= v;
             }
         }
@@ -319,28 +394,16 @@ impl Division {
             }
         }
     }
+}
 
-    fn prepare<'a>(&mut self, level: usize, series: &impl Fn(usize, usize, usize) -> &'a [f64]) {
-        while self.levels.len() <= level {
-            let plan = fft::plan(2 * (BLOCK_TERMS << self.levels.len()));
-            self.levels.push(Level { plan, ready: false, spectra: Vec::new() });
-        }
-        let Level { plan, ready, spectra } = &mut self.levels[level];
-        if *ready {
-            return;
-        }
-        spectra.resize_with(self.n * self.n, Vec::new);
-        self.time.resize(self.time.len().max(plan.len()), 0.0);
-        let time = &mut self.time[..plan.len()];
-        for (place, spectrum) in spectra.iter_mut().enumerate() {
-            let a = series(place / self.n, place % self.n, plan.len().min(self.m));
-            time[..a.len()].copy_from_slice(a);
-            time[a.len()..].fill(0.0);
-            spectrum.resize(plan.bins(), Bin::new(0.0, 0.0));
-            plan.transform(time, spectrum, &mut self.workspace);
-        }
-        *ready = true;
+/// Index of the longest level with a block that ends at term `solved`, the length of its blocks, and the number of them
+/// that the next one must be joined to.
+fn level_of(solved: usize) -> (usize, usize, usize) {
+    let (mut level, mut len, mut count) = (0, BLOCK_TERMS, solved / BLOCK_TERMS);
+    while count != 0 && count.is_multiple_of(MAX_LEVEL_BLOCKS) {
+        (level, len, count) = (level + 1, len * MAX_LEVEL_BLOCKS, count / MAX_LEVEL_BLOCKS);
     }
+    (level, len, count % MAX_LEVEL_BLOCKS)
 }
 
 /// Quotient mod z^m with m the numerator's length, exact for stable and unstable divisors. O(m log² m).
