@@ -598,7 +598,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{input} saturates at {value:.3g} ± {error:.2g}, which the model lacks|: with it the residuals of {output} are "
         "independent of the inputs",
         "{input} saturates at {value:.3g}, which the model lacks",
-        "estimate the limit with the model: {ask[saturation]}",
+        "estimate it with the model: {ask[saturation]}, for {input} between {low:.2g} and {high:.2g}",
         prefix="{run}: ",
     ),
     "dead_zone_fits": FindingKind(
@@ -607,7 +607,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{input} has a dead zone of {value:.3g} ± {error:.2g}, which the model lacks|: with it the residuals of "
         "{output} are independent of the inputs",
         "{input} has a dead zone of {value:.3g}, which the model lacks",
-        "estimate the dead zone with the model: {ask[dead_zone]}",
+        "estimate it with the model: {ask[dead_zone]}, for {input} between {low:.2g} and {high:.2g}",
         prefix="{run}: ",
     ),
     "gain_varies": FindingKind(

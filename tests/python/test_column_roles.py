@@ -106,3 +106,13 @@ def test_a_file_that_is_no_run_has_no_columns_to_write(tmp_path):
     file = write(tmp_path / "a.csv", ["t", "foo", "bar"])
     with pytest.raises(ftlm.DataError, match="not a run yet"):
         ftlm.open_file(file).write_columns(tmp_path / "bench.toml")
+
+
+def test_a_file_with_outputs_alone_is_a_free_response(tmp_path):
+    path = tmp_path / "decay.csv"
+    time = np.arange(200) * 0.1
+    angle = np.exp(-0.1 * time) * np.cos(2 * time)
+    path.write_text("time,angle\n" + "\n".join(f"{t:.12g},{y:.12g}" for t, y in zip(time, angle, strict=True)) + "\n")
+    run = ftlm.load(path)
+    assert (run.inputs, run.outputs) == ((), ("angle",))
+    assert any("nothing drives 'angle', by the names of the columns" in w for w in run.warnings)

@@ -93,6 +93,7 @@ def test_how_an_input_acts_is_named(kind):
         assert said.reason in found.verdict.reasons
         if limit is not None:
             assert abs(said.numbers["value"] / limit - 1) < 0.03
+            assert "between 0.25 and 1" in said.remedy or "between 0.15 and 0.6" in said.remedy
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -401,18 +401,16 @@ class Run:
         Returns
         -------
         list of Run
-            Each with the number of its piece in its name.
+            Each with the number of its piece in its name, and without the notes of the whole run.
         """
         if not duration > 0.0:
             raise DataError(f"duration = {duration:g}, which must be above 0; give the length of a piece in seconds")
         count = max(1, int(self.length * self.step / max(duration, MIN_RUN_SAMPLES * self.step) + 1e-9))
         ends = np.linspace(0, self.length, count + 1).astype(int) * self.step
-        pieces = [self.window(float(a), float(b)) for a, b in itertools.pairwise(ends)]
-        return (
-            [p._with(name=f"{self.name} piece {k} of {count}") for k, p in enumerate(pieces, 1)]
-            if count > 1
-            else [self]
-        )
+        if count == 1:
+            return [self]
+        pieces = (self.window(float(a), float(b)) for a, b in itertools.pairwise(ends))
+        return [p._with(name=f"{self.name} piece {k} of {count}", notes=()) for k, p in enumerate(pieces, 1)]
 
     @check_arguments
     def resample(self, step: float) -> Run:

@@ -124,7 +124,7 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
         ((name, value),) = limits.items()
-        numbers = {"value": value, "error": refit.standard_errors[name]}
+        numbers = {"value": value, "error": refit.standard_errors[name], "low": 0.5 * value, "high": 2.0 * value}
         about["parameter"] = name
     shown = join_names(extension.inputs)
     return [make_finding(extension.code, input=shown, term=extension.terms, **about, **numbers)]

@@ -460,7 +460,8 @@ def identify_pieces(
     pieces = as_runs([piece for run in runs for piece in run.split(duration)])
     asked = replace(structure, initial="caputo")
     result = assess_fit(_fit_runs(pieces, asked, method or OutputError(), m=m, threads=threads, progress=None))
-    findings = (*result.findings, make_finding("runs_split", pieces=len(pieces), seconds=duration))
+    notes = [note for run in runs for note in data_notes(run)]
+    findings = (*result.findings, *notes, make_finding("runs_split", pieces=len(pieces), seconds=duration))
     known = result.model.estimate
     assert known is not None
     about = msgspec.structs.replace(known, findings=tuple(f.to_file() for f in findings), piece_duration=duration)
@@ -529,6 +530,8 @@ def assess_fit(fit: Fit) -> Identification:
             # No linear structure explains them: what the direction of motion shows is more specific.
             missing = []
         if not missing:
+            white = {o for o, r in tests.outputs.items() if r.whiteness.passed}
+            findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in white]
             findings = [_noise_finding(f, tests) for f in findings]
         findings += _residual_findings(fit, tests)
         if explained:

@@ -68,7 +68,7 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in measured)
     ]
     found = _roles_by_words(plant)
-    return found if found[0] else _roles_by_words(columns)
+    return found if found[1] else _roles_by_words(columns)
 
 
 def _tokens(column: str) -> frozenset[str]:
@@ -98,6 +98,9 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
             follows, rest = rest, []
         elif follows and not drives:
             drives, rest = rest, []
+    if follows and not drives and not rest:
+        # A free response.
+        return [], follows
     return (drives, follows) if drives and follows else ([], [])
 
 
@@ -162,10 +165,12 @@ def assume_roles(
     drives, follows = guess_roles(list(own))
     names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
     wanted.inputs, wanted.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
-    if not drives:
+    if not follows:
         return ()
     inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
     words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
+    if not drives:
+        words = f"nothing drives {outputs}, by the names of the columns"
     remedy = f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}"
     return (Assumption("inputs", inputs, words, remedy),)
 
