@@ -42,6 +42,10 @@ LOAD, MIN_LOAD_SHARE = "load", 0.05
 FIRST_LOAD_ROWS, MAX_LOAD_SEARCHES = 7, 4
 #: Smallest saturation limit and largest dead zone that are tried, as shares of the largest value of an input.
 MIN_SATURATION_SHARE, MAX_DEAD_SHARE = 0.05, 0.9
+#: First values of a saturation or dead zone, as shares of the largest value of an input.
+LIMIT_STARTS = (0.25, 0.6)
+#: Name of the coefficient of the square of an input.
+SQUARE = "square"
 #: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
 DELAY_SIGMAS = 3.0
 
@@ -60,8 +64,8 @@ class Extension:
         Number of additional parameters.
     inputs
         Inputs of what is added.
-    known
-        Initial guesses besides the automatic ones.
+    starts
+        Initial guesses; None stands for the automatic ones.
     terms
         Additional terms, as text.
     runs
@@ -74,10 +78,19 @@ class Extension:
     structure: Structure
     parameters: int
     inputs: Sequence[str]
-    known: Sequence[Mapping[str, float]] = ()
+    starts: Sequence[Mapping[str, float] | None] = (None,)
     terms: str = ""
     runs: Runs | None = None
     time: float = 0.0
+
+
+@dataclass(frozen=True)
+class FittedExtension:
+    """Extension with its fit and the criterion of one-step predictions of its residuals."""
+
+    extension: Extension
+    fit: JointFit
+    criterion: float
 
 
 def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
@@ -97,24 +110,14 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     if not names:
         return []
     own = _prediction_criterion(joint, 0)
-    best: tuple[float, Extension, JointFit] | None = None
-    for extension in _extensions(structure, joint, runs, names):
-        extended = replace(extension.structure, initial=joint.initial)
-        try:
-            fits = [fit_output_error(extension.runs or runs, extended)]
-            if extension.known:
-                fits.append(fit_output_error(runs, extended, known=extension.known))
-        except FtlmError:
-            continue
-        refit = min(fits, key=lambda f: f.noise[equation.output])
-        criterion = _prediction_criterion(refit, extension.parameters)
-        if refit.unstable_optimum is None and criterion < (own if best is None else best[0] - STRONG_EVIDENCE):
-            best = criterion, replace(extension, structure=extended), refit
-    if best is None or best[0] > own - MIN_CRITERION_DECREASE:
+    best = _best_extension(_extensions(structure, joint, runs, names), joint, runs, own)
+    load = _load_step(equation, structure, joint, runs)
+    best = best if load is None else _best_extension([load], joint, runs, own, best)
+    if best is None or best.criterion > own - MIN_CRITERION_DECREASE:
         return []
-    _, extension, refit = best
+    extension, refit = best.extension, best.fit
     about = {"run": ", ".join(r.name for r in runs), "output": equation.output}
-    if not _is_sufficient(refit, extension.structure, extension.runs or runs):
+    if not _is_sufficient(best, runs):
         return [make_finding("dynamics_missing", input=join_names(names), **about)]
     if extension.code == "delay_fits":
         return _delay_findings(extension, refit, structure, min(r.step for r in runs), about)
@@ -128,6 +131,29 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
         about["parameter"] = name
     shown = join_names(extension.inputs)
     return [make_finding(extension.code, input=shown, term=extension.terms, **about, **numbers)]
+
+
+def _best_extension(
+    extensions: Sequence[Extension], joint: JointFit, runs: Runs, own: float, best: FittedExtension | None = None
+) -> FittedExtension | None:
+    """Return the fit of the extension with the least criterion, if that is below `own` and clearly below `best`."""
+    for extension in extensions:
+        there = extension.runs or runs
+        asked = replace(extension.structure, initial=joint.initial)
+        try:
+            fits = [fit_output_error(there, asked, start=start, refine=False) for start in extension.starts]
+        except FtlmError:
+            continue
+        refit = min(fits, key=log_noise)
+        criterion = _prediction_criterion(refit, extension.parameters)
+        if refit.unstable_optimum is None and criterion < (own if best is None else best.criterion - STRONG_EVIDENCE):
+            best = FittedExtension(replace(extension, structure=asked), refit, criterion)
+    return best
+
+
+def log_noise(joint: JointFit) -> float:
+    """Return the sum over outputs of the logarithm of the residuals' root mean square."""
+    return sum(math.log(max(v, 1e-300)) for v in joint.noise.values())
 
 
 def _delay_findings(
@@ -155,7 +181,7 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     lagged = _with_lag(equation)
     found = [
         Extension("lag_fits", replace(structure, equations=(lagged,)), 1, names),
-        Extension("delay_fits", late, len(names), names, [begin]),
+        Extension("delay_fits", late, len(names), names, [None, begin]),
     ]
     more = [_next_derivative(equation, name, k) for k, name in enumerate(names)]
     shown = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
@@ -166,14 +192,16 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
         limited = structure.with_limits(saturation={name: (MIN_SATURATION_SHARE * largest, largest)})
-        found.append(Extension("saturation_fits", limited, 1, [name]))
+        starts = [{**joint.values_by_name, input_name("saturation", name): s * largest} for s in LIMIT_STARTS]
+        found.append(Extension("saturation_fits", limited, 1, [name], starts))
         dead = structure.with_limits(dead_zone={name: (0.0, MAX_DEAD_SHARE * largest)})
-        found.append(Extension("dead_zone_fits", dead, 1, [name]))
-        square = Term(name, Order(0.0), "square", expression=power(channel(name), 2.0))
+        starts = [{**joint.values_by_name, input_name("dead_zone", name): s * largest} for s in LIMIT_STARTS]
+        found.append(Extension("dead_zone_fits", dead, 1, [name], starts))
+        square = Term(name, Order(0.0), SQUARE, expression=power(channel(name), 2.0))
         curved = replace(structure, equations=(replace(equation, terms=(*equation.terms, square)),))
-        found.append(Extension("gain_varies", curved, 1, [name], terms=f"k {name}^2"))
-    load = _load_step(equation, structure, joint, runs)
-    return found if load is None else [*found, load]
+        flat = {**joint.values_by_name, SQUARE: 0.0}
+        found.append(Extension("gain_varies", curved, 1, [name], [flat], terms=f"k {name}^2"))
+    return found
 
 
 def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs) -> Extension | None:
@@ -188,9 +216,10 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
     wider = replace(structure, equations=(replace(item, terms=(*item.terms, Term(LOAD, Order(0.0), LOAD))),))
     size = run.length
 
-    def fit_at(row: int) -> JointFit:
+    def fit_at(row: int, near: JointFit) -> JointFit:
         loaded = _with_input(run, LOAD, np.where(np.arange(size) >= row, 1.0, 0.0))
-        return fit_output_error([loaded], replace(wider, initial=joint.initial), refine=False)
+        start = {LOAD: 0.0, **near.values_by_name}
+        return fit_output_error([loaded], replace(wider, initial=joint.initial), start=start, refine=False)
 
     def search(fitted: JointFit, row: int) -> tuple[float, int]:
         for _ in range(MAX_LOAD_SEARCHES):
@@ -201,19 +230,20 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
             found = _load_row(residuals, response)
             if found is None or found == row:
                 break
-            fitted, row = fit_at(found), found
+            fitted, row = fit_at(found, fitted), found
         return (fitted.noise[item.output] if row else math.inf), row
 
     try:
         rows = np.linspace(0, size, FIRST_LOAD_ROWS + 2).astype(int)[1:-1]
-        best = min(((fit_at(int(k)), int(k)) for k in rows), key=lambda pair: pair[0].noise[item.output])
+        best = min(((fit_at(int(k), joint), int(k)) for k in rows), key=lambda pair: pair[0].noise[item.output])
         noise, row = min(search(joint, 0), search(*best))
     except FtlmError:
         return None
     if not math.isfinite(noise):
         return None
     loaded = _with_input(run, LOAD, np.where(np.arange(size) >= row, 1.0, 0.0))
-    return Extension("load_steps", wider, 2, [LOAD], runs=as_runs(loaded), time=run.start + row * run.step)
+    starts = [None, {LOAD: 0.0, **joint.values_by_name}]
+    return Extension("load_steps", wider, 2, [LOAD], starts, runs=as_runs(loaded), time=run.start + row * run.step)
 
 
 def _with_input(run: Run, name: str, values: Floats) -> Run:
@@ -281,8 +311,9 @@ def _prediction_criterion(joint: JointFit, more: int) -> float:
     return total
 
 
-def _is_sufficient(joint: JointFit, structure: Structure, runs: Runs) -> bool:
-    """Whether the residuals of a fit follow neither an input nor the direction of motion."""
+def _is_sufficient(fitted: FittedExtension, given: Runs) -> bool:
+    """Whether the residuals of a fit depend neither on an input nor on the direction of motion."""
+    structure, joint, runs = fitted.extension.structure, fitted.fit, fitted.extension.runs or given
     model = fitted_model(joint, structure)
     try:
         tests = run_residual_tests(
@@ -295,6 +326,5 @@ def _is_sufficient(joint: JointFit, structure: Structure, runs: Runs) -> bool:
     except FtlmError:
         return False
     outputs = tests.outputs.values()
-    return not any(t.failed for o in outputs for t in o.inputs.values()) and not any(
-        o.follows_direction for o in outputs
-    )
+    failed = any(t.failed for o in outputs for t in o.inputs.values())
+    return not failed and not any(o.follows_direction for o in outputs)
