@@ -192,8 +192,8 @@ fn no_orders_of_a_region_do_better_than_is_proved() {
         };
         println!("{found:?}");
         let Certificate { lower_bound: at_least, best, order, ref orders, open_cells: open, .. } = found;
-        // What is said to be reached is.
-        assert!((rmse(order, orders).0 / best - 1.0).abs() < 1e-6, "{:?} {best}", rmse(order, orders));
+        // What is said to be reached is, as far as sums of squares of 1 tell a residual of 1e-5.
+        assert!((rmse(order, orders).0 / best - 1.0).abs() < 1e-5, "{:?} {best}", rmse(order, orders));
         assert!(at_least <= best);
         if open == 0 {
             assert!(at_least >= (1.0 - within) * best * (1.0 - 1e-8));

@@ -153,8 +153,8 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
 #[test]
 fn the_correction_of_a_long_record_for_its_step_ends_where_finer_grids_do() {
     // Of the second record the grid is off by half of the noise.
+    correction_ends_where_finer_grids_do(0.015);
     correction_ends_where_finer_grids_do(0.01);
-    correction_ends_where_finer_grids_do(0.003);
 }
 
 fn correction_ends_where_finer_grids_do(size: f64) {
@@ -186,9 +186,11 @@ fn correction_ends_where_finer_grids_do(size: f64) {
     let refined = refine_step(best.clone(), grid, Loss::Squares, &[]).unwrap().into_statistics();
     assert!(corrected.step_converged && corrected.pulses_per_sample == 1 && refined.pulses_per_sample > 1);
     assert_eq!(corrected.attempt.values(), best.values());
-    // On the grid itself the order is off by far more than its error.
-    assert!((best.values()[0] - 1.0).abs() > 4.0 * corrected.covariance[0].sqrt(), "{:?}", best.values());
-    for (k, truth) in [1.0, -2.0, 2.0].into_iter().enumerate() {
+    let truths = [1.0, -2.0, 2.0];
+    // On the grid itself a parameter is off by far more than its error.
+    let off = |k: usize| (best.values()[k] - truths[k]).abs() / corrected.covariance[k * 4].sqrt();
+    assert!(off(0).max(off(1)).max(off(2)) > 4.0, "{:?}", best.values());
+    for (k, truth) in truths.into_iter().enumerate() {
         let error = corrected.covariance[k * 4].sqrt();
         let (found, expected) = (corrected.estimate[k], refined.estimate[k]);
         assert!((found - expected).abs() < 0.15 * error, "{found} and {expected} ± {error}");
