@@ -108,7 +108,7 @@ def section(title):
 
 def test_the_walk_of_a_run_is_the_one_it_takes(tmp_path, small_run):
     """Each line of the walk names one function; a run passes them in that order."""
-    lines = re.findall(r"^(\d+)\. (.*(?:\n   .*)*)", section("The walk of a run"), re.MULTILINE)
+    lines = re.findall(r"^(\d+)\. (.*(?:\n   .*)*)", section("From a run to a report"), re.MULTILINE)
     assert [int(number) for number, _ in lines] == list(range(1, 11))
     walk = []
     for _, line in lines:

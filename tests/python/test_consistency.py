@@ -194,7 +194,7 @@ def test_a_page_a_frame_and_json(changed, tmp_path):
 def test_words_where_nothing_can_be_compared():
     run = changing([40.0])
     for parts in (1, 0, -2, 1.5, True, "2"):
-        with pytest.raises(ftlm.ModelError, match="is not a whole number from 2"):
+        with pytest.raises(ftlm.ModelError, match="is not a whole number of at least 2"):
             ftlm.consistency(run, SECOND, segments=parts)
     with pytest.raises(ftlm.ModelError, match="2 runs are segments by themselves; leave segments= out"):
         ftlm.consistency([run, changing([40.0], seed=1)], SECOND, segments=2)

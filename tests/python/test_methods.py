@@ -30,7 +30,7 @@ BAD_VALUES = {
     "top": (0, "top = 0 is outside [1, 100000]"),
     "store": (3, "store is int; give the path of a file"),
     "executor": (object(), "is not an executor of concurrent.futures"),
-    "innovation_length": (0, "innovation_length = 0 is not a whole number from 1"),
+    "innovation_length": (0, "innovation_length = 0 is not a whole number of at least 1; give one"),
     "prior_covariance": (-1, "prior_covariance = -1 is not positive; a large one is a weak prior"),
     "row_basis": ("columns", "row_basis = 'columns' is not known"),
     "seeds": ("12", "seeds = '12': give 1 to 1000 whole numbers"),

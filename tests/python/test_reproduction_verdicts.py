@@ -357,7 +357,7 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
 
     monkeypatch.setattr("ftlm.reproduction.stage_result.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
-        compare_orders(1, demo_run("square"), "fractional", 1, unseen=demo_run("sine"))
+        compare_orders(1, demo_run("square"), "fractional", 1, validation=demo_run("sine"))
     preset = Preset(ftlm.OrderGrid(increment=0.25), 1, 2, common_pulses=True)
     for simulated, initial in ((True, "rest"), (False, "auto")):
         work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None, simulated=simulated)

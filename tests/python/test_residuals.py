@@ -193,7 +193,7 @@ def test_refusals_name_the_thing_and_the_way_out(small_model, small_run):
     with pytest.raises(ftlm.DataError, match="has 40 rows, correlations up to 25 lags need 53; give a longer run"):
         small_model.resid(small_run.window(0, 0.8))
     for lags in (0, -1, 1.5, "x", None):
-        with pytest.raises(ftlm.ModelError, match="is not a whole number from 1"):
+        with pytest.raises(ftlm.ModelError, match="is not a whole number of at least 1"):
             small_model.resid(small_run, lags=lags)
     other = ftlm.Run.from_arrays(step=0.02, inputs={"w": small_run["u"]}, outputs={"y": small_run["y"]})
     with pytest.raises(ftlm.DataError, match="has no signal 'u', which the model needs"):
@@ -233,7 +233,7 @@ def test_information_criteria_by_hand(small_model, noisy):
     assert found.aic == pytest.approx(2 * k - 2 * likelihood, rel=1e-12)
     assert found.aicc == pytest.approx(found.aic + 2 * k * (k + 1) / (n - k - 1), rel=1e-12)
     assert found.bic == pytest.approx(k * math.log(n) - 2 * likelihood, rel=1e-12)
-    with pytest.raises(ftlm.ModelError, match="not a whole number from 0"):
+    with pytest.raises(ftlm.ModelError, match="not a whole number of at least 0"):
         ftlm.information_criteria(tests, -1)
 
 

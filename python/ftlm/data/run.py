@@ -402,6 +402,11 @@ class Run:
         -------
         list of Run
             Each with the number of its piece in its name, and without the notes of the whole run.
+
+        Raises
+        ------
+        DataError
+            A duration that is not positive.
         """
         if not duration > 0.0:
             raise DataError(f"duration = {duration:g}, which must be above 0; give the length of a piece in seconds")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +25,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.expression import channel, power
-from ftlm.structure.input_nonlinearity import input_name
+from ftlm.structure.input_nonlinearity import InputEffect, input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import Floats
@@ -37,7 +40,7 @@ MIN_CRITERION_DECREASE = 30.0
 STRONG_EVIDENCE = 10.0
 #: Name of an additional input, a load that is constant from some row on, and smallest share of the run before and
 #: after its step.
-LOAD, MIN_LOAD_SHARE = "load", 0.05
+LOAD_NAME, MIN_LOAD_SHARE = "load", 0.05
 #: Number of rows at which a load is fitted first, and most searches from the best of them.
 FIRST_LOAD_ROWS, MAX_LOAD_SEARCHES = 7, 4
 #: Smallest saturation limit and largest dead zone that are tried, as shares of the largest value of an input.
@@ -45,7 +48,7 @@ MIN_SATURATION_SHARE, MAX_DEAD_SHARE = 0.05, 0.9
 #: First values of a saturation or dead zone, as shares of the largest value of an input.
 LIMIT_STARTS = (0.25, 0.6)
 #: Name of the coefficient of the square of an input.
-SQUARE = "square"
+SQUARE_NAME = "square"
 #: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
 DELAY_SIGMAS = 3.0
 
@@ -123,7 +126,11 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
         return _delay_findings(extension, refit, structure, min(r.step for r in runs), about)
     numbers: dict[str, float] = {}
     if extension.runs is not None:
-        numbers = {"time": extension.time, "value": refit.coefficients[LOAD], "error": refit.standard_errors[LOAD]}
+        numbers = {
+            "time": extension.time,
+            "value": refit.coefficients[LOAD_NAME],
+            "error": refit.standard_errors[LOAD_NAME],
+        }
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
         ((name, value),) = limits.items()
@@ -178,29 +185,38 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     given = {n: structure.delay.get(n, 0.0) for n in names}
     late = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in given.items()})
     begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in given.items()}}
+    found: list[Extension] = []
+
+    def add(code: str, make: Callable[[], Structure], count: int, inputs: Sequence[str], **more: Any) -> None:
+        # What the structure cannot be extended by, such as orders that no input may have beside a square, is left out.
+        with contextlib.suppress(FtlmError):
+            found.append(Extension(code, make(), count, inputs, **more))
+
+    def with_equation(item: Equation) -> Structure:
+        return replace(structure, equations=(item,))
+
     lagged = _with_lag(equation)
-    found = [
-        Extension("lag_fits", replace(structure, equations=(lagged,)), 1, names),
-        Extension("delay_fits", late, len(names), names, [None, begin]),
-    ]
+    add("lag_fits", lambda: with_equation(lagged), 1, names)
+    add("delay_fits", lambda: late, len(names), names, starts=[None, begin])
     more = [_next_derivative(equation, name, k) for k, name in enumerate(names)]
     shown = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
     for code, item, limit in (("zero_fits", equation, equation.order), ("mode_fits", lagged, lagged.order)):
         if all(t.order.weights == () and limit.weights == () and t.order.constant <= limit.constant for t in more):
-            wider = replace(structure, equations=(replace(item, terms=(*item.terms, *more)),))
-            found.append(Extension(code, wider, len(more) + (item is lagged), names, terms=shown))
+            wider = replace(item, terms=(*item.terms, *more))
+            add(code, partial(with_equation, wider), len(more) + (item is lagged), names, terms=shown)
+    known = joint.values_by_name
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
-        limited = structure.with_limits(saturation={name: (MIN_SATURATION_SHARE * largest, largest)})
-        starts = [{**joint.values_by_name, input_name("saturation", name): s * largest} for s in LIMIT_STARTS]
-        found.append(Extension("saturation_fits", limited, 1, [name], starts))
-        dead = structure.with_limits(dead_zone={name: (0.0, MAX_DEAD_SHARE * largest)})
-        starts = [{**joint.values_by_name, input_name("dead_zone", name): s * largest} for s in LIMIT_STARTS]
-        found.append(Extension("dead_zone_fits", dead, 1, [name], starts))
-        square = Term(name, Order(0.0), SQUARE, expression=power(channel(name), 2.0))
-        curved = replace(structure, equations=(replace(equation, terms=(*equation.terms, square)),))
-        flat = {**joint.values_by_name, SQUARE: 0.0}
-        found.append(Extension("gain_varies", curved, 1, [name], [flat], terms=f"k {name}^2"))
+        ends = {"saturation": (MIN_SATURATION_SHARE * largest, largest), "dead_zone": (0.0, MAX_DEAD_SHARE * largest)}
+        effects: tuple[InputEffect, InputEffect] = ("saturation", "dead_zone")
+        for effect in effects:
+            starts = [{**known, input_name(effect, name): share * largest} for share in LIMIT_STARTS]
+            limits = {effect: {name: ends[effect]}}
+            add(f"{effect}_fits", partial(structure.with_limits, **limits), 1, [name], starts=starts)
+        square = Term(name, Order(0.0), SQUARE_NAME, expression=power(channel(name), 2.0))
+        curved = replace(equation, terms=(*equation.terms, square))
+        flat = {**known, SQUARE_NAME: 0.0}
+        add("gain_varies", partial(with_equation, curved), 1, [name], starts=[flat], terms=f"k {name}^2")
     return found
 
 
@@ -211,14 +227,14 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
     explains most of the residuals, searched again with the model that is fitted then.
     """
     (run, *others) = runs
-    if others or run.sample_times is not None or LOAD in run or LOAD in structure.coefficient_names:
+    if others or run.sample_times is not None or LOAD_NAME in run or LOAD_NAME in structure.coefficient_names:
         return None
-    wider = replace(structure, equations=(replace(item, terms=(*item.terms, Term(LOAD, Order(0.0), LOAD))),))
+    wider = replace(structure, equations=(replace(item, terms=(*item.terms, Term(LOAD_NAME, Order(0.0), LOAD_NAME))),))
     size = run.length
 
     def fit_at(row: int, near: JointFit) -> JointFit:
-        loaded = _with_input(run, LOAD, np.where(np.arange(size) >= row, 1.0, 0.0))
-        start = {LOAD: 0.0, **near.values_by_name}
+        loaded = _with_input(run, LOAD_NAME, np.where(np.arange(size) >= row, 1.0, 0.0))
+        start = {LOAD_NAME: 0.0, **near.values_by_name}
         return fit_output_error([loaded], replace(wider, initial=joint.initial), start=start, refine=False)
 
     def search(fitted: JointFit, row: int) -> tuple[float, int]:
@@ -226,7 +242,7 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
             response = _load_response(item, structure, fitted, run)
             residuals = fitted.noise[item.output] * fitted.residuals[0][item.output]
             if row:
-                residuals[row - 1 :] += fitted.coefficients[LOAD] * response[: size - 1 - row]
+                residuals[row - 1 :] += fitted.coefficients[LOAD_NAME] * response[: size - 1 - row]
             found = _load_row(residuals, response)
             if found is None or found == row:
                 break
@@ -241,9 +257,9 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
         return None
     if not math.isfinite(noise):
         return None
-    loaded = _with_input(run, LOAD, np.where(np.arange(size) >= row, 1.0, 0.0))
-    starts = [None, {LOAD: 0.0, **joint.values_by_name}]
-    return Extension("load_steps", wider, 2, [LOAD], starts, runs=as_runs(loaded), time=run.start + row * run.step)
+    loaded = _with_input(run, LOAD_NAME, np.where(np.arange(size) >= row, 1.0, 0.0))
+    starts = [None, {LOAD_NAME: 0.0, **joint.values_by_name}]
+    return Extension("load_steps", wider, 2, [LOAD_NAME], starts, runs=as_runs(loaded), time=run.start + row * run.step)
 
 
 def _with_input(run: Run, name: str, values: Floats) -> Run:
@@ -261,13 +277,13 @@ def _with_input(run: Run, name: str, values: Floats) -> Run:
 def _load_response(item: Equation, structure: Structure, joint: JointFit, run: Run) -> Floats:
     """Return the response of a fitted model to a constant load from row 0 on, at rows 1 to N - 1."""
     own = (t for t in item.terms if t.signal == item.output)
-    alone = replace(item, terms=(*own, Term(LOAD, Order(0.0), 1.0)))
+    alone = replace(item, terms=(*own, Term(LOAD_NAME, Order(0.0), 1.0)))
     known = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
     values = joint.values_by_name
     known = known.with_orders({n: values[n] for n in known.order_names})
     model = Model(known.with_coefficients({n: values[n] for n in known.coefficient_names}))
     ones, zeros = np.ones(run.length), np.zeros(run.length)
-    return simulate(model, Run.from_arrays(step=run.step, inputs={LOAD: ones}, outputs={item.output: zeros}))[
+    return simulate(model, Run.from_arrays(step=run.step, inputs={LOAD_NAME: ones}, outputs={item.output: zeros}))[
         item.output
     ][1:]
 

@@ -481,7 +481,7 @@ def compare_orders(
 ) -> OrderComparison:
     """Fit integer and free orders of one stage of a simulated arm, which starts at rest, on a decimated run.
 
-    Both are compared on an validation run.
+    Both are compared on a validation run.
 
     Raises
     ------

@@ -82,8 +82,8 @@ def check_whole(name: str, value: object, low: int, high: int | None = None) -> 
     """Return a whole number in an interval as an int; without an upper end it is below 2^62, the limit of the core."""
     number = whole_number(value)
     if number is None or not low <= number <= ((1 << 62) - 1 if high is None else high):
-        upper = "" if high is None else f" to {high}"
-        raise ModelError(f"{setting(name)} {short_repr(value)} is not a whole number from {low}{upper}")
+        limits = f"of at least {low}" if high is None else f"from {low} to {high}"
+        raise ModelError(f"{setting(name)} {short_repr(value)} is not a whole number {limits}; give one")
     return number
 
 

@@ -447,8 +447,8 @@ impl Run {
     }
 }
 
-#[cfg(test)]
 #[allow(clippy::unwrap_used, clippy::cast_precision_loss)]
+#[cfg(test)]
 mod tests {
     use super::super::evaluation_cache::EvaluationCache;
     use super::super::integer_orders::IntegerOrders;
