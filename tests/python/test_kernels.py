@@ -342,7 +342,7 @@ def test_a_start_in_motion_is_a_term_of_a_recursion():
         (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], initial="rest"), "initial = 'rest'"),
         (
             lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], p=0),
-            "p = 0 is not a whole number of at least 1",
+            "p = 0 is not a whole number from 1",
         ),
         (lambda: STREAM.push(np.ones(3)), r"samples has shape \(3,\); give \(n, 2\)"),
         (lambda: STREAM.push([[0.0, np.nan]]), r"samples is not finite at index \[0, 1\]"),

@@ -134,7 +134,7 @@ def test_an_estimate_that_fails_does_not_stop_the_run(stage):
         (
             ftlm.equation("D^1.5 y = b u"),
             {"innovation_length": 0},
-            "innovation_length = 0 is not a whole number of at least 1",
+            "innovation_length = 0 is not a whole number from 1",
         ),
         (ftlm.equation("D^1.5 y = b u"), {"prior_covariance": 0.0}, "prior covariance"),
     ],
