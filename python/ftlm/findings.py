@@ -178,14 +178,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "unstable",
         LEVEL_FACT,
         "the model is unstable, and so is the plant: simulations restarted every {seconds:.2g} s explain "
-        "{fit:.3g} % of the outputs, and the outputs stay bounded as under a controller",
-        remedy="record the reference signal of the controller",
+        "{fit:.3g} % of the outputs, and the outputs stay bounded, so a controller was acting",
+        remedy="record the reference signal of the controller, and give it as {ask[reference]}",
     ),
     "runs_split": FindingKind(
         "other",
         LEVEL_FACT,
         "no simulation of a whole run follows this unstable plant, which a controller stabilizes: the runs were split "
-        "into {pieces} pieces of {seconds:.2g} s, each with its own initial values; {ask[initial]} overrules it",
+        "into {pieces} pieces of at least {seconds:.2g} s, each with its own initial values; {ask[initial is rest]} or "
+        "another start simulates whole runs",
     ),
     "plant_unstable_in_pieces": FindingKind(
         "closed_loop",
@@ -195,7 +196,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "in the feedback biases this method",
         "the plant is unstable, as the model is: simulations restarted every {seconds:.2g} s explain {fit:.3g} % of "
         "the outputs",
-        "identify the pieces of run.split({seconds:.2g}) together by output error with {ask[initial is caputo]}, which "
+        "identify run.split({seconds:.2g}) by output error with {ask[initial is caputo]}, which white "
         "noise does not bias",
     ),
     "plant_needs_pieces": FindingKind(
@@ -205,7 +206,7 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "least squares at these orders gives an unstable model whose simulations, restarted every "
         "{seconds:.2g} s, explain {fit:.3g} %",
         "the plant is unstable and stabilized by a controller, so no simulation of a whole run fits the outputs",
-        "identify the pieces of run.split({seconds:.2g}) together with {ask[initial is caputo]}, or use "
+        "identify run.split({seconds:.2g}) with {ask[initial is caputo]}, or use "
         "{ask[method is least-squares]}, which noise in the loop biases",
     ),
     "growth_not_told": FindingKind(
@@ -555,62 +556,64 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "{output} follows {input} with a delay of {value:.4g} ± {error:.2g} s that the model lacks|: with it the "
         "residuals are independent of the inputs",
         "{output} follows {input} with a delay of {value:.4g} s that the model lacks",
-        "estimate it with the model: write {input}(t - 0:{longest:.2g}) in the equation",
+        "write {input}(t - 0:{longest:.2g}) in the equation, a delay between 0 and {longest:.2g} s that is estimated",
         prefix="{run}: ",
     ),
     "lag_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output} answers {input} with a further lag that the model lacks|: with it the residuals are independent of "
-        "the inputs",
-        "{output} answers {input} with a further lag that the model lacks",
-        "raise the order of the equation by 1",
+        "{output} responds to {input} with one order more than the model has|: with it the residuals are independent "
+        "of the inputs",
+        "{output} responds to {input} with one order more than the model has",
+        "raise the order of the equation by 1, and keep a term of its former order: {term}",
         prefix="{run}: ",
     ),
     "dynamics_missing": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "residuals of {output} contain a response to {input}|: a structure with more dynamics predicts {output} "
-        "better, one sample ahead, than a model of the noise does",
+        "residuals of {output} contain a response to {input}|: a larger structure lowers their one-step prediction "
+        "error, which colored noise alone does not allow, but none of those tried leaves residuals that are "
+        "independent of the inputs",
         "residuals of {output} contain a response to {input} that the model lacks",
         prefix="{run}: ",
     ),
     "zero_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output} answers a derivative of {input} that the model lacks|: with it the residuals are independent of the "
-        "inputs",
-        "{output} answers a derivative of {input} that the model lacks",
-        "add to the equation {term}",
+        "{output} also responds to the derivative of {input}|: with it the residuals are independent of the inputs",
+        "{output} also responds to the derivative of {input}, which the model lacks",
+        "add the term {term} to the equation",
         prefix="{run}: ",
     ),
     "mode_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output} has a further mode that the model lacks|: with it the residuals are independent of the inputs",
-        "{output} has a further mode that the model lacks",
-        "raise the order of the equation by 1 and add {term}",
+        "{output} responds to {input} with one more pole and zero than the model has|: with them the residuals are "
+        "independent of the inputs",
+        "{output} responds to {input} with one more pole and zero than the model has",
+        "raise the order of the equation by 1, keep a term of its former order, and add the derivative of the input: "
+        "{term}",
         prefix="{run}: ",
     ),
     "saturation_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{input} saturates at {value:.3g} ± {error:.2g}, which the model lacks|: with it the residuals of {output} are "
-        "independent of the inputs",
-        "{input} saturates at {value:.3g}, which the model lacks",
-        "estimate it with the model: {ask[saturation]}, for {input} between {low:.2g} and {high:.2g}",
+        "{input} saturates at ±{value:.3g} (standard error {error:.2g}), which the model lacks|: with it the residuals "
+        "of {output} are independent of the inputs",
+        "{input} saturates at ±{value:.3g}, which the model lacks",
+        "write sat({input}, {low:.2g}:{high:.2g}) in the equation, a limit that is estimated",
         prefix="{run}: ",
     ),
     "dead_zone_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{input} has a dead zone of {value:.3g} ± {error:.2g}, which the model lacks|: with it the residuals of "
-        "{output} are independent of the inputs",
-        "{input} has a dead zone of {value:.3g}, which the model lacks",
-        "estimate it with the model: {ask[dead_zone]}, for {input} between {low:.2g} and {high:.2g}",
+        "{input} has a dead zone of ±{value:.3g} (standard error {error:.2g}), which the model lacks|: with it the "
+        "residuals of {output} are independent of the inputs",
+        "{input} has a dead zone of ±{value:.3g}, which the model lacks",
+        "write dead({input}, {low:.2g}:{high:.2g}) in the equation, a limit that is estimated",
         prefix="{run}: ",
     ),
-    "gain_varies": FindingKind(
+    "square_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
         "the gain of {output} from {input} varies with {input}|: with a term in its square the residuals are "
@@ -619,20 +622,20 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "add the term {term} to the equation",
         prefix="{run}: ",
     ),
-    "load_steps": FindingKind(
+    "load_step_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "a constant load acts on {output} from {time:.4g} s on|: with {value:.3g} ± {error:.2g} more on the right-hand "
-        "side from there on the residuals are independent of the inputs",
+        "a constant load acts on {output} from {time:.4g} s on|: a constant {value:.3g} ± {error:.2g} on the "
+        "right-hand side of the equation from there on leaves residuals that are independent of the inputs",
         "a constant load acts on {output} from {time:.4g} s on",
-        "record the load as an input, or identify the rows before it with {ask[window]}",
+        "record the load as an input, or use only the rows before it: {ask[window]}",
         prefix="{run}: ",
     ),
     "lead_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,
-        "{output} answers {input} {value:.4g} ± {error:.2g} s before it is logged, or {rows:.2g} of its rows|: with "
-        "{input} so much earlier the residuals are independent of the inputs",
+        "{output} moves {value:.4g} ± {error:.2g} s (about {rows:.2g} rows) before {input} does in the log|: with "
+        "{input} shifted earlier by that much the residuals are independent of the inputs",
         "{output} moves before its input {input}, by about {rows:.2g} rows",
         "log the input before it acts, shift its rows, or allow a {ask[delay]} down to minus one sampling interval",
         prefix="{run}: ",

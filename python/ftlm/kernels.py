@@ -26,9 +26,9 @@ from ftlm.utils.validation import (
     Scalar,
     as_floats,
     check_choice,
+    check_integer,
     check_pulses,
     check_threads,
-    check_whole,
     real_number,
     short_repr,
     whole_number,
@@ -263,7 +263,7 @@ def multi_innovation(
         raise DataError(
             f"Q has shape {regressors.shape}, m {outputs.shape}; give (..., M, k) and (..., M) with M of at least 1"
         )
-    length = check_whole("p", p, 1)
+    length = check_integer("p", p, 1)
     count, width = regressors.shape[-2:]
     prior = as_floats("prior_covariance", prior_covariance)
     if prior.ndim > 1 or (prior.ndim and prior.size != width):
@@ -401,7 +401,7 @@ class Candidates:
         O(K M log M + K^2 M + N k^3) for K distinct integrals. Normal equations with unit columns.
         """
         table = self._orders(orders)
-        length = check_whole("p", p, 0)
+        length = check_integer("p", p, 0)
         check_choice("rows", rows, ("haar", "time"))
         prior = as_floats("prior_covariance", prior_covariance)
         if prior.ndim > 1 or (prior.ndim and prior.size != len(self._terms)) or not np.all(prior > 0):
@@ -649,7 +649,7 @@ class Recursion:
             raise DataError(
                 f"orders has shape {numbers.shape}; give ({1 + len(rows)},): alpha, then one order per term"
             )
-        length = check_whole("p", p, 1, (1 << 31) - 1)
+        length = check_integer("p", p, 1, (1 << 31) - 1)
         if isinstance(initial, str):
             check_choice("initial", initial, ("caputo",))
         exponents = [] if isinstance(initial, str) else [real_number("initial", e) for e in initial]

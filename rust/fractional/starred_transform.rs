@@ -1,25 +1,26 @@
 //! Transforms of samples from Laplace transforms, by Poisson's summation formula.
 //!
 //! Samples f(kh) have the starred transform F*(s) = Σ f(kh) e^{−skh} = 1/h Σ_n F(s + 2πi n/h), in which the sample at a
-//! jump is the mean of both sides. For Re s = σ > 0 it is the discrete Fourier transform of the samples times e^{−σkh},
-//! which are periodic up to e^{−σLh} over L samples. So a function of s of any orders has exact samples without a grid of
-//! pulses, and a convolution with held inputs is a product of two transforms.
+//! jump is the mean of both sides. For Re s = σ > 0, F* is the discrete Fourier transform of the samples times e^{−σkh},
+//! which are periodic up to e^{−σLh} over L samples. So a function of s of any orders has samples, exact to about 1e−10,
+//! without a grid of pulses, and a convolution with held inputs is a product of two transforms.
 //!
-//! The terms n ≠ 0 are smooth in the base band |Im s| ≤ π/h, where they are interpolated. Their sum is an
-//! Euler–Maclaurin sum up to a constant, which the sample at t = 0 determines.
+//! The alias terms n ≠ 0 are smooth in the base band |Im s| ≤ π/h: they are evaluated at Chebyshev nodes and
+//! interpolated. Those of large |n| are an Euler–Maclaurin integral. The constant that it leaves is given by f(0).
 
 use std::f64::consts::PI;
 
 use crate::fft::{self, Bin, Plan, Workspace};
 
-/// Damping σ times the duration: about the geometric mean of the errors by e^{−2σT} and by rounding, e^{σT} ε.
+/// Damping σ times the duration T: balances the wrap-around e^{−2σT} and the rounding e^{σT} ε, both 4e−11.
 const DAMPING_DURATIONS: f64 = 12.0;
-/// Panels of the base band, and Chebyshev nodes in each: 34^−8 is 6e−13 if no pole is near the Nyquist frequency.
+/// Panels of the base band, and Chebyshev nodes in each: the error is about 34^−8 = 6e−13, by the Bernstein ellipse of
+/// radius 34 of the outermost panel, if no pole is near the Nyquist frequency.
 const BAND_PANEL_COUNT: usize = 8;
 const PANEL_NODES: usize = 8;
-/// Order n from which on the terms are summed by an integral.
-const MAX_DIRECT_ORDER: usize = 32;
-/// Coefficient of the third difference in the Euler–Maclaurin sum between two orders.
+/// Number n of the alias term from which on an integral replaces the sum.
+const DIRECT_ALIAS_COUNT: usize = 32;
+/// Coefficient of the third difference in the midpoint Euler–Maclaurin sum.
 const THIRD_DIFFERENCE: f64 = 17.0 / 5760.0;
 /// Gauss–Legendre rule on [0, 1] as (point, weight).
 const LEGENDRE_RULE: [(f64, f64); 4] = [
@@ -29,7 +30,7 @@ const LEGENDRE_RULE: [(f64, f64); 4] = [
     (0.930_568_155_797_026_3, 0.173_927_422_568_726_93),
 ];
 
-/// Contour and transforms of a number of uniform samples.
+/// Line Re s = σ and FFT plan for a number of uniform samples.
 pub(crate) struct StarredTransform {
     step: f64,
     plan: Plan,
@@ -37,9 +38,9 @@ pub(crate) struct StarredTransform {
     damping: Vec<f64>,
     /// ln s of each bin.
     logarithms: Vec<Bin>,
-    /// Bin from which on each panel follows, and the number of bins at last.
+    /// First bin of each panel, then the number of bins.
     panels: Vec<usize>,
-    /// Weights and ln s of the terms n ≠ 0 of each node.
+    /// Weight and ln s of the alias terms of each node.
     aliases: Vec<Vec<(f64, Bin)>>,
 }
 
@@ -60,13 +61,13 @@ impl StarredTransform {
             }
         });
         let period = 2.0 * PI / step;
-        let mut weights = vec![1.0; MAX_DIRECT_ORDER];
+        let mut weights = vec![1.0; DIRECT_ALIAS_COUNT];
         weights.extend([0.0; 2]);
-        weights[MAX_DIRECT_ORDER] += 1.0 / 24.0 + 3.0 * THIRD_DIFFERENCE;
-        weights[MAX_DIRECT_ORDER - 1] -= 1.0 / 24.0 + 3.0 * THIRD_DIFFERENCE;
-        weights[MAX_DIRECT_ORDER + 1] -= THIRD_DIFFERENCE;
-        weights[MAX_DIRECT_ORDER - 2] += THIRD_DIFFERENCE;
-        let edge = (MAX_DIRECT_ORDER as f64 - 0.5) * period;
+        weights[DIRECT_ALIAS_COUNT] += 1.0 / 24.0 + 3.0 * THIRD_DIFFERENCE;
+        weights[DIRECT_ALIAS_COUNT - 1] -= 1.0 / 24.0 + 3.0 * THIRD_DIFFERENCE;
+        weights[DIRECT_ALIAS_COUNT + 1] -= THIRD_DIFFERENCE;
+        weights[DIRECT_ALIAS_COUNT - 2] += THIRD_DIFFERENCE;
+        let edge = (DIRECT_ALIAS_COUNT as f64 - 0.5) * period;
         let node = |place: usize| {
             let omega = width * (0.5 + (place / PANEL_NODES) as f64 + 0.5 * chebyshev_node(place % PANEL_NODES));
             let direct =
@@ -98,7 +99,7 @@ impl StarredTransform {
         spectrum
     }
 
-    /// Samples of a transform.
+    /// Samples of a transform, the inverse of [`Self::transform`].
     pub(crate) fn samples(&self, mut spectrum: Vec<Bin>) -> Vec<f64> {
         let mut time = vec![0.0; self.plan.len()];
         self.plan.inverse(&mut spectrum, &mut time, &mut Workspace::new());
@@ -107,7 +108,8 @@ impl StarredTransform {
         time
     }
 
-    /// Compute the starred transforms of functions with these samples at t = 0: `functions` sets their values at ln s.
+    /// Compute the starred transforms of functions: `functions(ln s, out)` writes their Laplace transforms, and `starts`
+    /// are their samples at t = 0.
     pub(crate) fn spectra(&self, starts: &[f64], mut functions: impl FnMut(Bin, &mut [Bin])) -> Vec<Vec<Bin>> {
         let count = starts.len();
         let mut values = vec![Bin::default(); count];

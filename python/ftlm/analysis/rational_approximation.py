@@ -19,7 +19,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.resources import python_control
-from ftlm.utils.validation import Floats, as_floats, check_vector, check_whole, frequency_pair
+from ftlm.utils.validation import Floats, as_floats, check_integer, check_vector, frequency_pair
 
 #: Maximum errors of the approximation without a warning.
 MAX_GAIN_ERROR_DB, MAX_PHASE_ERROR_DEGREES = 1.0, 5.0
@@ -225,7 +225,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     low, high = frequency_pair(band)
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is not an interval; give 0 < low < high")
-    count = check_whole("order", order, 1, LARGEST_ORDER)
+    count = check_integer("order", order, 1, LARGEST_ORDER)
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     delays = model.structure.delay

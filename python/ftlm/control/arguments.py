@@ -9,7 +9,7 @@ import numpy as np
 
 from ftlm.errors import ModelError
 from ftlm.utils.parameters import setting
-from ftlm.utils.validation import Floats, check_seed, check_whole, nearest, real_number, short_repr
+from ftlm.utils.validation import Floats, check_integer, check_seed, nearest, real_number, short_repr
 
 #: Sampling rates [Hz] at which margins can be computed in floating point.
 RATE_RANGE_HZ = (1e-9, 1e9)
@@ -75,7 +75,7 @@ def check_limit(limit: object) -> float:
 
 def check_samples(samples: object, seed: object) -> tuple[int, int]:
     """Return the number of parameter samples and their seed."""
-    return check_whole("samples", samples, 0, 10_000), check_seed(seed)
+    return check_integer("samples", samples, 0, 10_000), check_seed(seed)
 
 
 def sum_row(what: str, text: object, outputs: tuple[str, ...]) -> Floats:

@@ -22,8 +22,8 @@ from ftlm.utils.validation import (
     Complex,
     Floats,
     as_complex,
+    check_integer,
     check_vector,
-    check_whole,
     frequency_pair,
     nearest,
     real_number,
@@ -155,7 +155,7 @@ class DiscretePid:
                 "upper end "
                 f"is at most {MAX_BAND_RATIO:g} times the lower"
             )
-        count = check_whole("order", order, 1, LARGEST_ORDER)
+        count = check_integer("order", order, 1, LARGEST_ORDER)
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
         reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)

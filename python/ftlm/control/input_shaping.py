@@ -18,7 +18,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import attributes, with_error
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, check_whole, short_repr
+from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, check_integer, short_repr
 
 #: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
 SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
@@ -185,7 +185,7 @@ def input_shaper(
     decays as a power of time, which no shaper cancels; it is not a vibration.
     """
     check_choice("kind", kind, SHAPER_REPETITIONS)
-    count = check_whole("modes", modes, 1)
+    count = check_integer("modes", modes, 1)
     if isinstance(model, (complex, float, int, np.number)):
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:

@@ -20,8 +20,8 @@ from ftlm.utils.validation import (
     Complex,
     Floats,
     as_floats,
+    check_integer,
     check_vector,
-    check_whole,
     error_text,
     frequency_pair,
 )
@@ -116,7 +116,9 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     errors. Discretized with a zero-order hold by python-control.
     """
     low, high = _band(band, plants[0].rate)
-    counts = list(range(2, MAX_POLES + 1, 2)) if poles is None else [check_whole("poles", poles, MIN_POLES, MAX_POLES)]
+    counts = (
+        list(range(2, MAX_POLES + 1, 2)) if poles is None else [check_integer("poles", poles, MIN_POLES, MAX_POLES)]
+    )
     library = python_control()
     w = np.geomspace(low, high, FIT_FREQUENCIES)
     with catch_numerical_errors(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):

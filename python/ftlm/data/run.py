@@ -391,12 +391,12 @@ class Run:
 
     @check_arguments
     def split(self, duration: float) -> list[Run]:
-        """Return consecutive runs of equal length that together hold all rows.
+        """Return consecutive runs that together hold all rows, of equal length to within one row.
 
         Parameters
         ----------
         duration : float
-            Shortest length of a piece [s], > 0; the whole run is one piece where it is shorter than two.
+            Shortest piece [s], > 0, and at least three rows. A run shorter than two such pieces is returned whole.
 
         Returns
         -------

@@ -24,7 +24,7 @@ from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, finite, format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
-from ftlm.utils.validation import Floats, check_whole
+from ftlm.utils.validation import Floats, check_integer
 from ftlm.validation.comparison import compare
 
 #: Default number of segments of one run.
@@ -325,7 +325,7 @@ def consistency(
         A segment whose fit fails.
     """
     every = as_runs(runs)
-    given = None if segments is None else check_whole("segments", segments, DEFAULT_SEGMENTS)
+    given = None if segments is None else check_integer("segments", segments, DEFAULT_SEGMENTS)
     if len(every) > 1 and given is not None:
         raise ModelError(
             f"{len(every)} runs are segments by themselves; leave {parameter('segments')} out, or give one run"

@@ -396,13 +396,9 @@ def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: Se
 
 
 def fitted_model(joint: JointFit, structure: Structure) -> Model:
-    """Return a fit as a model, with the covariance of its parameters."""
+    """Return a fit as a model with its initial conditions and the covariance of its parameters."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
-    orders, coefficients, inputs = problem.split(joint.values.tolist())
-    known = (
-        problem.structure.with_orders(dict(zip(problem.orders, orders, strict=True)))
-        .with_coefficients(problem.coefficients_by_name(coefficients))
-        .with_inputs(dict(zip(problem.names[len(orders) + len(coefficients) :], inputs, strict=True)))
-    )
+    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
+    known = problem.structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
     estimate = Estimate("output-error", (), joint.values_by_name, covariance=number_covariance(joint, problem))
-    return Model(known, estimate=estimate)
+    return Model(known, orders=joint.orders, estimate=estimate)

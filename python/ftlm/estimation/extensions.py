@@ -1,8 +1,13 @@
-"""Extensions of a structure that explain its colored residuals: a lag, a delay, a zero, a mode, a limit of an input."""
+"""Tests of extensions of an equation that would explain its colored residuals.
+
+Extensions are a lag, a delay or lead, a zero, a pole with a zero, a saturation, a dead zone, a squared input, and a
+load step.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,30 +37,33 @@ from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, run_residual_tests
 
-#: Decrease of the Schwarz criterion of one-step predictions from which on an extension is reported. The choice among
-#: several extensions lowers it as well, so it is three times what is called very strong evidence.
+#: Smallest decrease of the Schwarz criterion that is reported: three times the 10 of very strong evidence, because the
+#: best of several extensions is chosen.
 MIN_CRITERION_DECREASE = 30.0
-#: Decrease of the criterion from which on a later extension is preferred to an earlier one. An input that was logged
-#: one row late and feedthrough of a first-order plant, for example, give the same samples.
+#: Decrease of the criterion that an extension further down the list needs to replace one above it. An input that was
+#: logged one row late and feedthrough of a first-order plant, for example, give the same samples.
 STRONG_EVIDENCE = 10.0
-#: Name of an additional input, a load that is constant from some row on, and smallest share of the run before and
-#: after its step.
-LOAD_NAME, MIN_LOAD_SHARE = "load", 0.05
-#: Number of rows at which a load is fitted first, and most searches from the best of them.
-FIRST_LOAD_ROWS, MAX_LOAD_SEARCHES = 7, 4
-#: Smallest saturation limit and largest dead zone that are tried, as shares of the largest value of an input.
-MIN_SATURATION_SHARE, MAX_DEAD_SHARE = 0.05, 0.9
-#: First values of a saturation or dead zone, as shares of the largest value of an input.
+#: Samples of the first parts of all runs, to which extensions are fitted.
+MAX_EXTENSION_SAMPLES = 6000
+#: Smallest share of a run before and after a load step.
+MIN_LOAD_SHARE = 0.05
+#: Number of rows at which a load step is fitted first.
+FIRST_LOAD_ROWS = 7
+#: Maximum number of searches of the row of a load step from one fit.
+MAX_LOAD_SEARCHES = 4
+#: Smallest saturation limit that is tried, as a share of the largest value of an input.
+MIN_SATURATION_SHARE = 0.05
+#: Largest dead zone that is tried, as a share of the largest value of an input.
+MAX_DEAD_SHARE = 0.9
+#: Initial guesses of a saturation or dead zone, as shares of the largest value of an input.
 LIMIT_STARTS = (0.25, 0.6)
-#: Name of the coefficient of the square of an input.
-SQUARE_NAME = "square"
-#: Difference of an estimated delay from the one of the structure, in standard errors, from which on it is reported.
+#: Smallest difference of an estimated delay from that of the structure that is reported, in standard errors.
 DELAY_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
 class Extension:
-    """Structure with more dynamics than the fitted one.
+    """Structure that extends the fitted one.
 
     Parameters
     ----------
@@ -63,28 +71,28 @@ class Extension:
         Code of the finding that reports it.
     structure
         The extended structure.
-    parameters
+    parameter_count
         Number of additional parameters.
     inputs
-        Inputs of what is added.
+        Inputs that the additional terms act on.
     starts
         Initial guesses; None stands for the automatic ones.
-    terms
-        Additional terms, as text.
+    term_text
+        Additional terms as text, for the remedy.
     runs
-        Runs with an additional input; None for the given ones.
-    time
-        Time from which on the additional input acts [s].
+        Runs with a load as an additional input; None for the given ones.
+    load_time
+        Time of the load step [s].
     """
 
     code: str
     structure: Structure
-    parameters: int
+    parameter_count: int
     inputs: Sequence[str]
     starts: Sequence[Mapping[str, float] | None] = (None,)
-    terms: str = ""
+    term_text: str = ""
     runs: Runs | None = None
-    time: float = 0.0
+    load_time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -97,11 +105,12 @@ class FittedExtension:
 
 
 def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
-    """Return a finding on the extension whose residuals are best predicted from their own past, if clearly better.
+    """Return findings if one extension clearly lowers the one-step prediction error of the residuals.
 
-    Colored noise and a response that the structure lacks look alike in the residuals, but noise has the same one-step
-    prediction error beside every structure: the innovations of an autoregression of the residuals. An extension lowers
-    it if the residuals contain a response to the inputs.
+    Colored noise and a response that the structure lacks both color residuals. Noise has the same one-step prediction
+    error, the variance of the innovations of an autoregression, whichever structure is fitted; a response has not. The
+    extension is named if its residuals depend neither on an input nor on the direction of motion. Linear structures of
+    one equation are tested, without friction, coefficient laws and free parameters of inputs.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     colored = any(not o.whiteness.passed for o in tests.outputs.values())
@@ -112,24 +121,32 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     names = tuple(n for n in runs[0].inputs if n in equation.signals)
     if not names:
         return []
-    own = _prediction_criterion(joint, 0)
-    best = _best_extension(_extensions(structure, joint, runs, names), joint, runs, own)
-    load = _load_step(equation, structure, joint, runs)
-    best = best if load is None else _best_extension([load], joint, runs, own, best)
-    if best is None or best.criterion > own - MIN_CRITERION_DECREASE:
-        return []
-    extension, refit = best.extension, best.fit
     about = {"run": ", ".join(r.name for r in runs), "output": equation.output}
-    if not _is_sufficient(best, runs):
-        return [make_finding("dynamics_missing", input=join_names(names), **about)]
+    try:
+        joint, runs = _first_samples(joint, structure, runs)
+        own = _prediction_criterion(joint, 0)
+        best = _best_extension(_extensions(structure, joint, runs, names), joint, runs, own)
+        load = _load_step(equation, structure, joint, runs)
+        best = best if load is None else _best_extension([load], joint, runs, own, best)
+        if best is None or best.criterion > own - MIN_CRITERION_DECREASE:
+            return []
+        sufficient = _passes_residual_tests(best, runs)
+    except FtlmError:
+        # Nothing is said of what cannot be fitted.
+        return []
+    missing = [make_finding("dynamics_missing", input=join_names(names), **about)]
+    extension, refit = best.extension, best.fit
+    if not sufficient:
+        return missing
     if extension.code == "delay_fits":
-        return _delay_findings(extension, refit, structure, min(r.step for r in runs), about)
+        return _delay_findings(extension, refit, structure, min(r.step for r in runs), about) or missing
     numbers: dict[str, float] = {}
     if extension.runs is not None:
+        (load_name,) = extension.inputs
         numbers = {
-            "time": extension.time,
-            "value": refit.coefficients[LOAD_NAME],
-            "error": refit.standard_errors[LOAD_NAME],
+            "time": extension.load_time,
+            "value": refit.coefficients[load_name],
+            "error": refit.standard_errors[load_name],
         }
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
@@ -137,13 +154,37 @@ def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
         numbers = {"value": value, "error": refit.standard_errors[name], "low": 0.5 * value, "high": 2.0 * value}
         about["parameter"] = name
     shown = join_names(extension.inputs)
-    return [make_finding(extension.code, input=shown, term=extension.terms, **about, **numbers)]
+    return [make_finding(extension.code, input=shown, term=extension.term_text, **about, **numbers)]
+
+
+def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[JointFit, Runs]:
+    """Return the first samples of long runs, and the fit to them; shorter runs and their fit unchanged."""
+    length = MAX_EXTENSION_SAMPLES // len(runs)
+    if all(run.length <= length for run in runs):
+        return joint, runs
+    parts = as_runs([run if run.length <= length else run.window(None, length * run.step) for run in runs])
+    return fit_output_error(parts, replace(structure, initial=joint.initial), near=joint, refine=False), parts
+
+
+def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list[str]:
+    """Return names that are neither parameters nor signals: `base`, or with a number."""
+    taken = {*structure.order_names, *structure.coefficient_names, *structure.signals, *run.signals}
+    numbered = (f"{base}{k}" for k in itertools.count(1))
+    names = itertools.chain([base] if count == 1 else [], numbered)
+    return list(itertools.islice((n for n in names if n not in taken), count))
 
 
 def _best_extension(
-    extensions: Sequence[Extension], joint: JointFit, runs: Runs, own: float, best: FittedExtension | None = None
+    extensions: Sequence[Extension],
+    joint: JointFit,
+    runs: Runs,
+    own_criterion: float,
+    best: FittedExtension | None = None,
 ) -> FittedExtension | None:
-    """Return the fit of the extension with the least criterion, if that is below `own` and clearly below `best`."""
+    """Return the fitted extension of least criterion, or `best` if none is clearly better.
+
+    `own_criterion` is the criterion of the structure without an extension.
+    """
     for extension in extensions:
         there = extension.runs or runs
         asked = replace(extension.structure, initial=joint.initial)
@@ -151,16 +192,12 @@ def _best_extension(
             fits = [fit_output_error(there, asked, start=start, refine=False) for start in extension.starts]
         except FtlmError:
             continue
-        refit = min(fits, key=log_noise)
-        criterion = _prediction_criterion(refit, extension.parameters)
-        if refit.unstable_optimum is None and criterion < (own if best is None else best.criterion - STRONG_EVIDENCE):
+        refit = min(fits, key=lambda f: max(f.noise.values()))
+        criterion = _prediction_criterion(refit, extension.parameter_count)
+        limit = own_criterion if best is None else best.criterion - STRONG_EVIDENCE
+        if refit.unstable_optimum is None and criterion < limit:
             best = FittedExtension(replace(extension, structure=asked), refit, criterion)
     return best
-
-
-def log_noise(joint: JointFit) -> float:
-    """Return the sum over outputs of the logarithm of the residuals' root mean square."""
-    return sum(math.log(max(v, 1e-300)) for v in joint.noise.values())
 
 
 def _delay_findings(
@@ -192,19 +229,26 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
         with contextlib.suppress(FtlmError):
             found.append(Extension(code, make(), count, inputs, **more))
 
-    def with_equation(item: Equation) -> Structure:
-        return replace(structure, equations=(item,))
+    def with_terms(terms: Sequence[Term]) -> Structure:
+        return replace(structure, equations=(_with_terms(equation, terms),))
 
-    lagged = _with_lag(equation)
-    add("lag_fits", lambda: with_equation(lagged), 1, names)
-    add("delay_fits", lambda: late, len(names), names, starts=[None, begin])
-    more = [_next_derivative(equation, name, k) for k, name in enumerate(names)]
+    (lag_name,) = _unused_names("lag", 1, structure, runs[0])
+
+    def with_lag(terms: Sequence[Term]) -> Structure:
+        return replace(structure, equations=(_with_terms(_with_lag(equation, lag_name), terms),))
+
+    coefficients = _unused_names("k", len(names), structure, runs[0])
+    more = [_next_derivative(equation, *pair) for pair in zip(names, coefficients, strict=True)]
     shown = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
-    for code, item, limit in (("zero_fits", equation, equation.order), ("mode_fits", lagged, lagged.order)):
-        if all(t.order.weights == () and limit.weights == () and t.order.constant <= limit.constant for t in more):
-            wider = replace(item, terms=(*item.terms, *more))
-            add(code, partial(with_equation, wider), len(more) + (item is lagged), names, terms=shown)
-    known = joint.values_by_name
+    known_orders = not equation.order.weights and not any(t.order.weights for t in more)
+    former = f"{lag_name} D^{equation.order} {equation.output}"
+    add("lag_fits", partial(with_lag, []), 1, names, term_text=former)
+    add("delay_fits", lambda: late, len(names), names, starts=[None, begin])
+    if known_orders and all(t.order.constant <= equation.order.constant for t in more):
+        add("zero_fits", partial(with_terms, more), len(more), names, term_text=shown)
+    if known_orders and all(t.order.constant <= equation.order.constant + 1.0 for t in more):
+        add("mode_fits", partial(with_lag, more), 1 + len(more), names, term_text=f"{former} + {shown}")
+    known, (coefficient,) = joint.values_by_name, _unused_names("k", 1, structure, runs[0])
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
         ends = {"saturation": (MIN_SATURATION_SHARE * largest, largest), "dead_zone": (0.0, MAX_DEAD_SHARE * largest)}
@@ -213,28 +257,29 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
             starts = [{**known, input_name(effect, name): share * largest} for share in LIMIT_STARTS]
             limits = {effect: {name: ends[effect]}}
             add(f"{effect}_fits", partial(structure.with_limits, **limits), 1, [name], starts=starts)
-        square = Term(name, Order(0.0), SQUARE_NAME, expression=power(channel(name), 2.0))
-        curved = replace(equation, terms=(*equation.terms, square))
-        flat = {**known, SQUARE_NAME: 0.0}
-        add("gain_varies", partial(with_equation, curved), 1, [name], starts=[flat], terms=f"k {name}^2")
+        square = Term(name, Order(0.0), coefficient, expression=power(channel(name), 2.0))
+        text, flat = f"{coefficient} {name}^2", {**known, coefficient: 0.0}
+        add("square_fits", partial(with_terms, [square]), 1, [name], starts=[flat], term_text=text)
     return found
 
 
 def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs) -> Extension | None:
-    """Return the structure with a constant load from some row on; None if the runs cannot have one.
+    """Return the structure with a constant load from some row on; None for several runs or irregular rows.
 
-    Fits with loads from few rows on give a model near the plant. The row is that at which its response to a load
-    explains most of the residuals, searched again with the model that is fitted then.
+    The load is fitted with its step at each of seven rows. From the best of these fits, and from the fit without a
+    load, the step moves to the row at which the response to a load explains most of the residuals, and the model is
+    fitted again, until the row does not change.
     """
     (run, *others) = runs
-    if others or run.sample_times is not None or LOAD_NAME in run or LOAD_NAME in structure.coefficient_names:
+    if others or run.sample_times is not None:
         return None
-    wider = replace(structure, equations=(replace(item, terms=(*item.terms, Term(LOAD_NAME, Order(0.0), LOAD_NAME))),))
+    (name,) = _unused_names("load", 1, structure, run)
+    wider = replace(structure, equations=(_with_terms(item, [Term(name, Order(0.0), name)]),))
     size = run.length
 
     def fit_at(row: int, near: JointFit) -> JointFit:
-        loaded = _with_input(run, LOAD_NAME, np.where(np.arange(size) >= row, 1.0, 0.0))
-        start = {LOAD_NAME: 0.0, **near.values_by_name}
+        loaded = _with_input(run, name, np.where(np.arange(size) >= row, 1.0, 0.0))
+        start = {name: 0.0, **near.values_by_name}
         return fit_output_error([loaded], replace(wider, initial=joint.initial), start=start, refine=False)
 
     def search(fitted: JointFit, row: int) -> tuple[float, int]:
@@ -242,7 +287,7 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
             response = _load_response(item, structure, fitted, run)
             residuals = fitted.noise[item.output] * fitted.residuals[0][item.output]
             if row:
-                residuals[row - 1 :] += fitted.coefficients[LOAD_NAME] * response[: size - 1 - row]
+                residuals[row - 1 :] += fitted.coefficients[name] * response[: size - 1 - row]
             found = _load_row(residuals, response)
             if found is None or found == row:
                 break
@@ -257,9 +302,11 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
         return None
     if not math.isfinite(noise):
         return None
-    loaded = _with_input(run, LOAD_NAME, np.where(np.arange(size) >= row, 1.0, 0.0))
-    starts = [None, {LOAD_NAME: 0.0, **joint.values_by_name}]
-    return Extension("load_steps", wider, 2, [LOAD_NAME], starts, runs=as_runs(loaded), time=run.start + row * run.step)
+    loaded = _with_input(run, name, np.where(np.arange(size) >= row, 1.0, 0.0))
+    starts = [None, {name: 0.0, **joint.values_by_name}]
+    return Extension(
+        "load_step_fits", wider, 2, [name], starts, runs=as_runs(loaded), load_time=run.start + row * run.step
+    )
 
 
 def _with_input(run: Run, name: str, values: Floats) -> Run:
@@ -277,43 +324,49 @@ def _with_input(run: Run, name: str, values: Floats) -> Run:
 def _load_response(item: Equation, structure: Structure, joint: JointFit, run: Run) -> Floats:
     """Return the response of a fitted model to a constant load from row 0 on, at rows 1 to N - 1."""
     own = (t for t in item.terms if t.signal == item.output)
-    alone = replace(item, terms=(*own, Term(LOAD_NAME, Order(0.0), 1.0)))
+    alone = replace(item, terms=(*own, Term("load", Order(0.0), 1.0)))
     known = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
     values = joint.values_by_name
     known = known.with_orders({n: values[n] for n in known.order_names})
     model = Model(known.with_coefficients({n: values[n] for n in known.coefficient_names}))
     ones, zeros = np.ones(run.length), np.zeros(run.length)
-    return simulate(model, Run.from_arrays(step=run.step, inputs={LOAD_NAME: ones}, outputs={item.output: zeros}))[
-        item.output
-    ][1:]
+    rest = Run.from_arrays(step=run.step, inputs={"load": ones}, outputs={item.output: zeros})
+    return simulate(model, rest)[item.output][1:]
 
 
 def _load_row(residuals: Floats, response: Floats) -> int | None:
-    """Return the row from which on a load explains most of the residuals of the inner rows of a run."""
+    """Return the row from which on a load explains most of the residuals of the rows 1 to N - 2 of a run."""
     series = np.nan_to_num(residuals)
     here = response[: series.size]
     power, edge = np.cumsum(here**2)[::-1], max(int(MIN_LOAD_SHARE * series.size), 1)
     if not np.all(np.isfinite(here)) or not power[-edge] > 0.0:
         return None
-    explained = np.correlate(series, here, "full")[series.size - 1 :] ** 2 / np.maximum(power, 1e-300)
+    # The correlation by FFT, padded so that it is not circular.
+    spectra = np.fft.rfft(series, 2 * series.size) * np.conj(np.fft.rfft(here, 2 * series.size))
+    explained = np.fft.irfft(spectra)[: series.size] ** 2 / np.maximum(power, 1e-300)
     # A load of row k acts on row k + 1 first, which is number k of the inner rows.
     return edge + int(np.argmax(explained[edge:-edge]))
 
 
-def _with_lag(item: Equation) -> Equation:
+def _with_lag(item: Equation, coefficient: str) -> Equation:
     """Return an equation with a further lag: its order raised by 1, and a term of its former order."""
     raised = Order(item.order.constant + 1.0, item.order.weights)
-    return replace(item, order=raised, terms=(Term(item.output, item.order, "lag"), *item.terms))
+    return replace(item, order=raised, terms=(Term(item.output, item.order, coefficient), *item.terms))
 
 
-def _next_derivative(item: Equation, name: str, number: int) -> Term:
+def _with_terms(item: Equation, terms: Sequence[Term]) -> Equation:
+    """Return an equation with additional terms."""
+    return replace(item, terms=(*item.terms, *terms))
+
+
+def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
     """Return a term of an input whose order is 1 above the highest one of this input."""
     highest = max((t.order for t in item.terms if t.signal == name), key=lambda order: order.constant)
-    return Term(name, Order(highest.constant + 1.0, highest.weights), f"zero{number or ''}")
+    return Term(name, Order(highest.constant + 1.0, highest.weights), coefficient)
 
 
-def _prediction_criterion(joint: JointFit, more: int) -> float:
-    """Return the Schwarz criterion of one-step predictions of the residuals from their own past."""
+def _prediction_criterion(joint: JointFit, added_parameters: int) -> float:
+    """Return the Schwarz criterion of one-step predictions of the residuals by autoregressions of up to 25 lags."""
     total = 0.0
     for name in joint.noise:
         series = [joint.noise[name] * part[name] for part in joint.residuals]
@@ -323,11 +376,11 @@ def _prediction_criterion(joint: JointFit, more: int) -> float:
         power = float(np.nanmean(left**2)) if rows else math.nan
         if not power > 0.0:
             return math.inf
-        total += rows * math.log(power) + (parameters + more) * math.log(rows)
+        total += rows * math.log(power) + (parameters + added_parameters) * math.log(rows)
     return total
 
 
-def _is_sufficient(fitted: FittedExtension, given: Runs) -> bool:
+def _passes_residual_tests(fitted: FittedExtension, given: Runs) -> bool:
     """Whether the residuals of a fit depend neither on an input nor on the direction of motion."""
     structure, joint, runs = fitted.extension.structure, fitted.fit, fitted.extension.runs or given
     model = fitted_model(joint, structure)

@@ -384,7 +384,9 @@ def identify(
     PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
     result = assess_fit(_fit_runs(several, structure, chosen, m=m, threads=threads, progress=progress))
     duration = next((f.numbers["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
-    if duration is not None and structure.initial == "auto" and getattr(chosen, "reference", UNSET) is None:
+    without_reference = isinstance(chosen, OutputError) and chosen.reference is None
+    if duration is not None and structure.initial == "auto" and without_reference:
+        # Where the pieces cannot be fitted, the result of whole runs says so.
         with contextlib.suppress(FtlmError):
             split = identify_pieces(several, structure, float(duration), method=chosen, m=m, threads=threads)
             result = split if any(f.code == "plant_unstable" for f in split.findings) else result
@@ -435,16 +437,17 @@ def identify_pieces(
     m: int | None = None,
     threads: int | None = None,
 ) -> Identification:
-    """Identify an unstable plant under control from pieces of its runs, each with initial values of its own.
+    """Identify an unstable plant under control from pieces of its runs, each with its own initial values.
 
-    Errors of a simulation grow over one piece only, and noise in the feedback does not bias output error.
+    So an error of the simulation cannot grow beyond one piece. White noise in the feedback does not bias output error
+    if the plant has a delay of a sample.
 
     Parameters
     ----------
     runs
         Whole runs.
     structure
-        What to identify; its start is not used.
+        What to identify; ``"caputo"`` replaces its initial conditions.
     duration
         Shortest duration of a piece [s].
     method
@@ -455,7 +458,7 @@ def identify_pieces(
     Returns
     -------
     Identification
-        Its model is compared with other runs in such pieces, too.
+        Later comparisons of its model split other runs in the same way.
     """
     pieces = as_runs([piece for run in runs for piece in run.split(duration)])
     asked = replace(structure, initial="caputo")
@@ -536,7 +539,7 @@ def assess_fit(fit: Fit) -> Identification:
         findings += _residual_findings(fit, tests)
         if explained:
             findings = [f for f in findings if f.code not in SHOWN_BY_RESIDUALS]
-        if any(f.code == "gain_varies" for f in missing):
+        if any(f.code == "square_fits" for f in missing):
             # The square of an input has a mean.
             findings = [f for f in findings if f.code != "offset_missing"]
         findings += missing

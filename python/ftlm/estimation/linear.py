@@ -33,7 +33,7 @@ from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import Floats, check_whole
+from ftlm.utils.validation import Floats, check_integer
 
 #: Maximum number of iterations of refined instrumental variables, and the relative change of a coefficient below which
 #: the iteration has converged.
@@ -256,7 +256,7 @@ def multi_innovation_trace(
         raise ModelError(
             f"a trace follows no offset, and offset = {equation.offset!r}; use {parameter('offset', 'none')}"
         )
-    stride = check_whole("every", every, 1)
+    stride = check_integer("every", every, 1)
     rest = replace(equation, initial="rest")
     rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
     item = equation.equations[0]
@@ -380,7 +380,7 @@ class Streaming:
             )
         self.signals = tuple(structure.signals)
         self.structure = structure
-        length = check_whole("innovation_length", innovation_length, 1, (1 << 31) - 1)
+        length = check_integer("innovation_length", innovation_length, 1, (1 << 31) - 1)
         step, longest = check_step(step, "step"), check_step(longest, "longest")
         self.step = step
         self._recursions: list[Recursion] = []

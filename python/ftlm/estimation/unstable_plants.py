@@ -57,7 +57,8 @@ class PieceTest:
     seconds
         Length of a piece [s].
     residual
-        RMS of the residuals of all outputs, relative to the deviations from the mean of each piece.
+        Largest over the outputs of the RMS of the residuals, relative to that of the deviations from the mean of each
+        piece.
     """
 
     seconds: float
@@ -75,10 +76,12 @@ class PieceTest:
 
 
 def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
-    """Return the test of an unstable model on pieces of the runs; None without modes or enough pieces.
+    """Return the test of an unstable model on pieces of the runs.
 
-    A model of a stable plant that grows by a wrong sign fails it: from no start does it follow the output over five
-    time constants. Whole runs of an unstable plant are bounded only because a controller answers the output.
+    A model of a stable plant that is unstable by the sign of an estimate fails it: from no start does it follow the
+    output over five time constants. Whole runs of an unstable plant are bounded only because a controller answers the
+    output. None if the model is stable or its modes are not known, if the rows are irregular, too few or too far apart
+    for the growth, or if a simulation fails.
     """
     try:
         growing = [m.pole.real for m in modes(model, coupling=model.structure.coupling) if m.unstable]
@@ -128,12 +131,12 @@ def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], compari
             return [make_finding(code, fit=test.fit, seconds=test.seconds)]
     if (explained and not grows) or fit.joint is None:
         return []
-    test = equation_test(runs, fit.task.structure.with_orders(model.orders), model.units)
+    test = least_squares_piece_test(runs, fit.task.structure.with_orders(model.orders), model.units)
     return [] if test is None else [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]
 
 
-def equation_test(runs: Sequence[Run], structure: Structure, units: Mapping[str, str]) -> PieceTest | None:
-    """Return the test of the least-squares model of a structure if it is unstable and passes, else None."""
+def least_squares_piece_test(runs: Sequence[Run], structure: Structure, units: Mapping[str, str]) -> PieceTest | None:
+    """Fit a structure by least squares, and return the piece test of an unstable model that passes it, else None."""
     try:
         linear = estimate_coefficients(runs, structure, SearchSettings(coefficients="least-squares"), None)
         model = Model(structure.with_coefficients(linear.values), units=units, m=linear.m)

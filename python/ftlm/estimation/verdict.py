@@ -47,8 +47,8 @@ MISSING_PART_CODES = (
     "mode_fits",
     "saturation_fits",
     "dead_zone_fits",
-    "gain_varies",
-    "load_steps",
+    "square_fits",
+    "load_step_fits",
     "drift_fits",
     "offset_missing",
 )

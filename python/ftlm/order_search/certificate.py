@@ -21,7 +21,7 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import check_whole, real_number, short_repr
+from ftlm.utils.validation import check_integer, real_number, short_repr
 
 #: Default tolerance of the certificate relative to the best equation error found, and maximum number of boxes.
 DEFAULT_TOLERANCE = 0.05
@@ -98,7 +98,7 @@ def certify_orders(
         Ctrl-C, within half a second.
     """
     share = _check_tolerance(tolerance)
-    most = check_whole("max_cells", max_cells, 1)
+    most = check_integer("max_cells", max_cells, 1)
     gap = real_number(
         "min_separation",
         (order_grid.increment if isinstance(order_grid, OrderGrid) else DEFAULT_INCREMENT)

@@ -10,7 +10,7 @@ from ftlm import _core
 from ftlm.errors import ModelError
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
-from ftlm.utils.validation import check_choice, check_whole, real_number, whole_number
+from ftlm.utils.validation import check_choice, check_integer, real_number, whole_number
 
 Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
@@ -60,7 +60,7 @@ class SearchSettings:
             raise ModelError(
                 f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read"
             )
-        length = check_whole("innovation_length", self.innovation_length, 1)
+        length = check_integer("innovation_length", self.innovation_length, 1)
         given = self.prior_covariance
         covariance = None if given is None else real_number("prior_covariance", given)
         if covariance is not None and not 0 < covariance < math.inf:

@@ -46,7 +46,7 @@ from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.formatting import attributes, json_value
 from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
-from ftlm.utils.validation import check_threads, check_whole, join_names, nearest, real_number
+from ftlm.utils.validation import check_integer, check_threads, join_names, nearest, real_number
 
 #: Name of the given runs in verdicts.
 MEASURED_LABEL = "as measured"
@@ -323,7 +323,7 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
     for name in arms or ():
         if name not in ARM_VARIANTS:
             raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
-    check_whole("records", records, 1, MAX_RECORDS)
+    check_integer("records", records, 1, MAX_RECORDS)
     return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 

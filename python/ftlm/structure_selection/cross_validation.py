@@ -12,12 +12,13 @@ import numpy as np
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.simulate import simulate
-from ftlm.structure.structure import Initial, Structure
+from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import vector_norm
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import variance_inflation
@@ -57,9 +58,9 @@ class Fold:
     def fit(self, model: Model) -> dict[str, float]:
         """Return the fit of a simulation on the validation data in percent, by output.
 
-        A validation run has initial terms of its own, and its residual is raised by their degrees of freedom. A block
-        has those of the estimation data of the same run. The first block of a run with nonzero initial conditions has
-        those of the whole run.
+        A validation run has initial terms of its own; its residual is divided by the root of 1 - k/N for k terms and N
+        samples. A block has the initial terms that the rest of its run gives, and the first block of a run with nonzero
+        initial conditions those of the whole run.
         """
         outputs = model.outputs
         if self.rows is None:
@@ -110,13 +111,14 @@ class Folds:
     Parameters
     ----------
     runs
-        Runs of the final estimate.
+        Runs to which candidates are fitted.
     parts
         Folds; the validation data of a fold are excluded from its fit.
     description
         Description of the validation.
     split
-        Whole runs of an unstable plant, and the duration [s] of the pieces that `runs` are; None for whole runs.
+        Whole runs of an unstable plant, for the final estimate, and the shortest duration [s] of the pieces of them
+        that are `runs`; None if `runs` are whole.
     """
 
     runs: Runs
@@ -172,7 +174,10 @@ class Folds:
 
     @classmethod
     def of_pieces(cls, runs: Runs, duration: float) -> Folds:
-        """Build folds of pieces of the runs of an unstable plant, at most :data:`MAX_SPLIT_FOLDS`, spread evenly."""
+        """Build folds that leave out one piece of the runs of an unstable plant at a time.
+
+        Of more than :data:`MAX_SPLIT_FOLDS` pieces as many are used, spread evenly; the final estimate uses all.
+        """
         every = [piece for run in runs for piece in run.split(duration)]
         chosen = np.unique(np.linspace(0, len(every) - 1, MAX_SPLIT_FOLDS).astype(int))
         folds = cls.of([every[k] for k in chosen], "runs")
@@ -331,17 +336,9 @@ def log_residual_power(joint: JointFit) -> float:
     return float(np.mean([2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()]))
 
 
-def model_of(structure: Structure, joint: JointFit, initial: Initial) -> Model:
-    """Return a fit as a model with fixed initial conditions."""
-    problem = FreeProblem.of(replace(structure, initial=joint.initial))
-    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
-    made = replace(structure, initial=initial).with_orders(joint.orders).with_coefficients(numbers)
-    return Model(made.with_inputs(joint.inputs), orders=joint.orders)
-
-
 def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
     """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
-    model = model_of(structure, joint, joint.initial)
+    model = fitted_model(joint, structure)
     estimation = compare(model, folds.runs).fit
     grows = (
         folds.split is None and structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
@@ -354,7 +351,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         runs = fold.estimation_runs(structure.outputs)
         try:
             own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
-            validation[fold.name] = fold.fit(model_of(structure, own, joint.initial))
+            validation[fold.name] = fold.fit(fitted_model(replace(own, initial=joint.initial), structure))
         except FtlmError as error:
             # The message is about the estimation data of the fold, not about the given runs.
             raise type(error)(f"without {fold.name}: {error}") from error
@@ -413,7 +410,7 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
 
 def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
     """Return a trial with another fit to all runs, on a grid that was refined until converged."""
-    estimation = compare(model_of(trial.structure, joint, joint.initial), folds.runs).fit
+    estimation = compare(fitted_model(joint, trial.structure), folds.runs).fit
     return replace(
         trial,
         joint=joint,

@@ -15,7 +15,7 @@ from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify, identify_pieces
 from ftlm.estimation.result import Identification
-from ftlm.estimation.unstable_plants import equation_test
+from ftlm.estimation.unstable_plants import least_squares_piece_test
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degenerate
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
@@ -267,7 +267,7 @@ def _select_automatically(work: CandidateEvaluator, sought: Sequence[OutputProbl
 def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
     """Return the duration [s] of pieces of the runs of an unstable plant, by linear fits; None for other plants."""
     forms = [IntegerOrderForm(n, n - 1) for n in range(1, MAX_ORDER + 1)]
-    tests = [equation_test(p.runs, form.structure(p), p.runs[0].units) for p in sought for form in forms]
+    tests = [least_squares_piece_test(p.runs, form.structure(p), p.runs[0].units) for p in sought for form in forms]
     return min((t for t in tests if t is not None), key=lambda t: t.residual).seconds if any(tests) else None
 
 

@@ -78,8 +78,8 @@ def whole_number(value: object) -> int | None:
         return None
 
 
-def check_whole(name: str, value: object, low: int, high: int | None = None) -> int:
-    """Return a whole number in an interval as an int; without an upper end it is below 2^62, the limit of the core."""
+def check_integer(name: str, value: object, low: int, high: int | None = None) -> int:
+    """Return a value as an int; raise ModelError unless it is an integer from `low` to `high`, by default 2^62 - 1."""
     number = whole_number(value)
     if number is None or not low <= number <= ((1 << 62) - 1 if high is None else high):
         limits = f"of at least {low}" if high is None else f"from {low} to {high}"

@@ -9,7 +9,7 @@ from ftlm.data.sampling import drop_missing
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, Exact, attributes
-from ftlm.utils.validation import check_whole
+from ftlm.utils.validation import check_integer
 from ftlm.validation.residual_tests import Residuals
 
 
@@ -73,7 +73,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     -----
     doi:10.1109/TAC.1974.1100705, doi:10.1093/biomet/76.2.297, doi:10.1214/aos/1176344136.
     """
-    given = check_whole("parameters", parameters, 0)
+    given = check_integer("parameters", parameters, 0)
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = given + tests.initial_terms + len(tests.outputs)

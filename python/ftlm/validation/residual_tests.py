@@ -33,7 +33,7 @@ from ftlm.utils.statistics import (
     portmanteau,
     whiten_series,
 )
-from ftlm.utils.validation import Floats, check_whole
+from ftlm.utils.validation import Floats, check_integer
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import FeedbackTest, feedback_test
 
@@ -321,7 +321,7 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     """
     check_model(model)
     several = as_runs(runs)
-    count = check_whole("lags", lags, 1)
+    count = check_integer("lags", lags, 1)
     check_run_lengths(several, count)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])

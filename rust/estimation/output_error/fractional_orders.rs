@@ -1,10 +1,10 @@
 //! Exact output samples of equations of any orders, and their derivatives.
 //!
-//! With the integration orders η of its terms an equation is y = Σ c s^−η u/D, D = 1 − Σ c s^−η over its own terms. A
-//! held input is a sum of steps, so the starred transform of the samples of y is that of c s^−η/(D s) times the transform
-//! of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D. Derivatives with respect to orders and
-//! coefficients are functions of s as well. Samples at jumps are the mean of both sides: the direct feedthrough is
-//! corrected as for block pulses.
+//! With the integration orders η of the terms an equation is y = Σ c s^−η u/D. D = 1 − Σ c s^−η has the terms in y alone.
+//! A held input is a sum of steps, so the starred transform of the samples of y is that of c s^−η/(D s) times the
+//! transform of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D. Derivatives with respect to
+//! orders and coefficients are functions of s as well. A sample at a jump is the mean of both sides; [`Feedthrough`]
+//! corrects it.
 
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -45,7 +45,7 @@ pub(crate) struct SampledSimulation {
     pub(crate) effects: Vec<Vec<f64>>,
 }
 
-/// Terms of an equation at a point.
+/// Terms of an equation at a parameter point.
 struct Terms {
     /// Distinct integration orders, and the place of each term in them.
     etas: Vec<f64>,
@@ -58,7 +58,7 @@ struct Terms {
 /// Derivatives of the coefficient and of the integration order of each term with respect to a parameter.
 type Slopes = Vec<(f64, f64)>;
 
-/// Functions of one column: its samples are Σ of function × source.
+/// One column of the design matrix: its samples are Σ of function × source.
 struct Column {
     /// Weight of each term, which replaces its coefficient, for a column of the response from rest.
     weights: Vec<f64>,
@@ -447,7 +447,6 @@ impl Run {
     }
 }
 
-#[allow(clippy::unwrap_used, clippy::cast_precision_loss)]
 #[cfg(test)]
 mod tests {
     use super::super::evaluation_cache::EvaluationCache;
@@ -478,7 +477,8 @@ mod tests {
         }
     }
 
-    fn experiment(pulses_per_sample: usize) -> Experiment {
+    #[allow(clippy::cast_precision_loss)]
+    fn experiment(pulses_per_sample: usize) -> Result<Experiment> {
         let rows = MIN_EXACT_PULSES + 2;
         let held = |every: usize, seed: usize| -> Vec<f64> {
             (0..rows).map(|k| ((k / every * 7919 + seed) % 11) as f64 / 5.0 - 1.0).collect()
@@ -486,15 +486,17 @@ mod tests {
         let y = (0..rows).map(|k| (0.1 * k as f64).cos()).collect();
         let input = |name: &str, samples| Channel::new(name, samples, Role::Input(Intersample::Hold));
         let channels = vec![Channel::new("y", y, Role::Output), input("u", held(9, 1)), input("v", held(23, 5))];
-        let run = Recording::new("run", STEP, None, channels, vec![0]).unwrap();
-        run.experiment(Sampling { pulses_per_sample, ..Sampling::default() })
-            .unwrap()
-            .with_weights(&[2.0], None)
-            .unwrap()
+        let run = Recording::new("run", STEP, None, channels, vec![0])?;
+        run.experiment(Sampling { pulses_per_sample, ..Sampling::default() })?.with_weights(&[2.0], None)
     }
 
     fn point(order: f64) -> ParameterPoint {
         ParameterPoint { orders: vec![order], coefficients: vec![-0.8, -9.0, 0.5, 7.0, 0.3], inputs: Vec::new() }
+    }
+
+    /// A simulation that these experiments allow.
+    fn accepted<T>(found: Option<T>) -> Result<T> {
+        found.ok_or_else(|| Error::Diverged { what: "experiments without exact samples".into(), index: 0 })
     }
 
     /// Largest difference, relative to the largest value.
@@ -505,56 +507,59 @@ mod tests {
     }
 
     #[test]
-    fn integer_orders_have_the_samples_and_derivatives_of_their_states() {
-        let (experiments, at) = ([experiment(1)], point(2.0));
+    fn integer_orders_have_the_samples_and_derivatives_of_their_states() -> Result<()> {
+        let (experiments, at) = ([experiment(1)?], point(2.0));
         for initial in [Initial::Rest, Initial::Caputo] {
             let model = model((2.0, 2.0), 1.0, initial);
-            let found = FractionalOrders::of(&model, &experiments, &at).unwrap();
-            let states = IntegerOrders::of(&model, &experiments, &at).unwrap();
-            let here = found.evaluate(&model, &experiments, &at, &[2, 3]).unwrap();
-            let there = states.evaluate(&model, &experiments, &at, &[2, 3]).unwrap();
+            let found = accepted(FractionalOrders::of(&model, &experiments, &at))?;
+            let states = accepted(IntegerOrders::of(&model, &experiments, &at))?;
+            let here = found.evaluate(&model, &experiments, &at, &[2, 3])?;
+            let there = states.evaluate(&model, &experiments, &at, &[2, 3])?;
             assert!(distance(&here.residuals, &there.residuals) < 1e-8);
             assert!(distance(&here.point.coefficients, &there.point.coefficients) < 1e-8);
-            let slopes = found.jacobian(&model, &experiments, &[2, 3], &here).unwrap();
-            let exact = states.jacobian(&model, &experiments, &[2, 3], &there).unwrap();
+            let slopes = found.jacobian(&model, &experiments, &[2, 3], &here)?;
+            let exact = states.jacobian(&model, &experiments, &[2, 3], &there)?;
             // The order is fixed in the states.
             slopes.iter().zip(&exact).skip(1).for_each(|(a, b)| assert!(distance(a, b) < 1e-7));
         }
+        Ok(())
     }
 
     #[test]
-    fn derivatives_are_limits_of_differences() {
-        let (experiments, at, model) = ([experiment(1)], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
-        let found = FractionalOrders::of(&model, &experiments, &at).unwrap();
-        let here = found.evaluate(&model, &experiments, &at, &[]).unwrap();
-        let slopes = found.jacobian(&model, &experiments, &[], &here).unwrap();
+    fn derivatives_are_limits_of_differences() -> Result<()> {
+        let (experiments, at, model) = ([experiment(1)?], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
+        let found = accepted(FractionalOrders::of(&model, &experiments, &at))?;
+        let here = found.evaluate(&model, &experiments, &at, &[])?;
+        let slopes = found.jacobian(&model, &experiments, &[], &here)?;
         for (parameter, slope) in slopes.iter().enumerate() {
-            let moved = |by: f64| {
+            let moved = |by: f64| -> Result<Vec<f64>> {
                 let mut at = at.clone();
                 match parameter.checked_sub(1) {
                     None => at.orders[0] += by,
                     Some(j) => at.coefficients[j] += by,
                 }
-                found.evaluate(&model, &experiments, &at, &[]).unwrap().residuals
+                Ok(found.evaluate(&model, &experiments, &at, &[])?.residuals)
             };
-            let differences: Vec<f64> = moved(1e-4).iter().zip(moved(-1e-4)).map(|(a, b)| (a - b) / 2e-4).collect();
+            let differences: Vec<f64> = moved(1e-4)?.iter().zip(moved(-1e-4)?).map(|(a, b)| (a - b) / 2e-4).collect();
             assert!(distance(slope, &differences) < 1e-5, "parameter {parameter}");
         }
+        Ok(())
     }
 
     #[test]
-    fn pulses_have_the_same_limit() {
+    fn pulses_have_the_same_limit() -> Result<()> {
         let (at, model) = (point(1.7), model((1.0, 3.0), 0.6, Initial::Caputo));
-        let (experiments, fine) = ([experiment(1)], [experiment(8)]);
-        let found = FractionalOrders::of(&model, &experiments, &at).unwrap();
-        let here = found.evaluate(&model, &experiments, &at, &[2, 3]).unwrap();
-        let mut caches = EvaluationCache::of(&fine, &Stop::default()).unwrap();
-        let there = model.evaluate(&fine, &mut caches, &at, &[2, 3]).unwrap();
+        let (experiments, fine) = ([experiment(1)?], [experiment(8)?]);
+        let found = accepted(FractionalOrders::of(&model, &experiments, &at))?;
+        let here = found.evaluate(&model, &experiments, &at, &[2, 3])?;
+        let mut caches = EvaluationCache::of(&fine, &Stop::default())?;
+        let there = model.evaluate(&fine, &mut caches, &at, &[2, 3])?;
         assert!(distance(&here.residuals, &there.residuals) < 1e-4);
         assert!(distance(&here.point.coefficients, &there.point.coefficients) < 1e-4);
         assert!(distance(&here.initial[0][0], &there.initial[0][0]) < 1e-2);
-        let slopes = found.jacobian(&model, &experiments, &[2, 3], &here).unwrap();
-        let pulses = model.jacobian(&fine, &mut caches, &[2, 3], &there).unwrap();
+        let slopes = found.jacobian(&model, &experiments, &[2, 3], &here)?;
+        let pulses = model.jacobian(&fine, &mut caches, &[2, 3], &there)?;
         slopes.iter().zip(&pulses).for_each(|(a, b)| assert!(distance(a, b) < 1e-3));
+        Ok(())
     }
 }
