@@ -130,3 +130,21 @@ def test_too_few_pulses_are_an_error_and_what_grows_is_one_too():
         model.simulate(run, max_m=30_000)
     with pytest.raises(ftlm.errors.ConvergenceError, match="overflows"):
         ftlm.Model(ftlm.equation("D^1.4 y = 4 y + 2 u")).simulate(run)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-6])
+def test_half_an_order_of_a_long_record_is_that_of_its_closed_form(noise):
+    """D^0.5 y = -y + u answers a step by 1 - erfcx(sqrt t), here for held steps of random size."""
+    g, rows, step = np.random.default_rng(5), 5000, 0.02
+    response = 1.0 - erfcx(np.sqrt(np.arange(rows) * step))
+    u = np.repeat(g.uniform(-1, 1, rows // 50), 50)
+    jumps = np.diff(u, prepend=0.0)
+    y = sum(jumps[k] * np.r_[np.zeros(k), response[: rows - k]] for k in np.flatnonzero(jumps))
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y + noise * g.standard_normal(rows)})
+    found = ftlm.identify(run, ftlm.equation("D^alpha y = a y + b u", initial="rest"))
+    for name, truth in {"alpha": 0.5, "a": -1.0, "b": 1.0}.items():
+        parameter = found.parameters[name]
+        assert abs(parameter.value - truth) < 4 * parameter.standard_error
+        assert parameter.standard_error < noise
+    # Exact samples need no finer grid.
+    assert found.joint.refinement == 1

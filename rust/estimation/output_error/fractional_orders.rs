@@ -494,8 +494,8 @@ mod tests {
         ParameterPoint { orders: vec![order], coefficients: vec![-0.8, -9.0, 0.5, 7.0, 0.3], inputs: Vec::new() }
     }
 
-    /// A simulation that these experiments allow.
-    fn accepted<T>(found: Option<T>) -> Result<T> {
+    /// Return what these experiments allow, or an error.
+    fn require<T>(found: Option<T>) -> Result<T> {
         found.ok_or_else(|| Error::Diverged { what: "experiments without exact samples".into(), index: 0 })
     }
 
@@ -511,8 +511,8 @@ mod tests {
         let (experiments, at) = ([experiment(1)?], point(2.0));
         for initial in [Initial::Rest, Initial::Caputo] {
             let model = model((2.0, 2.0), 1.0, initial);
-            let found = accepted(FractionalOrders::of(&model, &experiments, &at))?;
-            let states = accepted(IntegerOrders::of(&model, &experiments, &at))?;
+            let found = require(FractionalOrders::of(&model, &experiments, &at))?;
+            let states = require(IntegerOrders::of(&model, &experiments, &at))?;
             let here = found.evaluate(&model, &experiments, &at, &[2, 3])?;
             let there = states.evaluate(&model, &experiments, &at, &[2, 3])?;
             assert!(distance(&here.residuals, &there.residuals) < 1e-8);
@@ -528,7 +528,7 @@ mod tests {
     #[test]
     fn derivatives_are_limits_of_differences() -> Result<()> {
         let (experiments, at, model) = ([experiment(1)?], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
-        let found = accepted(FractionalOrders::of(&model, &experiments, &at))?;
+        let found = require(FractionalOrders::of(&model, &experiments, &at))?;
         let here = found.evaluate(&model, &experiments, &at, &[])?;
         let slopes = found.jacobian(&model, &experiments, &[], &here)?;
         for (parameter, slope) in slopes.iter().enumerate() {
@@ -550,7 +550,7 @@ mod tests {
     fn pulses_have_the_same_limit() -> Result<()> {
         let (at, model) = (point(1.7), model((1.0, 3.0), 0.6, Initial::Caputo));
         let (experiments, fine) = ([experiment(1)?], [experiment(8)?]);
-        let found = accepted(FractionalOrders::of(&model, &experiments, &at))?;
+        let found = require(FractionalOrders::of(&model, &experiments, &at))?;
         let here = found.evaluate(&model, &experiments, &at, &[2, 3])?;
         let mut caches = EvaluationCache::of(&fine, &Stop::default())?;
         let there = model.evaluate(&fine, &mut caches, &at, &[2, 3])?;
