@@ -613,6 +613,15 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         "write dead({input}, {low:.2g}:{high:.2g}) in the equation, a limit that is estimated",
         prefix="{run}: ",
     ),
+    "friction_fits": FindingKind(
+        "residuals",
+        LEVEL_WITH_CARE,
+        "{output} has dry friction (fc = {value:.3g} ± {error:.2g}), which the model lacks|: with it the residuals of "
+        "{output} are independent of the inputs",
+        "{output} has dry friction, which the model lacks",
+        "add the term {term}",
+        prefix="{run}: ",
+    ),
     "square_fits": FindingKind(
         "residuals",
         LEVEL_WITH_CARE,

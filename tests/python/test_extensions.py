@@ -27,11 +27,19 @@ ACTING = {
 }
 CODES = {
     "dynamics_missing",
+    "drift_fits",
+    "friction_fits",
     "load_step_fits",
     *(code for _, code, _ in ACTING.values()),
     *(code for *_, code in MISSING.values()),
 }
 STEP = 0.05 / RATE
+#: Equation without friction, and the friction term to add; J v' = u - c v - k x - friction in both.
+RUBBING = {
+    "speed": ("D y = a y + b u", "- fc*tanh(100 y)"),
+    "servo": ("D^2 y = d D y + a y + b u", "- fc*sign(D y)"),
+    "motor": ("D^2 y = d D y + b u", "- fc*sign(D y)"),
+}
 
 
 def record(numerator, denominator, delay, seed, noise, rows=500, acting=np.asarray):
@@ -100,6 +108,70 @@ def test_how_an_input_acts_is_named(kind):
             better = ftlm.identify(run, ftlm.equation(f"D y = a y + b {term}"))
             (value,) = better.limits.values()
             assert abs(value / limit - 1) < 0.03
+
+
+def rubbing(kind, seed, friction, rows=500, steps=40):
+    """A mass with Coulomb friction that sticks, by Euler steps of a fortieth of a row; noise of 2 % of the output."""
+    g = np.random.default_rng(seed)
+    u = np.repeat(g.uniform(-1, 1, rows), g.integers(4, 60, rows))[:rows]
+    servo = kind == "servo"
+    mass, drag, spring = (1 / RATE**2, 0.4 / RATE, 1.0) if servo else (1 / RATE, 1.0, 0.0)
+    h, v, x = STEP / steps, 0.0, 0.0
+    y = np.zeros(rows)
+    for k in range(rows - 1):
+        for _ in range(steps):
+            force = u[k] - drag * v - spring * x
+            if v == 0.0:
+                v = 0.0 if abs(force) <= friction else h * (force - np.sign(force) * friction) / mass
+            else:
+                later = v + h * (force - np.sign(v) * friction) / mass
+                v = 0.0 if later * v < 0.0 else later
+            x += h * v
+        y[k + 1] = v if kind == "speed" else x
+    y += 0.02 * y.std() * g.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=STEP, inputs={"u": u}, outputs={"y": y}), friction / mass
+
+
+@pytest.mark.parametrize("friction", [0.05, 0.25])
+@pytest.mark.parametrize("kind", RUBBING)
+def test_dry_friction_is_named_and_its_term_finds_it(kind, friction):
+    poor, term = RUBBING[kind]
+    for seed in range(3):
+        run, true = rubbing(kind, seed, friction)
+        found = ftlm.identify(run, ftlm.equation(poor))
+        (said,) = (f for f in found.findings if f.code in CODES)
+        assert said.code == "friction_fits"
+        assert said.reason in found.verdict.reasons
+        assert abs(said.numbers["value"] / true - 1) < 0.1
+        assert term.split("(")[0] in said.remedy
+        added = said.remedy.removeprefix("add the term ")
+        better = ftlm.identify(run, ftlm.equation(f"{poor} {added}"))
+        assert abs(better.coefficients["fc"] / true - 1) < 0.1
+        assert not {f.code for f in better.findings} & CODES
+
+
+@pytest.mark.parametrize("equation", ["D y = a y + b u", "D^2 y = d D y + a y + b u"])
+def test_resonant_noise_is_no_friction(equation):
+    noise = [1.0, -1.96 * np.cos(0.05), 0.9604]
+    plant = [1 / RATE, 1.0] if equation.startswith("D y") else [1 / RATE**2, 0.4 / RATE, 1.0]
+    named = []
+    for seed in range(10):
+        run = record([1.0], plant, 0, seed, [1.0])
+        e = signal.lfilter([1.0], noise, np.random.default_rng(seed).standard_normal(run.length))
+        y = run["y"] + 0.1 * run["y"].std() / e.std() * e
+        run = ftlm.Run.from_arrays(step=STEP, inputs={"u": run["u"]}, outputs={"y": y})
+        named.append(codes_of(run, equation) & (CODES | {"residuals_follow_direction"}))
+    assert sum(map(bool, named)) == 0, named
+
+
+def test_a_drift_of_the_level_is_no_mode():
+    found = []
+    for seed in range(6):
+        run = record([1.0], [1 / RATE, 1.0], 0, seed, [1.0])
+        y = run["y"] + run["y"].std() * np.linspace(0.0, 1.0, run.length)
+        drifting = ftlm.Run.from_arrays(step=STEP, inputs={"u": run["u"]}, outputs={"y": y})
+        found.append(codes_of(drifting) & CODES)
+    assert all(codes == {"drift_fits"} for codes in found), found
 
 
 @pytest.mark.parametrize("seed", range(4))

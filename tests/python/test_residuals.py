@@ -503,13 +503,13 @@ def rubbing_motor(seed: int, friction: float) -> ftlm.Run:
 def test_friction_that_a_linear_model_lacks_is_named_with_the_term(seed):
     run, other = rubbing_motor(seed, 9.0), rubbing_motor(seed + 50, 9.0)
     found = ftlm.identify(run, ftlm.equation("D w = a w + b u"), threads=1)
-    (said,) = [f for f in found.findings if f.code == "residuals_follow_direction"]
+    (said,) = [f for f in found.findings if f.code == "friction_fits"]
     assert not [f for f in found.findings if f.code == "noise_coloured"]
     assert found.validate(other).verdict.level == "with care"
     term = said.numbers["term"]
     assert term.startswith("- fc*tanh(")
     whole = ftlm.identify(run, ftlm.equation(f"D w = a w + b u {term}"), threads=1)
-    assert not [f for f in whole.findings if f.code == "residuals_follow_direction"]
+    assert not [f for f in whole.findings if f.code == "friction_fits"]
     for name, true in (("a", -3.0), ("b", 12.0), ("fc", 9.0)):
         assert whole.parameters[name].value == pytest.approx(true, rel=0.02)
 
@@ -520,4 +520,4 @@ def test_a_linear_motor_has_no_friction():
         for seed in range(20)
         for f in ftlm.identify(rubbing_motor(seed, 0.0), ftlm.equation("D w = a w + b u"), threads=1).findings
     ]
-    assert not [f for f in said if f.code == "residuals_follow_direction"]
+    assert not [f for f in said if f.code == "friction_fits"]

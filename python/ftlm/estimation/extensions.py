@@ -1,7 +1,7 @@
 """Tests of extensions of an equation that would explain its colored residuals.
 
-Extensions are a lag, a delay or lead, a zero, a pole with a zero, a saturation, a dead zone, a squared input, and a
-load step.
+Extensions are a drift of the level, another hold of an input between samples, a lag, a delay or lead, a zero, a pole
+with a zero, dry friction, a saturation, a dead zone, a squared input, and a load step.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run, Runs, as_runs
-from ftlm.data.sampling import longest_delay
+from ftlm.data.sampling import ZERO_ORDER_HOLD, Intersample, drop_missing, longest_delay
 from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
@@ -28,14 +28,21 @@ from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
 from ftlm.simulation.simulate import simulate
-from ftlm.structure.equation import Equation, Term
-from ftlm.structure.expression import channel, power
+from ftlm.structure.equation import Equation, Friction, Term
+from ftlm.structure.expression import apply, channel, constant, multiply, power
 from ftlm.structure.input_nonlinearity import InputEffect, input_name
 from ftlm.structure.order import Order
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import History, Structure
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import simulate_runs
-from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, run_residual_tests
+from ftlm.validation.residual_tests import (
+    DEFAULT_LAGS,
+    MAX_REST_VELOCITY_RATIO,
+    SIGN_TANH_SLOPE,
+    NoiseModel,
+    Residuals,
+    run_residual_tests,
+)
 
 #: Smallest decrease of the Schwarz criterion that is reported: three times the 10 of very strong evidence, because the
 #: best of several extensions is chosen.
@@ -57,6 +64,10 @@ MIN_SATURATION_SHARE = 0.05
 MAX_DEAD_SHARE = 0.9
 #: Initial guesses of a saturation or dead zone, as shares of the largest value of an input.
 LIMIT_STARTS = (0.25, 0.6)
+#: Least share of rows in which an input changes, so that its behavior between samples is in doubt.
+MIN_CHANGING_SHARE = 0.5
+#: Behavior of an input between samples, as text.
+HOLD_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 #: Smallest difference of an estimated delay from that of the structure that is reported, in standard errors.
 DELAY_SIGMAS = 3.0
 
@@ -80,7 +91,7 @@ class Extension:
     term_text
         Additional terms as text, for the remedy.
     runs
-        Runs with a load as an additional input; None for the given ones.
+        Runs with a load as an additional input, or another hold; None for the given ones.
     load_time
         Time of the load step [s].
     """
@@ -104,57 +115,138 @@ class FittedExtension:
     criterion: float
 
 
-def extension_findings(fit: Fit, tests: Residuals) -> list[Finding]:
-    """Return findings if one extension clearly lowers the one-step prediction error of the residuals.
+@dataclass(frozen=True)
+class ExtensionTests:
+    """Findings on what a structure lacks, and whether friction was among the extensions that were fitted."""
+
+    findings: list[Finding]
+    has_friction: bool = False
+
+
+def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
+    """Fit extensions if residuals are colored, and name one that clearly lowers their one-step prediction error.
 
     Colored noise and a response that the structure lacks both color residuals. Noise has the same one-step prediction
     error, the variance of the innovations of an autoregression, whichever structure is fitted; a response has not. The
-    extension is named if its residuals depend neither on an input nor on the direction of motion. Linear structures of
-    one equation are tested, without friction, coefficient laws and free parameters of inputs.
+    extension is named if its residuals depend neither on an input nor on the direction of motion. Structures without
+    friction, limits and free delays are tested; those with non-linear terms, several equations or a coefficient law for
+    a drift and another hold alone.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
-    colored = any(not o.whiteness.passed for o in tests.outputs.values())
-    single = len(structure.equations) == 1 and structure.is_linear and not structure.has_friction
-    if joint is None or not colored or not single or structure.coefficient_law or structure.free_inputs:
-        return []
-    (equation,) = structure.equations
-    names = tuple(n for n in runs[0].inputs if n in equation.signals)
-    if not names:
-        return []
-    about = {"run": ", ".join(r.name for r in runs), "output": equation.output}
+    colored = any(not o.whiteness.passed or o.follows_direction for o in tests.outputs.values())
+    if joint is None or not colored or structure.has_friction or structure.limits or structure.free_inputs:
+        return ExtensionTests([])
+    structure = replace(structure, initial=joint.initial)
+    names = _inputs_of_single_equation(structure, runs)
+    about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
+    friction = _friction(structure, runs) if names else []
     try:
         joint, runs = _first_samples(joint, structure, runs)
-        own = _prediction_criterion(joint, 0)
-        best = _best_extension(_extensions(structure, joint, runs, names), joint, runs, own)
-        load = _load_step(equation, structure, joint, runs)
-        best = best if load is None else _best_extension([load], joint, runs, own, best)
-        if best is None or best.criterion > own - MIN_CRITERION_DECREASE:
-            return []
-        sufficient = _passes_residual_tests(best, runs)
+        own = _prediction_criterion(joint, structure, runs, 0)
+        found = [*_drift(structure), *_other_holds(structure, joint, runs)]
+        if names:
+            found += [*_extensions(structure, joint, runs, names), *friction, *_load_step(structure, joint, runs)]
+        best = _best_extension(found, joint, runs, own)
+        clear = best is not None and best.criterion <= own - MIN_CRITERION_DECREASE
+        findings = _findings_of(best, structure, joint, runs, names, about) if best is not None and clear else []
     except FtlmError:
-        # Nothing is said of what cannot be fitted.
-        return []
-    missing = [make_finding("dynamics_missing", input=join_names(names), **about)]
+        # An extension that cannot be fitted is not reported.
+        return ExtensionTests([])
+    return ExtensionTests(findings, bool(friction))
+
+
+def _findings_of(
+    best: FittedExtension,
+    structure: Structure,
+    joint: JointFit,
+    runs: Runs,
+    names: Sequence[str],
+    about: Mapping[str, str],
+) -> list[Finding]:
+    """Return the findings on the best extension: its own if its residuals are independent of inputs and direction."""
+    missing = [make_finding("dynamics_missing", input=join_names(names), **about)] if names else []
     extension, refit = best.extension, best.fit
-    if not sufficient:
+    if not _passes_residual_tests(best, runs):
         return missing
+    if extension.code == "drift_fits":
+        return [make_finding("drift_fits", **about, **_largest_change(joint, refit))]
+    if extension.code == "other_intersample_fits":
+        return _hold_findings(extension, joint, refit, runs, about)
     if extension.code == "delay_fits":
         return _delay_findings(extension, refit, structure, min(r.step for r in runs), about) or missing
-    numbers: dict[str, float] = {}
-    if extension.runs is not None:
+    about, numbers = dict(about), {}
+    if extension.code == "load_step_fits":
         (load_name,) = extension.inputs
         numbers = {
             "time": extension.load_time,
             "value": refit.coefficients[load_name],
             "error": refit.standard_errors[load_name],
         }
+    if extension.code == "friction_fits":
+        (name,) = (n for n in refit.coefficients if n not in joint.coefficients)
+        numbers = {"value": refit.coefficients[name], "error": refit.standard_errors[name]}
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
         ((name, value),) = limits.items()
         numbers = {"value": value, "error": refit.standard_errors[name], "low": 0.5 * value, "high": 2.0 * value}
         about["parameter"] = name
-    shown = join_names(extension.inputs)
-    return [make_finding(extension.code, input=shown, term=extension.term_text, **about, **numbers)]
+    if extension.inputs:
+        about["input"] = join_names(extension.inputs)
+    return [make_finding(extension.code, term=extension.term_text, **about, **numbers)]
+
+
+def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, ...]:
+    """Return the inputs of a linear structure of one equation without a coefficient law; none for others."""
+    if len(structure.equations) > 1 or structure.coefficient_law or not structure.is_linear:
+        return ()
+    return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
+
+
+def _drift(structure: Structure) -> list[Extension]:
+    """Return the linear structure with levels of the outputs that change linearly; none if its offsets were given."""
+    if structure.offset not in ("none", "level") or not structure.is_linear:
+        return []
+    count = 2 * len(structure.equations)
+    return [Extension("drift_fits", replace(structure, offset="ramp"), count, [])]
+
+
+def _other_holds(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+    """Return the structure with the other hold of each input that changes in most rows.
+
+    Samples alone do not distinguish a staircase from a smooth signal. The wrong hold acts like a delay of half a
+    sample, which biases the parameters.
+    """
+    found = []
+    for name in runs[0].inputs:
+        steps = np.concatenate([np.diff(drop_missing(run[name])) for run in runs])
+        if name in structure.signals and np.count_nonzero(steps) > MIN_CHANGING_SHARE * steps.size:
+            other: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
+            changed = as_runs([run.with_intersample({name: other}) for run in runs])
+            starts = [joint.values_by_name]
+            found.append(Extension("other_intersample_fits", structure, 0, [name], starts, runs=changed))
+    return found
+
+
+def _hold_findings(
+    extension: Extension, joint: JointFit, refit: JointFit, runs: Runs, about: Mapping[str, str]
+) -> list[Finding]:
+    """Return a finding on another hold, if a parameter then differs by more than one standard error."""
+    change = _largest_change(joint, refit)
+    if not abs(change["other_value"] - change["value"]) > change["error"]:
+        return []
+    (name,), other = extension.inputs, as_runs(extension.runs or runs)[0].intersample
+    words = {"taken": HOLD_NAMES[runs[0].intersample[name]], "other": HOLD_NAMES[other[name]]}
+    return [make_finding(extension.code, input=name, kind=other[name], **about, **change, **words)]
+
+
+def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
+    """Return the ratio of the sums of squares of two fits, and the parameter that differs most in standard errors."""
+    ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
+    values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
+    moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
+    most = max(values, key=lambda n: moves.get(n, 0.0))
+    known = {"value": values[most], "error": errors[most], "other_value": others.get(most, math.nan)}
+    return {"parameter": most, "ratio": ratio, **known}
 
 
 def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[JointFit, Runs]:
@@ -163,7 +255,7 @@ def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[J
     if all(run.length <= length for run in runs):
         return joint, runs
     parts = as_runs([run if run.length <= length else run.window(None, length * run.step) for run in runs])
-    return fit_output_error(parts, replace(structure, initial=joint.initial), near=joint, refine=False), parts
+    return fit_output_error(parts, structure, near=joint, refine=False), parts
 
 
 def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list[str]:
@@ -187,16 +279,15 @@ def _best_extension(
     """
     for extension in extensions:
         there = extension.runs or runs
-        asked = replace(extension.structure, initial=joint.initial)
         try:
-            fits = [fit_output_error(there, asked, start=start, refine=False) for start in extension.starts]
+            fits = [fit_output_error(there, extension.structure, start=s, refine=False) for s in extension.starts]
         except FtlmError:
             continue
         refit = min(fits, key=lambda f: max(f.noise.values()))
-        criterion = _prediction_criterion(refit, extension.parameter_count)
+        criterion = _prediction_criterion(refit, extension.structure, there, extension.parameter_count)
         limit = own_criterion if best is None else best.criterion - STRONG_EVIDENCE
         if refit.unstable_optimum is None and criterion < limit:
-            best = FittedExtension(replace(extension, structure=asked), refit, criterion)
+            best = FittedExtension(extension, refit, criterion)
     return best
 
 
@@ -263,16 +354,44 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     return found
 
 
-def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs) -> Extension | None:
-    """Return the structure with a constant load from some row on; None for several runs or irregular rows.
+def _friction(structure: Structure, runs: Runs) -> list[Extension]:
+    """Return the structure with dry friction that opposes the derivative of the output, and the output itself.
+
+    An output that never changes its sign has friction that is a constant.
+    """
+    (item,) = structure.equations
+    (name,) = _unused_names("fc", 1, structure, runs[0])
+    # A simulation with friction starts from a level and a velocity.
+    initial = "caputo" if isinstance(structure.initial, History) else structure.initial
+    found = []
+
+    def add(shown: str, **changes: Any) -> None:
+        # Not simulated are, for example, friction of an output of order 1 and friction behind a sensor filter.
+        with contextlib.suppress(FtlmError):
+            wider = replace(structure, equations=(replace(item, **changes),), initial=initial)
+            found.append(Extension("friction_fits", wider, 1, [], term_text=shown))
+
+    add(f"- {name}*sign(D {item.output})", coulomb=Friction(name))
+    low, high = (float(f([f(run[item.output]) for run in runs])) for f in (np.nanmin, np.nanmax))
+    largest = max(-low, high)
+    if min(-low, high) > MAX_REST_VELOCITY_RATIO * largest:
+        slope = SIGN_TANH_SLOPE / largest
+        smooth = apply("tanh", multiply(constant(slope), channel(item.output)))
+        term = Term(item.output, Order(0.0), name, factor=-1.0, expression=smooth)
+        add(f"- {name}*tanh({slope:.2g} {item.output})", terms=(*item.terms, term))
+    return found
+
+
+def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+    """Return the structure with a constant load from some row on; none for several runs or irregular rows.
 
     The load is fitted with its step at each of seven rows. From the best of these fits, and from the fit without a
     load, the step moves to the row at which the response to a load explains most of the residuals, and the model is
     fitted again, until the row does not change.
     """
-    (run, *others) = runs
+    (item,), (run, *others) = structure.equations, runs
     if others or run.sample_times is not None:
-        return None
+        return []
     (name,) = _unused_names("load", 1, structure, run)
     wider = replace(structure, equations=(_with_terms(item, [Term(name, Order(0.0), name)]),))
     size = run.length
@@ -280,7 +399,7 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
     def fit_at(row: int, near: JointFit) -> JointFit:
         loaded = _with_input(run, name, np.where(np.arange(size) >= row, 1.0, 0.0))
         start = {name: 0.0, **near.values_by_name}
-        return fit_output_error([loaded], replace(wider, initial=joint.initial), start=start, refine=False)
+        return fit_output_error([loaded], wider, start=start, refine=False)
 
     def search(fitted: JointFit, row: int) -> tuple[float, int]:
         for _ in range(MAX_LOAD_SEARCHES):
@@ -299,14 +418,13 @@ def _load_step(item: Equation, structure: Structure, joint: JointFit, runs: Runs
         best = min(((fit_at(int(k), joint), int(k)) for k in rows), key=lambda pair: pair[0].noise[item.output])
         noise, row = min(search(joint, 0), search(*best))
     except FtlmError:
-        return None
+        return []
     if not math.isfinite(noise):
-        return None
+        return []
     loaded = _with_input(run, name, np.where(np.arange(size) >= row, 1.0, 0.0))
     starts = [None, {name: 0.0, **joint.values_by_name}]
-    return Extension(
-        "load_step_fits", wider, 2, [name], starts, runs=as_runs(loaded), load_time=run.start + row * run.step
-    )
+    time = run.start + row * run.step
+    return [Extension("load_step_fits", wider, 2, [name], starts, runs=as_runs(loaded), load_time=time)]
 
 
 def _with_input(run: Run, name: str, values: Floats) -> Run:
@@ -365,11 +483,17 @@ def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
     return Term(name, Order(highest.constant + 1.0, highest.weights), coefficient)
 
 
-def _prediction_criterion(joint: JointFit, added_parameters: int) -> float:
-    """Return the Schwarz criterion of one-step predictions of the residuals by autoregressions of up to 25 lags."""
+def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, added_parameters: int) -> float:
+    """Return the Schwarz criterion of one-step predictions of the residuals by autoregressions of up to 25 lags.
+
+    Least squares ignores the color of the noise. One generalized least-squares step subtracts what errors of the
+    parameters leave in the residuals.
+    """
     total = 0.0
+    sensitivities = output_sensitivities(runs, structure, joint.values_by_name, max(joint.refinement, 1))
     for name in joint.noise:
         series = [joint.noise[name] * part[name] for part in joint.residuals]
+        series = NoiseModel.fit(series, [], DEFAULT_LAGS).subtract(series, sensitivities.get(name, []))
         _, _, innovations, parameters = _core.arx_model(series, [], DEFAULT_LAGS)
         left = np.concatenate(innovations)
         rows = int(np.isfinite(left).sum())

@@ -18,15 +18,10 @@ from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
-from ftlm.estimation.alternative_assumptions import (
-    drift_findings,
-    intersample_findings,
-    undetermined_start_findings,
-)
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
-from ftlm.estimation.extensions import extension_findings
+from ftlm.estimation.extensions import run_extension_tests
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.methods import EstimationMethod, OutputError, method_with_options, resolve_method
@@ -54,6 +49,7 @@ from ftlm.estimation.nuisance_parameters import (
 )
 from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
 from ftlm.estimation.result import Identification
+from ftlm.estimation.undetermined_start import undetermined_start_findings
 from ftlm.estimation.unstable_plants import SPLIT_CODES, WHOLE_RUN_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
 from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
@@ -82,6 +78,8 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_fin
 
 #: Findings on residuals that known missing dynamics explain.
 SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
+#: Findings on effects that have a mean, as a missing offset has.
+HAVE_MEAN_CODES = ("square_fits", "drift_fits", "friction_fits")
 #: Share of the work of an identification that decides about the start of its runs.
 HYPOTHESES_SHARE = 0.7
 #: Initial terms of fits with a level.
@@ -525,9 +523,14 @@ def assess_fit(fit: Fit) -> Identification:
         tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is not None:
+        extensions = run_extension_tests(fit, tests)
+        missing = extensions.findings
+        if extensions.has_friction:
+            # The fit with friction decides about friction.
+            outputs = {n: replace(o, direction=None) for n, o in tests.outputs.items()}
+            tests = replace(tests, outputs=outputs)
         directed = [o for o, r in tests.outputs.items() if r.follows_direction]
         findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in directed]
-        missing = extension_findings(fit, tests)
         explained = bool(missing) and all(f.code != "dynamics_missing" for f in missing)
         if directed and not explained:
             # No linear structure explains them: what the direction of motion shows is more specific.
@@ -539,17 +542,11 @@ def assess_fit(fit: Fit) -> Identification:
         findings += _residual_findings(fit, tests)
         if explained:
             findings = [f for f in findings if f.code not in SHOWN_BY_RESIDUALS]
-        if any(f.code == "square_fits" for f in missing):
-            # The square of an input has a mean.
+        if any(f.code in HAVE_MEAN_CODES for f in missing):
             findings = [f for f in findings if f.code != "offset_missing"]
         findings += missing
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)
-        if any(f.code in (*LEFT_OUT_CODES, "noise_coloured") for f in findings):
-            findings += intersample_findings(fit)
-            drift = drift_findings(fit)
-            # A constant is a part of the line.
-            findings = [*(f for f in findings if not drift or f.code != "offset_missing"), *drift]
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
     known = _estimate(fit, comparison, criteria, every)
     result = Identification(

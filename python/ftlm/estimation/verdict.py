@@ -48,6 +48,7 @@ MISSING_PART_CODES = (
     "saturation_fits",
     "dead_zone_fits",
     "square_fits",
+    "friction_fits",
     "load_step_fits",
     "drift_fits",
     "offset_missing",

@@ -489,12 +489,12 @@ class NoiseModel:
 
     @classmethod
     def fit(cls, series: list[Floats], signal: list[Floats], lags: int) -> NoiseModel:
-        """Fit an ARX model to residuals and one input, and return its noise part.
+        """Fit an ARX model to residuals and one input, and return its noise part; an AR model without a signal.
 
         An AR model of the residuals alone would include the response to a periodic or slow input, and so hide it.
         Responses to other inputs count as noise.
         """
-        through, start, innovations, parameters = _core.arx_model(series, [signal], lags)
+        through, start, innovations, parameters = _core.arx_model(series, [signal] if signal else [], lags)
         rows = sum(row.size for row in innovations)
         return cls(through, start, innovations, rows / max(rows - parameters, 1))
 
