@@ -228,3 +228,33 @@ def test_free_decay_without_an_input(seed):
     assert abs(mode.frequency / rate - 1) < 0.003
     assert abs(mode.damping / damping - 1) < 0.1
     assert "excitation_short" not in {f.code for f in found.best.findings}
+
+
+def rubbing_mass(seed: int, spring: float, friction: float, rows: int = 400, steps: int = 20) -> ftlm.Run:
+    """Position of a mass with drag and Coulomb friction that sticks, by Euler steps; noise of 2 % of the position."""
+    g = np.random.default_rng(seed)
+    u = np.repeat(g.uniform(-1, 1, rows), g.integers(4, 60, rows))[:rows]
+    step, v, x, y = 0.1, 0.0, 0.0, np.zeros(rows)
+    h = step / steps
+    for k in range(rows - 1):
+        for _ in range(steps):
+            force = u[k] - 0.8 * v - spring * x
+            moving = v != 0.0
+            rub = friction * np.sign(v) if moving else np.clip(force, -friction, friction)
+            later = v + h * (force - rub)
+            v = 0.0 if moving and later * v < 0.0 else later
+            x += h * v
+        y[k + 1] = x
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y + 0.02 * y.std() * g.standard_normal(rows)})
+
+
+@pytest.mark.parametrize(("spring", "own"), [(1.0, {"a0": -1.0, "a1": -0.8}), (0.0, {"a1": -0.8})])
+def test_auto_finds_dry_friction_rather_than_higher_orders(spring: float, own: dict[str, float]) -> None:
+    run = rubbing_mass(1, spring, 0.25)
+    found = ftlm.select(run, "auto", threads=1).best
+    (item,) = found.model.structure.equations
+    assert item.friction is not None
+    assert item.order.constant == 2.0
+    assert found.coefficients["fc"] == pytest.approx(0.25, rel=0.1)
+    values = {n: v for n, v in found.coefficients.items() if n.startswith("a")}
+    assert values == pytest.approx(own, rel=0.1)

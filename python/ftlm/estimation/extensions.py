@@ -372,14 +372,19 @@ def _friction(structure: Structure, runs: Runs) -> list[Extension]:
             found.append(Extension("friction_fits", wider, 1, [], term_text=shown))
 
     add(f"- {name}*sign(D {item.output})", coulomb=Friction(name))
-    low, high = (float(f([f(run[item.output]) for run in runs])) for f in (np.nanmin, np.nanmax))
-    largest = max(-low, high)
-    if min(-low, high) > MAX_REST_VELOCITY_RATIO * largest:
-        slope = SIGN_TANH_SLOPE / largest
+    slope = sign_tanh_slope(runs, item.output)
+    if math.isfinite(slope):
         smooth = apply("tanh", multiply(constant(slope), channel(item.output)))
         term = Term(item.output, Order(0.0), name, factor=-1.0, expression=smooth)
         add(f"- {name}*tanh({slope:.2g} {item.output})", terms=(*item.terms, term))
     return found
+
+
+def sign_tanh_slope(runs: Sequence[Run], output: str) -> float:
+    """Return the slope of a tanh that replaces the sign of an output; infinite if the output has one sign."""
+    low, high = (float(f([f(run[output]) for run in runs])) for f in (np.nanmin, np.nanmax))
+    largest = max(-low, high)
+    return SIGN_TANH_SLOPE / largest if min(-low, high) > MAX_REST_VELOCITY_RATIO * largest else math.inf
 
 
 def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:

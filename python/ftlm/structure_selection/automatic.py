@@ -1,4 +1,4 @@
-"""Automatic structure of one output: integer orders with zeros, delays and an output level, then fractional forms."""
+"""Automatic structure of one output: integer orders with zeros, delays, friction and a level, then fractional forms."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 from ftlm.data.run import Run
 from ftlm.data.sampling import longest_delay
+from ftlm.estimation.extensions import sign_tanh_slope
 from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.parser import equation
@@ -21,7 +22,9 @@ from ftlm.structure_selection.cross_validation import (
     schwarz_criterion,
 )
 from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
+from ftlm.utils.statistics import chi_squared_99, portmanteau
 from ftlm.validation.feedback import feedback_test
+from ftlm.validation.residual_tests import DEFAULT_LAGS
 
 #: Highest integer order.
 MAX_ORDER = 4
@@ -47,7 +50,7 @@ Delays: TypeAlias = Mapping[str, float | tuple[float, float]]
 
 @dataclass(frozen=True)
 class IntegerOrderForm:
-    """Integer-order transfer function of one output: degrees of denominator and numerator, delay, integrator, offset.
+    """Integer-order transfer function of one output, with dry friction and an offset.
 
     Parameters
     ----------
@@ -62,6 +65,9 @@ class IntegerOrderForm:
     offset
         Kind of offset of each run: ``"none"``; ``"level"``, the value at which the output rests; or ``"ramp"``, a load
         that drifts.
+    friction
+        Dry friction: ``"none"``; ``"position"``, which opposes the derivative of the output; or ``"speed"``, which
+        opposes the output.
     """
 
     order: int
@@ -69,6 +75,7 @@ class IntegerOrderForm:
     delayed: bool = False
     integrator: bool = False
     offset: str = "none"
+    friction: Literal["none", "position", "speed"] = "none"
 
     @property
     def has_feedthrough(self) -> bool:
@@ -86,6 +93,11 @@ class IntegerOrderForm:
             for k in range(self.zeros, -1, -1)
         ]
         text = f"{_derivative(self.order, output)} = {' + '.join([*own, *driving])}"
+        if self.friction != "none":
+            velocity = (
+                f"sign(D {output})" if self.friction == "position" else f"tanh({problem.sign_slope:.3g} {output})"
+            )
+            text += f" - fc{end}*{velocity}"
         delay = problem.input_delays(delayed=self.delayed)
         return equation(text, delay=delay, offset=self.offset, initial=problem.initial)
 
@@ -125,6 +137,11 @@ class OutputProblem:
     def numbered_drivers(self) -> list[tuple[str, str]]:
         """Pairs of the number in coefficient names and the driving signal; the number is empty for a single signal."""
         return [(f"{k}_" if len(self.drivers) > 1 else "", name) for k, name in enumerate(self.drivers, 1)]
+
+    @property
+    def sign_slope(self) -> float:
+        """Slope of the tanh that replaces the sign of the output."""
+        return sign_tanh_slope(self.runs, self.output)
 
     def input_delays(self, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
         """Return the delays [s] of the driving inputs: a number, or an interval of one to estimate.
@@ -219,7 +236,7 @@ class AutomaticSelection:
         forms = [IntegerOrderForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
         fits = self._fit_delayed(self._fit_zeros(forms, probes), offset)
         self.feedback = self._inputs_in_loop(fits)
-        fits = self._fit_neighbors(fits)
+        fits = self._fit_neighbors(self._fit_friction(fits, offset))
         # Fewer zeros may be better within an order even if a higher order fits the noise.
         while fewer := [
             form
@@ -309,6 +326,17 @@ class AutomaticSelection:
             return fits
         return self._fit_zeros(delayed, fits)
 
+    def _fit_friction(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
+        """Add a speed or position with dry friction if residuals are colored and friction clearly lowers BIC."""
+        speed = IntegerOrderForm(1, 0, offset=offset, friction="speed")
+        changes_sign = math.isfinite(self.problem.sign_slope)
+        for form in ([speed] if changes_sign else []) + [replace(speed, order=2, friction="position")]:
+            if fits and not _has_white_residuals(fits[0].joint):
+                ranked = _rank([*fits, *self._fit([form])])
+                least = min(f.bic for f in ranked if f.form != form)
+                fits = ranked if ranked[0].bic < least - MIN_BIC_DECREASE else fits
+        return fits
+
     def _validate(self, ahead: Sequence[FittedForm]) -> FittedForm | None:
         """Validate fits; return the one with the best prediction."""
         found = self.evaluator.map_candidates(
@@ -368,6 +396,12 @@ class AutomaticSelection:
         return _rank(found)
 
 
+def _has_white_residuals(joint: JointFit) -> bool:
+    """Whether the residuals of every output pass the test of whiteness."""
+    series = ([part[name] for part in joint.residuals] for name in joint.noise)
+    return all(portmanteau(parts, DEFAULT_LAGS) <= chi_squared_99(DEFAULT_LAGS) for parts in series)
+
+
 def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
     """Return the form with the lowest BIC of each order; the noise color is that of the same order."""
     forms = [f for f in fits if f.form is not None]
@@ -382,7 +416,10 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
         replace(form, zeros=form.order if form.zeros < form.order else form.order - 1),
         replace(form, offset="level" if form.offset == "none" else "none"),
     ]
-    if form.zeros > 0:
+    if form.friction != "none":
+        # The simulation of friction needs inputs of lower order than the equation.
+        found[1] = replace(form, zeros=form.order - 1)
+    elif form.zeros > 0:
         lower = replace(form, order=form.order - 1, zeros=form.zeros - 1, integrator=False)
         # A canceled pole and zero at s = 0 are equivalent to a level, or with the initial terms to a drift.
         found += [lower, *(replace(lower, offset=o) for o in ("level", "ramp"))]
