@@ -17,7 +17,7 @@ from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.model_checks import join_names, stability_findings
 from ftlm.estimation.result import Identification
-from ftlm.findings import FINDING_TOPICS, LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding
+from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
@@ -36,7 +36,7 @@ MIN_FIT_GAIN = 0.5
 MAX_BURIED_RESIDUAL = 0.99
 #: Findings that explain a poor fit by the data.
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
-NOT_SEPARABLE_TOPIC = FINDING_TOPICS["not_separable"]
+NOT_SEPARABLE_TOPIC = "not_separable"
 #: Findings that name what a model lacks, and are reported before the residuals that show it.
 MISSING_PART_CODES = (
     "dynamics_missing",
@@ -161,7 +161,7 @@ def validation_with_verdict(result: Identification, comparison: Comparison) -> V
 def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
     """Return the verdict on a result, by the rules of :attr:`ftlm.Identification.verdict`.
 
-    Findings of weight that no rule covers count in the order of :data:`ftlm.findings.FINDING_TOPICS`.
+    Findings of weight that no rule covers count in the order of the topics in ``findings.toml``.
     """
     whole = not any(f.code == "runs_split" for f in result.findings)
     unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
@@ -229,7 +229,7 @@ def saved_findings(known: Estimate) -> list[Finding]:
     """Return all findings that speak against using a saved model, those recorded at the fit first."""
     found = [] if known.against is UNSET else list(known.against)
     unidentifiable = [n for n, e in known.standard_errors.items() if e is None]
-    if unidentifiable and not any(f.topic is NOT_SEPARABLE_TOPIC for f in found):
+    if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in found):
         found.append(
             make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
         )
