@@ -234,7 +234,7 @@ def search(
     parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
     every = grid.grid() or OrderGrid()
     check_order_names(every, wanted)
-    given = given_fields(replace(grid, order_grid=None, increment=None), replace(ranking, store=None), weighting)
+    given = given_fields(replace(ranking, store=None), weighting)
     settings = SearchSettings(coefficients=coefficients, **given)
     results = {}
     with resumable(ranking.store), contextlib.ExitStack() as stack:
@@ -268,8 +268,7 @@ def certify(
     structure: str,
     reading: ReadingOptions,
     shape: StructureOptions,
-    order_grid: list[str] | None = None,
-    increment: float | None = None,
+    grid: OrderGridOptions,
     tolerance: float = DEFAULT_TOLERANCE,
     min_separation: float | None = None,
     max_term_ratio: float = DEFAULT_MAX_TERM_RATIO,
@@ -284,8 +283,6 @@ def certify(
     ------
     order_grid : NAME=LOW:HIGH:STEP
         Interval of an order; alpha: every alpha.
-    increment
-        Increment of the order grid; default 0.05.
     tolerance
         How much smaller other errors may be, as a fraction.
     min_separation
@@ -297,7 +294,7 @@ def certify(
     """
     runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
-    every = OrderGridOptions(order_grid=order_grid, increment=increment).grid() or OrderGrid()
+    every = grid.grid() or OrderGrid()
     check_order_names(every, wanted)
     results = {}
     for item in wanted.equations:

@@ -169,7 +169,7 @@ class Command(TyperCommand):
                 panels["Arguments"].append((told.metavar, record[1]))
             elif record is not None:
                 panels[getattr(told, "rich_help_panel", None) or OTHER_PANEL].append(record)
-        if self.methods_by_field:
+        if self.methods_by_field and self._chosen_method([]) is not None:
             panels[OTHER_PANEL].append((HELP_ALL_FLAG, "Show the options of all methods and exit."))
         for name, records in panels.items():
             if records:
@@ -243,9 +243,9 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
 
     Positional parameters are arguments, keyword-only ones are options, and docstrings have their help: that of the
     function, or the docstring of ``ftlm.cli`` for options that commands share. A dataclass parameter expands to its
-    fields: each becomes an option at that place, and the function receives the dataclass. Its `methods` are those that
-    use the options. Errors become one line on standard error and an exit code. Existing files of `OutputFile` are
-    refused unless `force` is set.
+    fields: each becomes an option at that place, and the function receives the dataclass. Its `methods_of`, if it has
+    one, returns the methods that use an option. Errors become one line on standard error and an exit code. Existing
+    files of `OutputFile` are refused unless `force` is set.
     """
     records: dict[str, type[Any]] = {}
     options: list[inspect.Parameter] = []
@@ -255,10 +255,10 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
         kind = parameter.annotation
         if isinstance(kind, type) and is_dataclass(kind):
             records[parameter.name] = kind
-            hints, own = get_type_hints(kind, include_extras=True), parse_option_texts(kind.__doc__)[1]
+            hints, own = get_type_hints(kind, include_extras=True), parse_option_texts(kind.__doc__)[1] | texts
             options += [_option(f.name, hints[f.name], f.default, own) for f in fields(kind)]
-            if hasattr(kind, "methods"):
-                methods_by_field |= dict.fromkeys((f.name for f in fields(kind)), kind.methods)
+            if hasattr(kind, "methods_of"):
+                methods_by_field |= {f.name: kind.methods_of(f.name) for f in fields(kind)}
         else:
             positional = parameter.kind is not inspect.Parameter.KEYWORD_ONLY
             options.append(_option(parameter.name, kind, parameter.default, texts, positional=positional))

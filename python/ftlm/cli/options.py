@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from ftlm.arm.flexible_link import Form, InputOrder, Law, flexible_link
 from ftlm.cli.framework import OptionDetails, numbers, pairs, ranges
@@ -20,12 +20,20 @@ from ftlm.structure.order_grid import OrderGrid, order_grid
 from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import INITIAL_CHOICES, Offset, Structure, check_initial
-from ftlm.utils.parameters import parameter
+from ftlm.utils.parameters import flag_of, parameter
+
+#: Options of the flexible link, in the order of messages.
+LINK_OPTIONS = ("cross_stage", "cross_sensitivity", "cross_damping", "friction", "laws", "form", "input_order")
 
 
-def methods_with(*options: str) -> tuple[str, ...]:
-    """Return the names of the methods of estimation that have these options."""
-    return tuple(name for name, method in METHODS_BY_NAME.items() if set(options) <= {f.name for f in fields(method)})
+class MethodOptions:
+    """Base of options of methods of estimation; None stands for an option that is not given."""
+
+    @staticmethod
+    def methods_of(option: str) -> tuple[str, ...]:
+        """Return the names of the methods that have an option."""
+        field_name = "order_grid" if option == "increment" else option
+        return tuple(n for n, kind in METHODS_BY_NAME.items() if field_name in {f.name for f in fields(kind)})
 
 
 @dataclass(frozen=True)
@@ -128,10 +136,7 @@ class StructureOptions:
 
     def _check_equation(self, count: int) -> None:
         """Raise for options of the flexible link, given the number of equations."""
-        given = self._link_options() | {
-            "--coupling": self.coupling is not None and count == 1,
-        }
-        wrong = [option for option, is_given in given.items() if is_given]
+        wrong = self._given(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if wrong:
             owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
             kind = "one equation in words" if count == 1 else "equations in words"
@@ -140,17 +145,9 @@ class StructureOptions:
                 "out, or use --structure flexible-link:1, :2 or :both"
             )
 
-    def _link_options(self) -> dict[str, bool]:
-        """Whether each option of the flexible link is given."""
-        return {
-            "--cross-stage": self.cross_stage is not None,
-            "--cross-sensitivity": self.cross_sensitivity,
-            "--cross-damping": self.cross_damping,
-            "--friction": self.friction,
-            "--laws": self.laws is not None,
-            "--form": self.form is not None,
-            "--input-order": self.input_order is not None,
-        }
+    def _given(self, *names: str) -> list[str]:
+        """Flags of those of some options that are given."""
+        return [flag_of(name) for name in names if getattr(self, name)]
 
     def _sensor(self) -> SensorFilter | None:
         """Sensor filter of signals in equations."""
@@ -178,9 +175,7 @@ class StructureOptions:
         nearly integer order has hardly any memory. So runs start from the link's angle and velocity unless a history is
         requested.
         """
-        given = self._link_options() | {"--coupling": self.coupling is not None}
-        given |= {"--sensor-filter": self.sensor_filter is not None, "--filtered-signals": bool(self.filtered_signals)}
-        wrong = [option for option, is_given in given.items() if is_given]
+        wrong = self._given(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
         if wrong:
             raise ModelError(
                 f"{', '.join(wrong)}: --structure {text} has its own; leave {'it' if len(wrong) == 1 else 'them'} out, "
@@ -244,8 +239,8 @@ class StructureOptions:
 
 
 @dataclass(frozen=True)
-class OrderGridOptions:
-    """Order grid of a search and its norm; None for an option that is not given.
+class OrderGridOptions(MethodOptions):
+    """Order grid of a search; None for an option that is not given.
 
     Method
     ------
@@ -253,15 +248,10 @@ class OrderGridOptions:
         Values of an order; alpha stands for every alpha.
     increment
         Increment of the order grid; default 0.05.
-    norm
-        Norm of errors: l1 (45) or l2 (46); default l1.
     """
-
-    methods: ClassVar[tuple[str, ...]] = methods_with("order_grid", "norm")
 
     order_grid: list[str] | None = None
     increment: float | None = None
-    norm: Norm | None = None
 
     def grid(self) -> OrderGrid | None:
         """Order grid of the search; None without options."""
@@ -274,11 +264,13 @@ class OrderGridOptions:
 
 
 @dataclass(frozen=True)
-class RankingOptions:
+class RankingOptions(MethodOptions):
     """Options of the ranking of candidates; None for an option that is not given.
 
     Method
     ------
+    norm
+        Norm of errors: l1 (45) or l2 (46); default l1.
     criterion
         Error that ranks candidates; default output-error.
     top
@@ -287,15 +279,14 @@ class RankingOptions:
         Checkpoint file, from which the search resumes.
     """
 
-    methods: ClassVar[tuple[str, ...]] = methods_with("criterion", "top", "store")
-
+    norm: Norm | None = None
     criterion: Criterion | None = None
     top: int | None = None
     store: str | None = None
 
 
 @dataclass(frozen=True)
-class MultiInnovationOptions:
+class MultiInnovationOptions(MethodOptions):
     """Options of the multi-innovation method; None for an option that is not given.
 
     Method
@@ -308,15 +299,13 @@ class MultiInnovationOptions:
         Basis of the rows of (44); default haar.
     """
 
-    methods: ClassVar[tuple[str, ...]] = methods_with("innovation_length", "prior_covariance", "row_basis")
-
     innovation_length: int | None = None
     prior_covariance: float | None = None
     row_basis: RowBasis | None = None
 
 
 @dataclass(frozen=True)
-class OutputErrorOptions:
+class OutputErrorOptions(MethodOptions):
     """Options of the output-error method; None for an option that is not given.
 
     Method
@@ -331,8 +320,6 @@ class OutputErrorOptions:
         Noise of the output; ar: an autoregression; default white.
     """
 
-    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference", "noise", "bounds")
-
     loss: Loss | None = None
     intervals: Intervals | None = None
     start: str | None = None
@@ -342,7 +329,7 @@ class OutputErrorOptions:
 
 
 @dataclass(frozen=True)
-class GeneticOptions:
+class GeneticOptions(MethodOptions):
     """Options of the genetic algorithm; None for an option that is not given.
 
     Method
@@ -352,8 +339,6 @@ class GeneticOptions:
     evaluations
         Evaluations per seed of the genetic algorithm.
     """
-
-    methods: ClassVar[tuple[str, ...]] = methods_with("seeds", "evaluations")
 
     seeds: Annotated[list[int] | None, OptionDetails(min=0)] = None
     evaluations: int | None = None

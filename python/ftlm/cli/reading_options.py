@@ -16,13 +16,6 @@ from ftlm.io.load import LoadOptions, Signals, load_selection, run_paths, select
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.structure.structure import Structure
 
-#: Panels of options in a command's help.
-FILE_PANEL, STRUCTURE_PANEL, METHOD_PANEL, OUTPUT_PANEL = "File", "Structure", "Method", "Output"
-#: Types of optional options.
-Text = str | None
-Number = float | None
-Texts = list[str] | None
-
 #: Options of a text file's layout; `layout_options` collects them from a dataclass.
 
 
