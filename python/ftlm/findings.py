@@ -49,12 +49,16 @@ class Topic:
     alternative, method
         Template of an action that uses another method, and the method that it recommends. Left out of the remedy of a
         finding on that method.
+    has_rule
+        Whether rules of the verdict cover it, so that its findings alone are no reasons: a test of whiteness may fail
+        by rounding alone, and a parameter may be uncertain, but not by much.
     """
 
     what: str
     remedy: str = ""
     alternative: str = ""
     method: str = ""
+    has_rule: bool = False
 
 
 #: Texts of Python and of the command line by name, for templates.
@@ -87,6 +91,10 @@ class FindingKind:
         Template of the remedy; empty for that of the topic.
     prefix
         Template of the beginning that names the run; a page about that run omits it.
+    names_missing_part
+        Whether it names what a model lacks, and is reported before the residuals that show it.
+    judges_whole_run
+        Whether it is about the simulation of a whole run, which an unstable plant does not allow.
     """
 
     topic: str
@@ -95,6 +103,8 @@ class FindingKind:
     reason: str = ""
     remedy: str = ""
     prefix: str = ""
+    names_missing_part: bool = False
+    judges_whole_run: bool = False
 
     @property
     def states_remedy(self) -> bool:
