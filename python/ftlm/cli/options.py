@@ -136,7 +136,7 @@ class StructureOptions:
 
     def _check_equation(self, count: int) -> None:
         """Raise for options of the flexible link, given the number of equations."""
-        wrong = self._given(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
+        wrong = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if wrong:
             owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
             kind = "one equation in words" if count == 1 else "equations in words"
@@ -145,7 +145,7 @@ class StructureOptions:
                 "out, or use --structure flexible-link:1, :2 or :both"
             )
 
-    def _given(self, *names: str) -> list[str]:
+    def _flags(self, *names: str) -> list[str]:
         """Flags of those of some options that are given."""
         return [flag_of(name) for name in names if getattr(self, name)]
 
@@ -175,7 +175,7 @@ class StructureOptions:
         nearly integer order has hardly any memory. So runs start from the link's angle and velocity unless a history is
         requested.
         """
-        wrong = self._given(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
+        wrong = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
         if wrong:
             raise ModelError(
                 f"{', '.join(wrong)}: --structure {text} has its own; leave {'it' if len(wrong) == 1 else 'them'} out, "

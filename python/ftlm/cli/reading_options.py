@@ -11,9 +11,10 @@ from ftlm.cli.framework import announce_reading, interval, pairs
 from ftlm.data.run import Run
 from ftlm.data.sampling import MissingPolicy
 from ftlm.errors import DataError, ModelError
+from ftlm.io.column_roles import ColumnSelection
 from ftlm.io.dialect import Layout
 from ftlm.io.load import LoadOptions, Signals, load_selection, run_paths, select_columns
-from ftlm.io.preview import OpenedFile, open_file
+from ftlm.io.preview import OpenedFile, preview_selection
 from ftlm.structure.structure import Structure
 
 #: Options of a text file's layout; `layout_options` collects them from a dataclass.
@@ -114,6 +115,10 @@ class ReadingOptions:
         return [self._load(path, signals) for path in paths]
 
     def _load(self, path: str | list[str], signals: Signals | None) -> Run:
+        return load_selection(path, *self._selection(), signals)
+
+    def _selection(self) -> tuple[ColumnSelection, LoadOptions]:
+        """Columns, layout and further arguments of :func:`ftlm.load`."""
         wanted = select_columns(
             self.columns,
             self.time,
@@ -124,32 +129,15 @@ class ReadingOptions:
             pairs("--intersample", self.intersample),
             layout_options(self),
         )
-        options = LoadOptions(self._window(), self.resample, None, self.time_unit, self.missing)
-        return load_selection(path, wanted, options, signals)
-
-    def _window(self) -> tuple[float | None, float | None] | None:
-        return None if self.window is None else interval(self.window, "--window", "1.1:19.5")
+        window = None if self.window is None else interval(self.window, "--window", "1.1:19.5")
+        return wanted, LoadOptions(window, self.resample, None, self.time_unit, self.missing)
 
     def preview_file(self, file: str) -> OpenedFile:
         """Preview a file that is not loaded as a run."""
         if self.detrend is not None:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
         announce_reading([file])
-        return open_file(
-            file,
-            time=self.time,
-            step=self.step,
-            inputs=pairs("-u", self.inputs) or None,
-            outputs=pairs("-y", self.outputs) or None,
-            units=pairs("--units", self.units),
-            columns=self.columns,
-            time_unit=self.time_unit,
-            intersample=pairs("--intersample", self.intersample),
-            layout=layout_options(self),
-            window=self._window(),
-            resample=self.resample,
-            missing=self.missing,
-        )
+        return preview_selection(file, *self._selection())
 
 
 def given_fields(*records: Any) -> dict[str, Any]:
