@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from ftlm.findings import FINDING_CATALOGUE, FINDING_LEVELS, FINDING_TOPICS
+from ftlm.findings import FINDING_LEVELS, finding_catalogue
 
 PAGE = Path(__file__).with_suffix(".md")
 LEAD = """# Findings
@@ -67,7 +67,9 @@ CHANGED_LEVELS = (
 def changed_levels() -> list[str]:
     """The table of the cases whose level was changed."""
     rows = ["## Levels that were changed\n", "| code | before | now | where |", "| --- | --- | --- | --- |"]
-    return rows + [f"| `{c}` | {old} | {FINDING_CATALOGUE[c].level} | {why} |" for old, c, why in CHANGED_LEVELS]
+    return rows + [
+        f"| `{c}` | {old} | {finding_catalogue().kinds[c].level} | {why} |" for old, c, why in CHANGED_LEVELS
+    ]
 
 
 def cell(text: str) -> str:
@@ -82,9 +84,9 @@ def page() -> str:
     parts = [LEAD]
     for level in FINDING_LEVELS:
         parts += [f"## {level.capitalize()}\n", "| code | sentence | remedy |", "| --- | --- | --- |"]
-        for code, kind in FINDING_CATALOGUE.items():
+        for code, kind in finding_catalogue().kinds.items():
             if kind.level == level:
-                topic = FINDING_TOPICS[kind.topic]
+                topic = finding_catalogue().topics[kind.topic]
                 remedy = kind.remedy or "; ".join(part for part in (topic.remedy, topic.alternative) if part)
                 text = (kind.prefix + kind.template).replace("{remedy}", remedy)
                 parts.append(f"| `{code}` | {cell(text)} | {'' if kind.states_remedy else cell(remedy)} |")

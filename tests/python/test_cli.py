@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import pytest
@@ -24,8 +23,7 @@ import ftlm
 from ftlm import progress
 from ftlm.cli import framework
 from ftlm.cli.framework import broken_line, print_text
-from ftlm.cli.main import app
-from ftlm.cli.reading_options import Force
+from ftlm.cli.main import COMMAND_HELP, CommandTable, app
 from ftlm.utils.formatting import EscapedStream, escape_standard_streams
 from measured import DATA, needs_data
 
@@ -624,11 +622,17 @@ def test_a_command_imports_what_it_needs_alone(words, tmp_path):
     assert out.stdout.splitlines()[-1] == "imported: []"
 
 
+def test_every_option_has_a_help_text():
+    table = CommandTable(COMMAND_HELP)
+    bare = [(name, p.name) for name in COMMAND_HELP for p in table[name].params if not getattr(p, "help", None)]
+    assert bare == []
+
+
 def test_a_file_to_write_is_checked_before_the_work(tmp_path):
     done = []
 
     @framework.command
-    def work(*, out: Annotated[str, framework.output_file("Write.")], force: Force = False) -> None:
+    def work(*, out: framework.OutputFile, force: bool = False) -> None:
         done.append((out, force))
 
     commands, path = typer.Typer(), tmp_path / "a.csv"

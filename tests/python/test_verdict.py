@@ -19,7 +19,7 @@ from ftlm.estimation import estimators as estimating
 from ftlm.estimation import nuisance_parameters as history
 from ftlm.estimation.output_error import ProfileInterval, fit_output_error
 from ftlm.estimation.verdict import saved_verdict, verdict
-from ftlm.findings import FINDING_CATALOGUE, FINDING_TOPICS, MAX_SUMMARY_FINDINGS, Finding, group_findings, make_finding
+from ftlm.findings import MAX_SUMMARY_FINDINGS, Finding, finding_catalogue, group_findings, make_finding
 from ftlm.report.html_report import model_page
 from loops import loop
 
@@ -410,10 +410,10 @@ def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_
     poor = replace(found, findings=(BOUND, TIED, make_finding("offset_missing", output="y", share=30.0, test="x")))
     model = replace_estimate(found.model, findings=(BOUND.to_file(),), against=(BOUND.to_file(),))
     before = verdict(poor, checked), saved_verdict(model, [])
-    for code, kind in FINDING_CATALOGUE.items():
+    for code, kind in finding_catalogue().kinds.items():
         reason = f"{code} a closed loop" if kind.reason else ""
         monkeypatch.setitem(
-            FINDING_CATALOGUE, code, replace(kind, template="grows without bound| is quantized", reason=reason)
+            finding_catalogue().kinds, code, replace(kind, template="grows without bound| is quantized", reason=reason)
         )
     after = verdict(poor, checked), saved_verdict(model, [])
     assert [v.level for v in after] == [v.level for v in before]
@@ -437,9 +437,9 @@ def test_the_name_of_a_run_is_no_reason(found, checked, name):
 
 def test_every_entry_of_the_catalogue_renders():
     fields = {"run": "r", "output": "y", "input": "u", "parameter": "a", "method": "least-squares"}
-    for code, kind in FINDING_CATALOGUE.items():
-        assert kind.topic in FINDING_TOPICS
-        topic = FINDING_TOPICS[kind.topic]
+    for code, kind in finding_catalogue().kinds.items():
+        assert kind.topic in finding_catalogue().topics
+        topic = finding_catalogue().topics[kind.topic]
         templates = "".join((kind.template, kind.reason, kind.remedy, kind.prefix, topic.remedy, topic.alternative))
         names = {n.partition("[")[0] for _, n, _, _ in string.Formatter().parse(templates) if n}
         numbers = dict.fromkeys(names - {*fields, "ask", "choose", "remedy", "written", "signal"}, 1)

@@ -1,4 +1,71 @@
-"""Command line: results on standard output, progress on standard error, exit codes for scripts."""
+"""Command line: results on standard output, progress on standard error, exit codes for scripts.
+
+Help of the options that commands share, by panel; docstrings of commands and of their option groups have the others.
+
+Arguments
+---------
+files : FILE...
+    Measured files; several files are several runs.
+store : STORE
+    Checkpoint file, written with --store.
+model : MODEL
+    Saved model.
+
+File
+----
+separator
+    Separator of cells; default detected.
+decimal
+    Decimal mark; default detected.
+thousands
+    Mark between groups of thousands; default detected.
+skip : LINES
+    Lines above the table; default detected.
+header : 0|1|2
+    Header lines: none, names, names and units; default detected.
+sheet
+    Sheet of a workbook.
+
+Structure
+---------
+structure
+    flexible-link:1|2|both, arm:1|2|both or an equation in words.
+fixed : NAME=VALUE
+    Fix a coefficient.
+delay : INPUT=SECONDS
+    Delay of an input; LOW:HIGH is estimated.
+
+Method
+------
+m
+    Block pulses per run; default 2048, or as many as fit.
+threads
+    Threads; default FTLM_THREADS, or all cores.
+bounds : NAME=LOW:HIGH
+    Bounds of a parameter; inf for an open side.
+loss
+    Loss of residuals; huber resists outliers; default squares.
+
+Output
+------
+force
+    Overwrite existing files.
+as_json
+    Print the result as JSON.
+out : FILE
+    Write the model to this .json file.
+report : HTML
+    Write an HTML report to this file.
+verbose
+    Print all details and all warnings.
+
+Options
+-------
+noise : OUTPUT=A
+    Noise standard deviation of an output; default the fit's residual.
+increment
+    Increment of the order grid.
+"""
 
 from ftlm.cli.main import app, main
 

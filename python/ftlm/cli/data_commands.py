@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
 
-from typer import Argument
-
-from ftlm.cli.framework import command, output_file, print_text, say_written, show
-from ftlm.cli.reading_options import OUTPUT_PANEL, Files, Force, Json, ReadingOptions, Text
+from ftlm.cli.framework import OptionalOutputFile, command, print_text, say_written, show
+from ftlm.cli.reading_options import ReadingOptions
 
 
 @command
 def open_(
+    file: str,
     *,
-    file: Annotated[str, Argument(metavar="FILE", help="Measured file.")],
     reading: ReadingOptions,
-    write_columns: Annotated[
-        Text,
-        output_file(
-            "Write columns, units and layout to this file for --columns.",
-            "--write-columns",
-            metavar="TOML",
-            panel=OUTPUT_PANEL,
-        ),
-    ] = None,
-    force: Force = False,
-    as_json: Json = False,
+    write_columns: OptionalOutputFile = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Preview a file: columns, units, roles, step, assumptions with contrary evidence, next command."""
+    """Preview a file: columns, units, roles, step, assumptions with contrary evidence, next command.
+
+    Arguments
+    ---------
+    file : FILE
+        Measured file.
+
+    Output
+    ------
+    write_columns : TOML
+        Write columns, units and layout to this file for --columns.
+    """
     opened = reading.preview_file(file)
     if write_columns is not None:
         opened.write_columns(write_columns, force=force)
@@ -38,7 +38,12 @@ def open_(
 
 
 @command
-def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> None:
+def inspect(
+    files: list[str],
+    *,
+    reading: ReadingOptions,
+    as_json: bool = False,
+) -> None:
     """Print ranges, noise, quantization and rest of runs, and advice before identification."""
     inspected = [(run.inspect(), run.advice()) for run in reading.runs(files)]
     if as_json:

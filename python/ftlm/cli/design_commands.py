@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from typer import Option
 
 from ftlm import control as designs
 from ftlm.cli.framework import (
+    NonNegative,
+    OptionalOutputFile,
     announce_design,
     check_ending,
     command,
     figure_kind,
     numbers,
-    output_file,
     parse_numbers,
     print_text,
     say_written,
@@ -24,8 +24,7 @@ from ftlm.cli.framework import (
     show_json,
     write_figure,
 )
-from ftlm.cli.options import NoiseDeviations, SavedModel
-from ftlm.cli.reading_options import Force, Json, Number, ReadingOptions, Text, Texts
+from ftlm.cli.reading_options import ReadingOptions
 from ftlm.errors import ModelError
 from ftlm.experiment_design import design_input as experiment
 from ftlm.experiment_design.problem import Kind
@@ -42,43 +41,71 @@ LQG_OPTIONS = ("max_deviation", "max_input", "process_noise", "noise", "measured
 
 @command
 def control(
+    model: str,
     *,
-    model: SavedModel,
-    design: Annotated[
-        Literal["pid", "lqg"], Option(help="Fractional PID, or LQG: observer and state feedback.")
-    ] = "pid",
-    input: Annotated[Text, Option(metavar="NAME", help="Input of the loop, if the model has several.")] = None,
-    output: Annotated[
-        Text, Option(metavar="OUTPUT", help="Output that follows; with --path also a sum such as a+b.")
-    ] = None,
-    crossover: Annotated[Number, Option(help="PID: gain crossover frequency [rad/s].")] = None,
-    phase_margin: Annotated[Number, Option(help="PID: phase margin [degrees]; default 60.")] = None,
-    max_deviation: Annotated[
-        Texts, Option(metavar="OUTPUT=A", help="LQG: acceptable deviation of an output or a sum such as a+b.")
-    ] = None,
-    max_input: Annotated[Number, Option(help="LQG: acceptable input, in its unit.")] = None,
-    process_noise: Annotated[
-        Number, Option(help="LQG: drift of the unknown input per second; default max-input/5.")
-    ] = None,
-    noise: NoiseDeviations = None,
-    measured: Annotated[Texts, Option(metavar="OUTPUT", help="LQG: measured output; default all.")] = None,
-    band: Annotated[
-        Text, Option(metavar="LOW:HIGH", help="LQG: band in which its poles match the model [rad/s].")
-    ] = None,
-    poles: Annotated[int | None, Option(help="LQG: number of poles; default chosen by accuracy.")] = None,
-    rate: Annotated[float, Option(help="Sampling rate of the loop [Hz].")] = 500.0,
-    limit: Annotated[Number, Option(help="Largest command; default none.")] = None,
-    path: Annotated[Text, Option(metavar="SIZE:SECONDS", help="Plan a smooth move of --output of this size.")] = None,
-    trajectory: Annotated[
-        Text, output_file("Write reference, command and path to this .csv file.", "--trajectory")
-    ] = None,
-    samples: Annotated[int, Option(help="Parameter samples on which the design is checked.")] = 100,
-    seed: Annotated[int, Option(min=0, help="Seed of these samples.")] = 0,
-    out: Annotated[Text, output_file("Write the controller to this .json file.")] = None,
-    force: Force = False,
-    as_json: Json = False,
+    design: Literal["pid", "lqg"] = "pid",
+    input: str | None = None,
+    output: str | None = None,
+    crossover: float | None = None,
+    phase_margin: float | None = None,
+    max_deviation: list[str] | None = None,
+    max_input: float | None = None,
+    process_noise: float | None = None,
+    noise: list[str] | None = None,
+    measured: list[str] | None = None,
+    band: str | None = None,
+    poles: int | None = None,
+    rate: float = 500.0,
+    limit: float | None = None,
+    path: str | None = None,
+    trajectory: OptionalOutputFile = None,
+    samples: int = 100,
+    seed: NonNegative = 0,
+    out: OptionalOutputFile = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Design a controller on a model: margins, their ranges over the model's uncertainty, controller file."""
+    """Design a controller on a model: margins, their ranges over the model's uncertainty, controller file.
+
+    Options
+    -------
+    design
+        Fractional PID, or LQG: observer and state feedback.
+    input : NAME
+        Input of the loop, if the model has several.
+    output : OUTPUT
+        Output that follows; with --path also a sum such as a+b.
+    crossover
+        PID: gain crossover frequency [rad/s].
+    phase_margin
+        PID: phase margin [degrees]; default 60.
+    max_deviation : OUTPUT=A
+        LQG: acceptable deviation of an output or a sum such as a+b.
+    max_input
+        LQG: acceptable input, in its unit.
+    process_noise
+        LQG: drift of the unknown input per second; default max-input/5.
+    measured : OUTPUT
+        LQG: measured output; default all.
+    band : LOW:HIGH
+        LQG: band in which its poles match the model [rad/s].
+    poles
+        LQG: number of poles; default chosen by accuracy.
+    rate
+        Sampling rate of the loop [Hz].
+    limit
+        Largest command; default none.
+    path : SIZE:SECONDS
+        Plan a smooth move of --output of this size.
+    trajectory : FILE
+        Write reference, command and path to this .csv file.
+    samples
+        Parameter samples on which the design is checked.
+    seed
+        Seed of these samples.
+    out : FILE
+        Write the controller to this .json file.
+    """
     given = dict(locals())
     check_ending(out, ".json")
     check_ending(trajectory, ".csv")
@@ -152,19 +179,31 @@ def control(
 
 @command
 def input_shaper(
+    model: str,
     *,
-    model: SavedModel,
-    kind: Annotated[Literal["zv", "zvd"], Option(help="zvd tolerates pole errors, at twice the delay.")] = "zv",
-    modes: Annotated[int, Option(help="Number of modes, the least damped first.")] = 1,
-    coupling: Annotated[
-        Literal["simulated", "measured"], Option(help="Poles of the equations together, or of each alone.")
-    ] = "simulated",
-    rate: Annotated[float, Option(help="Sampling rate of the reference [Hz].")] = 500.0,
-    out: Annotated[Text, output_file("Write its impulse response to this .csv file.")] = None,
-    force: Force = False,
-    as_json: Json = False,
+    kind: Literal["zv", "zvd"] = "zv",
+    modes: int = 1,
+    coupling: Literal["simulated", "measured"] = "simulated",
+    rate: float = 500.0,
+    out: OptionalOutputFile = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Design an input shaper from the poles of a model."""
+    """Design an input shaper from the poles of a model.
+
+    Options
+    -------
+    kind
+        zvd tolerates pole errors, at twice the delay.
+    modes
+        Number of modes, the least damped first.
+    coupling
+        Poles of the equations together, or of each alone.
+    rate
+        Sampling rate of the reference [Hz].
+    out : FILE
+        Write its impulse response to this .csv file.
+    """
     check_ending(out, ".csv")
     made = designs.input_shaper(load_model(model), kind, modes=modes, coupling=coupling)
     taps = made.impulses(rate)
@@ -194,35 +233,51 @@ def _write_table(rows: np.ndarray[Any, Any], names: tuple[str, ...], path: str, 
 
 @command
 def design_input(
+    model: str,
     *,
-    model: SavedModel,
-    reference_run: Annotated[
-        Text, Option(metavar="FILE", help="Admissible run, whose limits and step are the defaults.")
-    ] = None,
+    reference_run: str | None = None,
     reading: ReadingOptions,
-    duration: Annotated[Number, Option(help="Length of the run [s].")] = None,
-    peak: Annotated[
-        Texts, Option(metavar="A or INPUT=A", help="Largest absolute value of each input, or of one.")
-    ] = None,
-    slew: Annotated[
-        Texts, Option(metavar="A or INPUT=A", help="Largest rate of change of an input [1/s]; default none.")
-    ] = None,
-    limits: Annotated[Texts, Option(metavar="OUTPUT=A", help="Largest absolute value of an output, or inf.")] = None,
-    parameters: Annotated[
-        Texts, Option(metavar="NAME", help="Parameter of interest; default every free order.")
-    ] = None,
-    criterion: Annotated[Kind, Option(help="Criterion: D (all intervals together) or E (the widest).")] = "D",
-    noise: NoiseDeviations = None,
-    period: Annotated[
-        Number, Option(help="Period of the reference square wave [s]; default a fifth of the duration.")
-    ] = None,
-    seed: Annotated[int, Option(min=0, help="Seed of random initial inputs.")] = 0,
-    out: Annotated[Text, output_file("Write the run to this .csv file for ftlm record.")] = None,
-    plot: Annotated[Text, output_file("Write a figure to this .png, .pdf or .svg file.", "--plot")] = None,
-    force: Force = False,
-    as_json: Json = False,
+    duration: float | None = None,
+    peak: list[str] | None = None,
+    slew: list[str] | None = None,
+    limits: list[str] | None = None,
+    parameters: list[str] | None = None,
+    criterion: Kind = "D",
+    noise: list[str] | None = None,
+    period: float | None = None,
+    seed: NonNegative = 0,
+    out: OptionalOutputFile = None,
+    plot: OptionalOutputFile = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Design the input that determines the parameters best within the limits of the machine."""
+    """Design the input that determines the parameters best within the limits of the machine.
+
+    Options
+    -------
+    reference_run : FILE
+        Admissible run, whose limits and step are the defaults.
+    duration
+        Length of the run [s].
+    peak : A or INPUT=A
+        Largest absolute value of each input, or of one.
+    slew : A or INPUT=A
+        Largest rate of change of an input [1/s]; default none.
+    limits : OUTPUT=A
+        Largest absolute value of an output, or inf.
+    parameters : NAME
+        Parameter of interest; default every free order.
+    criterion
+        Criterion: D (all intervals together) or E (the widest).
+    period
+        Period of the reference square wave [s]; default a fifth of the duration.
+    seed
+        Seed of random initial inputs.
+    out : FILE
+        Write the run to this .csv file for ftlm record.
+    plot : FILE
+        Write a figure to this .png, .pdf or .svg file.
+    """
     check_ending(out, ".csv", ", as a run for a rig does")
     figure_kind(plot)
     loaded = load_model(model)

@@ -7,53 +7,31 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import typer
-from typer import Argument, Option
 
-from ftlm.cli.framework import EXIT_INTERRUPTED, command, numbers, pairs, print_text, ranges, show, show_json
+from ftlm.cli.framework import (
+    EXIT_INTERRUPTED,
+    OptionalOutputFile,
+    OptionDetails,
+    command,
+    numbers,
+    pairs,
+    print_text,
+    ranges,
+    show,
+    show_json,
+)
 from ftlm.cli.options import (
-    BlockPulses,
-    CandidateTexts,
-    Delay,
-    Fixed,
     GeneticOptions,
-    LossOption,
     MultiInnovationOptions,
     OrderGridOptions,
-    Out,
     OutputErrorOptions,
-    ParameterBounds,
     RankingOptions,
-    Report,
-    StoreFile,
     StructureOptions,
-    StructureText,
-    Threads,
-    Verbose,
 )
-from ftlm.cli.reading_options import (
-    FILE_PANEL,
-    METHOD_PANEL,
-    OUTPUT_PANEL,
-    STRUCTURE_PANEL,
-    Decimal,
-    Files,
-    Force,
-    HeaderLines,
-    Json,
-    Number,
-    ReadingOptions,
-    Separator,
-    Sheet,
-    SkippedLines,
-    Text,
-    Texts,
-    Thousands,
-    given_fields,
-    layout_options,
-)
+from ftlm.cli.reading_options import ReadingOptions, given_fields, layout_options
 from ftlm.data.frequency_data import FrequencyData
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
@@ -63,6 +41,7 @@ from ftlm.estimation.frequency_domain import Weights
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
 from ftlm.estimation.methods import OutputError, method_with_options
 from ftlm.estimation.order_ranking import with_verdict
+from ftlm.estimation.output_error import Loss
 from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
@@ -80,7 +59,6 @@ from ftlm.utils.resources import duration_bounds, estimate_duration, output_erro
 from ftlm.utils.validation import check_threads
 
 Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
-SavedStore = Annotated[str, Argument(metavar="STORE", help="Checkpoint file, written with --store.")]
 
 
 #: Range of a selection's duration relative to one fit per structure: from a list, and stepwise.
@@ -147,16 +125,10 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
 
 @command
 def identify(
+    files: list[str],
     *,
-    files: Files,
-    structure: Annotated[
-        str,
-        Option(
-            rich_help_panel=STRUCTURE_PANEL,
-            help="flexible-link:1|2|both, arm:1|2|both, an equation, or auto.",
-        ),
-    ],
-    method: Annotated[Method, Option(rich_help_panel=METHOD_PANEL, help="Estimation method.")] = "output-error",
+    structure: str,
+    method: Method = "output-error",
     reading: ReadingOptions,
     shape: StructureOptions,
     fit: OutputErrorOptions,
@@ -164,18 +136,32 @@ def identify(
     ranking: RankingOptions,
     weighting: MultiInnovationOptions,
     genetic: GeneticOptions,
-    m: BlockPulses = None,
-    threads: Threads = None,
-    out: Out = None,
-    report: Report = None,
-    validation: Annotated[
-        Text, Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Validate the model on this run.")
-    ] = None,
-    force: Force = False,
-    verbose: Verbose = False,
-    as_json: Json = False,
+    m: int | None = None,
+    threads: int | None = None,
+    out: OptionalOutputFile = None,
+    report: OptionalOutputFile = None,
+    validation: str | None = None,
+    force: bool = False,
+    verbose: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings."""
+    """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings.
+
+    Structure
+    ---------
+    structure
+        flexible-link:1|2|both, arm:1|2|both, an equation, or auto.
+
+    Method
+    ------
+    method
+        Estimation method.
+
+    Output
+    ------
+    validation : FILE
+        Validate the model on this run.
+    """
     equation = check_structures([structure], shape)
     given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
     given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
@@ -223,28 +209,32 @@ def identify(
 
 @command
 def search(
+    files: list[str],
     *,
-    files: Files,
-    structure: StructureText,
-    coefficients: Annotated[
-        Coefficients, Option(rich_help_panel=METHOD_PANEL, help="Estimation method of the coefficients.")
-    ] = "multi-innovation",
+    structure: str,
+    coefficients: Coefficients = "multi-innovation",
     reading: ReadingOptions,
     shape: StructureOptions,
     grid: OrderGridOptions,
     ranking: RankingOptions,
     weighting: MultiInnovationOptions,
-    m: BlockPulses = None,
-    threads: Threads = None,
-    as_json: Json = False,
+    m: int | None = None,
+    threads: int | None = None,
+    as_json: bool = False,
 ) -> None:
-    """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
+    """Rank the orders of each equation, or of a stage under its order law, and account for every candidate.
+
+    Method
+    ------
+    coefficients
+        Estimation method of the coefficients.
+    """
     runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
     parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
     every = grid.grid() or OrderGrid()
     check_order_names(every, wanted)
-    given = given_fields(replace(grid, order_grid=None, increment=None), replace(ranking, store=None), weighting)
+    given = given_fields(replace(ranking, store=None), weighting)
     settings = SearchSettings(coefficients=coefficients, **given)
     results = {}
     with resumable(ranking.store), contextlib.ExitStack() as stack:
@@ -273,40 +263,38 @@ def search(
 
 @command
 def certify(
+    files: list[str],
     *,
-    files: Files,
-    structure: StructureText,
+    structure: str,
     reading: ReadingOptions,
     shape: StructureOptions,
-    order_grid: Annotated[
-        Texts,
-        Option(
-            metavar="NAME=LOW:HIGH:STEP", rich_help_panel=METHOD_PANEL, help="Interval of an order; alpha: every alpha."
-        ),
-    ] = None,
-    increment: Annotated[
-        Number, Option(rich_help_panel=METHOD_PANEL, help="Increment of the order grid; default 0.05.")
-    ] = None,
-    tolerance: Annotated[
-        float, Option(rich_help_panel=METHOD_PANEL, help="How much smaller other errors may be, as a fraction.")
-    ] = DEFAULT_TOLERANCE,
-    min_separation: Annotated[
-        Number, Option(rich_help_panel=METHOD_PANEL, help="Minimum distance of orders; default the increment.")
-    ] = None,
-    max_term_ratio: Annotated[
-        float, Option(rich_help_panel=METHOD_PANEL, help="Maximum RMS of an equation's terms per RMS of its output.")
-    ] = DEFAULT_MAX_TERM_RATIO,
-    max_cells: Annotated[
-        int, Option(rich_help_panel=METHOD_PANEL, help="Maximum number of boxes of orders.")
-    ] = DEFAULT_MAX_CELLS,
-    m: BlockPulses = None,
-    threads: Threads = None,
-    as_json: Json = False,
+    grid: OrderGridOptions,
+    tolerance: float = DEFAULT_TOLERANCE,
+    min_separation: float | None = None,
+    max_term_ratio: float = DEFAULT_MAX_TERM_RATIO,
+    max_cells: int = DEFAULT_MAX_CELLS,
+    m: int | None = None,
+    threads: int | None = None,
+    as_json: bool = False,
 ) -> None:
-    """Prove a lower bound of the squared equation error of each equation at rest, over all orders in intervals."""
+    """Prove a lower bound of the squared equation error of each equation at rest, over all orders in intervals.
+
+    Method
+    ------
+    order_grid : NAME=LOW:HIGH:STEP
+        Interval of an order; alpha: every alpha.
+    tolerance
+        How much smaller other errors may be, as a fraction.
+    min_separation
+        Minimum distance of orders; default the increment.
+    max_term_ratio
+        Maximum RMS of an equation's terms per RMS of its output.
+    max_cells
+        Maximum number of boxes of orders.
+    """
     runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
-    every = OrderGridOptions(order_grid=order_grid, increment=increment).grid() or OrderGrid()
+    every = grid.grid() or OrderGrid()
     check_order_names(every, wanted)
     results = {}
     for item in wanted.equations:
@@ -368,15 +356,19 @@ def show_notes(store: Store) -> None:
 
 @command
 def resume(
+    store: str,
     *,
-    store: SavedStore,
-    recover: Annotated[
-        bool, Option("--recover", help="Continue a corrupt file; the corrupt one is kept beside it.")
-    ] = False,
-    threads: Threads = None,
-    as_json: Json = False,
+    recover: bool = False,
+    threads: int | None = None,
+    as_json: bool = False,
 ) -> None:
-    """Resume the searches of a checkpoint file and print them; no other file is needed."""
+    """Resume the searches of a checkpoint file and print them; no other file is needed.
+
+    Options
+    -------
+    recover
+        Continue a corrupt file; the corrupt one is kept beside it.
+    """
     results = {}
     with resumable(store), Store(store, recover=recover) as kept:
         show_notes(kept)
@@ -390,7 +382,11 @@ def resume(
 
 
 @command
-def status(*, store: SavedStore, as_json: Json = False) -> None:
+def status(
+    store: str,
+    *,
+    as_json: bool = False,
+) -> None:
     """Print the progress of the searches of a checkpoint file, which may be in use."""
     states = search_status(store)
     if as_json:
@@ -401,34 +397,39 @@ def status(*, store: SavedStore, as_json: Json = False) -> None:
 
 @dataclass(frozen=True)
 class ResponseOptions:
-    """Options for reading frequency responses; None for an option that is not given."""
+    """Options for reading frequency responses; None for an option that is not given.
 
-    panel: ClassVar[str] = FILE_PANEL
+    File
+    ----
+    columns : PART=COLUMN
+        Column of frequency, real, imag, magnitude, phase, deviation.
+    frequency_unit : UNIT
+        Hz, kHz, MHz, mHz or rad/s; default the file's.
+    magnitude_unit
+        Unit of magnitudes; default the file's, or abs.
+    phase_unit
+        Unit of phases; default the file's, or deg.
+    negated
+        Whether the imaginary column holds -Z''; default by its name.
+    output : NAME
+        Output of the response.
+    input : NAME
+        Input of the response.
+    """
 
-    columns: Annotated[
-        Texts, Option(metavar="PART=COLUMN", help="Column of frequency, real, imag, magnitude, phase, deviation.")
-    ] = None
-    frequency_unit: Annotated[Text, Option(metavar="UNIT", help="Hz, kHz, MHz, mHz or rad/s; default the file's.")] = (
-        None
-    )
-    magnitude_unit: Annotated[
-        Literal["dB", "abs"] | None, Option(help="Unit of magnitudes; default the file's, or abs.")
-    ] = None
-    phase_unit: Annotated[Literal["deg", "rad"] | None, Option(help="Unit of phases; default the file's, or deg.")] = (
-        None
-    )
-    negated: Annotated[
-        bool | None,
-        Option("--negated/--not-negated", help="Whether the imaginary column holds -Z''; default by its name."),
-    ] = None
-    output: Annotated[Text, Option("-y", "--output", metavar="NAME", help="Output of the response.")] = None
-    input: Annotated[Text, Option("-u", "--input", metavar="NAME", help="Input of the response.")] = None
-    separator: Separator = None
-    decimal: Decimal = None
-    thousands: Thousands = None
-    skip: SkippedLines = None
-    header: HeaderLines = None
-    sheet: Sheet = None
+    columns: list[str] | None = None
+    frequency_unit: str | None = None
+    magnitude_unit: Literal["dB", "abs"] | None = None
+    phase_unit: Literal["deg", "rad"] | None = None
+    negated: Annotated[bool | None, OptionDetails(flags=("--negated/--not-negated",))] = None
+    output: Annotated[str | None, OptionDetails(flags=("-y", "--output"))] = None
+    input: Annotated[str | None, OptionDetails(flags=("-u", "--input"))] = None
+    separator: Literal["comma", "semicolon", "tab", "space"] | None = None
+    decimal: Literal["point", "comma"] | None = None
+    thousands: Literal["none", "point", "comma", "space", "apostrophe"] | None = None
+    skip: int | None = None
+    header: int | None = None
+    sheet: str | None = None
 
     def load(self, file: str) -> FrequencyData:
         """Load one file."""
@@ -448,46 +449,49 @@ class ResponseOptions:
 
 @command
 def identify_frequency(
+    files: list[str],
     *,
-    files: Annotated[list[str], Argument(metavar="FILE...", help="Frequency responses or impedance spectra.")],
-    structure: Annotated[
-        str,
-        Option(
-            "--structure",
-            "--circuit",
-            metavar="EQUATION|CIRCUIT",
-            rich_help_panel=STRUCTURE_PANEL,
-            help="Equation 'D y = a y + b u', or circuit 'R0-p(R1,CPE1)'.",
-        ),
-    ],
-    weights: Annotated[
-        Weights,
-        Option(rich_help_panel=METHOD_PANEL, help="Weights; auto: deviations if the file has them."),
-    ] = "auto",
+    structure: Annotated[str, OptionDetails(flags=("--structure", "--circuit"))],
+    weights: Weights = "auto",
     reading: ResponseOptions,
-    orders: Annotated[
-        Texts,
-        Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix an order, or give LOW:HIGH:STEP."),
-    ] = None,
-    fixed: Fixed = None,
-    delay: Delay = None,
-    start: Annotated[
-        Texts,
-        Option(
-            metavar="NAME=VALUE", rich_help_panel=METHOD_PANEL, help="Additional initial guess of a free parameter."
-        ),
-    ] = None,
-    bounds: ParameterBounds = None,
-    out: Out = None,
-    report: Report = None,
-    validation: Annotated[
-        Text, Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Validate the model on this response.")
-    ] = None,
-    force: Force = False,
-    verbose: Verbose = False,
-    as_json: Json = False,
+    orders: list[str] | None = None,
+    fixed: list[str] | None = None,
+    delay: list[str] | None = None,
+    start: list[str] | None = None,
+    bounds: list[str] | None = None,
+    out: OptionalOutputFile = None,
+    report: OptionalOutputFile = None,
+    validation: str | None = None,
+    force: bool = False,
+    verbose: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Identify a model from a frequency response or impedance, with 95 % intervals."""
+    """Identify a model from a frequency response or impedance, with 95 % intervals.
+
+    Arguments
+    ---------
+    files : FILE...
+        Frequency responses or impedance spectra.
+
+    Structure
+    ---------
+    structure : EQUATION|CIRCUIT
+        Equation 'D y = a y + b u', or circuit 'R0-p(R1,CPE1)'.
+    orders : NAME=VALUE
+        Fix an order, or give LOW:HIGH:STEP.
+
+    Method
+    ------
+    weights
+        Weights; auto: deviations if the file has them.
+    start : NAME=VALUE
+        Additional initial guess of a free parameter.
+
+    Output
+    ------
+    validation : FILE
+        Validate the model on this response.
+    """
     if structure.startswith(("flexible-link", "arm:")) or structure == "auto":
         raise ModelError(f"--structure {structure!r}: a frequency response takes an equation in words")
     records = [reading.load(file) for file in files]
@@ -519,27 +523,36 @@ def identify_frequency(
 
 @command
 def select(
+    files: list[str],
     *,
-    files: Files,
-    structures: CandidateTexts,
+    structures: list[str],
     reading: ReadingOptions,
     shape: StructureOptions,
-    validation: Annotated[
-        Text,
-        Option(
-            metavar="runs|blocks|FILE",
-            rich_help_panel=METHOD_PANEL,
-            help="Cross-validate over runs or quarters, or on another run.",
-        ),
-    ] = None,
-    threads: Threads = None,
-    store: StoreFile = None,
-    out: Out = None,
-    report: Report = None,
-    force: Force = False,
-    as_json: Json = False,
+    validation: str | None = None,
+    threads: int | None = None,
+    store: str | None = None,
+    out: OptionalOutputFile = None,
+    report: OptionalOutputFile = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Select terms and orders that improve the score on validation data."""
+    """Select terms and orders that improve the score on validation data.
+
+    Structure
+    ---------
+    structures
+        Largest structure, several to compare, or auto.
+
+    Method
+    ------
+    validation : runs|blocks|FILE
+        Cross-validate over runs or quarters, or on another run.
+
+    Output
+    ------
+    store : FILE
+        Checkpoint file; the same command resumes from it.
+    """
     equation = check_structures(structures, shape)
     runs = reading.runs(files, equation)
     made = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
@@ -560,22 +573,25 @@ def select(
 
 @command
 def consistency(
+    files: list[str],
     *,
-    files: Files,
-    structure: StructureText,
+    structure: str,
     reading: ReadingOptions,
     shape: StructureOptions,
-    segments: Annotated[
-        int | None,
-        Option(rich_help_panel=METHOD_PANEL, help="Segments of one run; several runs are segments; default 2."),
-    ] = None,
-    loss: LossOption = None,
-    threads: Threads = None,
-    report: Report = None,
-    force: Force = False,
-    as_json: Json = False,
+    segments: int | None = None,
+    loss: Loss | None = None,
+    threads: int | None = None,
+    report: OptionalOutputFile = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Identify segments of a run separately, and list the parameters that differ significantly."""
+    """Identify segments of a run separately, and list the parameters that differ significantly.
+
+    Method
+    ------
+    segments
+        Segments of one run; several runs are segments; default 2.
+    """
     runs = reading.runs(files, shape.structure(structure))
     wanted = shape.structure_for_runs(structure, runs)
     method = OutputError() if loss is None else OutputError(loss=loss)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import functools
 import inspect
 import io
@@ -11,14 +10,15 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand
 
+from ftlm import cli
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.progress import Progress
@@ -169,7 +169,7 @@ class Command(TyperCommand):
                 panels["Arguments"].append((told.metavar, record[1]))
             elif record is not None:
                 panels[getattr(told, "rich_help_panel", None) or OTHER_PANEL].append(record)
-        if self.methods_by_field:
+        if self.methods_by_field and self._chosen_method([]) is not None:
             panels[OTHER_PANEL].append((HELP_ALL_FLAG, "Show the options of all methods and exit."))
         for name, records in panels.items():
             if records:
@@ -177,35 +177,92 @@ class Command(TyperCommand):
                     formatter.write_dl(records)
 
 
-def output_file(help: str, *flags: str, metavar: str = "FILE", panel: str | None = None) -> Any:
-    """Return an option for a file to write; a command refuses a path that it cannot write before it computes."""
-    option: Any = typer.Option(*flags or ("-o", "--out"), metavar=metavar, rich_help_panel=panel, help=help)
-    option.is_output = True
-    return option
+@dataclass(frozen=True)
+class OptionDetails:
+    """Details of an option that its name, type and default do not determine, as an annotation of its type.
+
+    Parameters
+    ----------
+    flags
+        Flags; by default those of `OPTION_FLAGS`, or the name.
+    min
+        Least integer.
+    is_output
+        Whether it is a file to write; a command refuses a path that it cannot write before it computes.
+    """
+
+    flags: tuple[str, ...] = ()
+    min: int | None = None
+    is_output: bool = False
+
+
+OutputFile = Annotated[str, OptionDetails(is_output=True)]
+OptionalOutputFile = Annotated[str | None, OptionDetails(is_output=True)]
+NonNegative = Annotated[int, OptionDetails(min=0)]
+Positive = Annotated[int, OptionDetails(min=1)]
+#: Flags of options whose flag is not their name alone.
+OPTION_FLAGS = {
+    "as_json": ("--json",),
+    "structures": ("--structure",),
+    "inputs": ("-u", "--inputs"),
+    "outputs": ("-y", "--outputs"),
+    "out": ("-o", "--out"),
+    "verbose": ("-v", "--verbose"),
+}
+
+
+@dataclass(frozen=True)
+class OptionText:
+    """Help of an option: its panel, the type of its value in words, and the help itself."""
+
+    panel: str | None
+    metavar: str | None
+    help: str
+
+
+def parse_option_texts(docstring: str | None) -> tuple[str, dict[str, OptionText]]:
+    """Return the text of a docstring before its first section, and the options that its sections describe.
+
+    A section is a panel of the help; its entries have the form of numpydoc, with the type of a value in words after a
+    colon. Options of the section ``Options`` have no panel.
+    """
+    summary, *parts = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(docstring or ""), flags=re.MULTILINE)
+    texts = {}
+    for panel, entries in zip(parts[::2], parts[1::2], strict=True):
+        for name, metavar, words in re.findall(r"^(\w+)(?: : (.+))?\n((?: +.*\n?)+)", entries, re.MULTILINE):
+            texts[name] = OptionText(None if panel == OTHER_PANEL else panel, metavar or None, " ".join(words.split()))
+    return summary.strip(), texts
+
+
+#: Help of the options that commands share.
+SHARED_TEXTS = parse_option_texts(cli.__doc__)[1]
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
     """Turn a function into a command.
 
-    A dataclass parameter expands to its fields: each becomes an option at that place, and the function receives the
-    dataclass. Its `panel` is that of the options in the help, its `methods` those that use them. Errors become one
-    line on standard error and an exit code. Existing files of :func:`output_file` are refused unless `force` is set.
+    Positional parameters are arguments, keyword-only ones are options, and docstrings have their help: that of the
+    function, or the docstring of ``ftlm.cli`` for options that commands share. A dataclass parameter expands to its
+    fields: each becomes an option at that place, and the function receives the dataclass. Its `methods_of`, if it has
+    one, returns the methods that use an option. Errors become one line on standard error and an exit code. Existing
+    files of `OutputFile` are refused unless `force` is set.
     """
     records: dict[str, type[Any]] = {}
     options: list[inspect.Parameter] = []
     methods_by_field: dict[str, tuple[str, ...]] = {}
-    outputs: list[str] = []
+    summary, texts = parse_option_texts(work.__doc__)
     for parameter in inspect.signature(work, eval_str=True).parameters.values():
         kind = parameter.annotation
         if isinstance(kind, type) and is_dataclass(kind):
             records[parameter.name] = kind
-            options += _options_of(kind)
-            if hasattr(kind, "methods"):
-                methods_by_field |= dict.fromkeys((f.name for f in fields(kind)), kind.methods)
+            hints, own = get_type_hints(kind, include_extras=True), parse_option_texts(kind.__doc__)[1] | texts
+            options += [_option(f.name, hints[f.name], f.default, own) for f in fields(kind)]
+            if hasattr(kind, "methods_of"):
+                methods_by_field |= {f.name: kind.methods_of(f.name) for f in fields(kind)}
         else:
-            options.append(parameter.replace(annotation=_with_help(kind)))
-            if hasattr(get_args(kind)[1], "is_output"):
-                outputs.append(parameter.name)
+            positional = parameter.kind is not inspect.Parameter.KEYWORD_ONLY
+            options.append(_option(parameter.name, kind, parameter.default, texts, positional=positional))
+    outputs = [option.name for option in options if option.annotation.__metadata__[0].is_output]
 
     @functools.wraps(work)
     def run(**given: Any) -> None:
@@ -242,31 +299,31 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(EXIT_DATA) from None
 
     # What typer reads.
+    run.__doc__ = summary
     run.__annotations__ = {option.name: option.annotation for option in options}
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     run.methods_by_field = methods_by_field  # type: ignore[attr-defined]
     return run
 
 
-def _options_of(record: type[Any]) -> list[inspect.Parameter]:
-    """Return the fields of a dataclass as parameters of a function, in the panel of the dataclass."""
-    hints = get_type_hints(record, include_extras=True)
-    panel = getattr(record, "panel", None)
-    return [
-        inspect.Parameter(
-            f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=_with_help(hints[f.name], panel)
-        )
-        for f in fields(record)
-    ]
-
-
-def _with_help(hint: Any, panel: str | None = None) -> Any:
-    """Return an annotated type whose option has a type in plain words, and the panel of its dataclass in the help."""
-    kind, option = get_args(hint)
-    described = copy.copy(option)
-    described.metavar = option.metavar or _type_label(kind)
-    described.rich_help_panel = panel or option.rich_help_panel
-    return Annotated[kind, described]
+def _option(
+    name: str, hint: Any, default: Any, texts: Mapping[str, OptionText], *, positional: bool = False
+) -> inspect.Parameter:
+    """Return a parameter as typer reads it, from its name, type, default and help."""
+    kind, details = get_args(hint) if get_origin(hint) is Annotated else (hint, OptionDetails())
+    text = texts.get(name) or SHARED_TEXTS.get(name) or OptionText(None, None, "")
+    metavar = text.metavar or ("FILE" if details.is_output else _type_label(kind))
+    described: Any
+    if positional:
+        described = typer.Argument(metavar=metavar, help=text.help)
+    else:
+        # A switch that is on by default has two flags, which typer makes.
+        flags = details.flags or OPTION_FLAGS.get(name) or (() if default is True else (f"--{name.replace('_', '-')}",))
+        described = typer.Option(*flags, metavar=metavar, rich_help_panel=text.panel, help=text.help, min=details.min)
+    described.is_output = details.is_output
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, described]
+    )
 
 
 def _type_label(kind: Any) -> str | None:

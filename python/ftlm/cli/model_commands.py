@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
 import typer
-from typer import Argument, Option
 
 from ftlm.analysis.conversion import export_text
 from ftlm.cli.framework import (
     EXIT_VALIDATION,
+    OptionalOutputFile,
+    OutputFile,
+    Positive,
     announce_simulation,
     command,
     figure_kind,
     interval,
-    output_file,
     print_outcome,
     show,
     write_figure,
 )
-from ftlm.cli.options import BlockPulses, Page, SavedModel
-from ftlm.cli.reading_options import Files, Force, Json, Number, ReadingOptions, Text, Texts
+from ftlm.cli.reading_options import ReadingOptions
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
@@ -44,15 +44,21 @@ def _with_runs(
 
 @command
 def compare(
+    model: str,
+    files: list[str],
     *,
-    model: SavedModel,
-    files: Files,
-    min_fit: Annotated[Number, Option(help="Exit with 4 if the simulation fits less [%].")] = None,
+    min_fit: float | None = None,
     reading: ReadingOptions,
-    m: BlockPulses = None,
-    as_json: Json = False,
+    m: int | None = None,
+    as_json: bool = False,
 ) -> None:
-    """Print the equation error and output error of a saved model on measured runs."""
+    """Print the equation error and output error of a saved model on measured runs.
+
+    Options
+    -------
+    min_fit
+        Exit with 4 if the simulation fits less [%].
+    """
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     comparison = loaded.compare(runs, m=m)
     show(comparison, as_json=as_json)
@@ -67,14 +73,20 @@ def compare(
 
 @command
 def resid(
+    model: str,
+    files: list[str],
     *,
-    model: SavedModel,
-    files: Files,
-    lags: Annotated[int, Option(min=1, help="Largest lag in samples.")] = 25,
+    lags: Positive = 25,
     reading: ReadingOptions,
-    as_json: Json = False,
+    as_json: bool = False,
 ) -> None:
-    """Test residuals for whiteness and independence of the inputs; exit code 4 if a test fails."""
+    """Test residuals for whiteness and independence of the inputs; exit code 4 if a test fails.
+
+    Options
+    -------
+    lags
+        Largest lag in samples.
+    """
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     tests = loaded.resid(runs, lags=lags)
     show(tests, as_json=as_json)
@@ -84,16 +96,29 @@ def resid(
 
 @command
 def simulate(
+    model: str,
+    file: str,
     *,
-    model: SavedModel,
-    file: Annotated[str, Argument(metavar="FILE", help="Run with the inputs of the simulation.")],
-    out: Annotated[str, output_file("Write the simulated run to this file.", metavar="CSV")],
+    out: OutputFile,
     reading: ReadingOptions,
-    tolerance: Annotated[float, Option(help="Relative tolerance of the step refinement.")] = 1e-6,
-    force: Force = False,
-    as_json: Json = False,
+    tolerance: float = 1e-06,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Simulate a saved model on the inputs of a run and write the outputs as csv."""
+    """Simulate a saved model on the inputs of a run and write the outputs as csv.
+
+    Arguments
+    ---------
+    file : FILE
+        Run with the inputs of the simulation.
+
+    Options
+    -------
+    out : CSV
+        Write the simulated run to this file.
+    tolerance
+        Relative tolerance of the step refinement.
+    """
     loaded, runs = _with_runs(model, reading, [file], quiet=as_json)
     free = loaded.simulate(runs[0], tolerance=tolerance)
     free.to_csv(out, force=force)
@@ -103,15 +128,26 @@ def simulate(
 
 @command
 def report(
+    model: str,
     *,
-    model: SavedModel,
-    out: Page,
-    validation: Annotated[Texts, Option(metavar="FILE", help="Run to validate the model on.")] = None,
+    out: OutputFile,
+    validation: list[str] | None = None,
     reading: ReadingOptions,
-    force: Force = False,
-    as_json: Json = False,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Write the HTML report of a saved model, with validation runs."""
+    """Write the HTML report of a saved model, with validation runs.
+
+    Output
+    ------
+    out : HTML
+        Write the page to this file.
+
+    Options
+    -------
+    validation : FILE
+        Run to validate the model on.
+    """
     loaded, runs = _with_runs(model, reading, validation, quiet=as_json)
     page = model_page(loaded, out, validation=runs or None, force=force)
     print_outcome(f"written: {page}", as_json=as_json, written=str(page))
@@ -119,19 +155,29 @@ def report(
 
 @command
 def plot(
+    model: str,
+    files: list[str] | None = None,
     *,
-    model: SavedModel,
-    out: Annotated[str, output_file("Write the figure to this .png, .pdf or .svg file.")],
-    files: Annotated[Texts, Argument(metavar="[RUN]...", help="Runs, for fit, residuals and series.")] = None,
-    kind: Annotated[
-        Literal["fit", "residuals", "series", "bode", "poles", "step", "impulse"],
-        Option(help="Kind of figure; series: residuals over time."),
-    ] = "fit",
+    out: OutputFile,
+    kind: Literal["fit", "residuals", "series", "bode", "poles", "step", "impulse"] = "fit",
     reading: ReadingOptions,
-    force: Force = False,
-    as_json: Json = False,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Plot a saved model: fit or residuals on runs, Bode plot, poles, step or impulse response."""
+    """Plot a saved model: fit or residuals on runs, Bode plot, poles, step or impulse response.
+
+    Arguments
+    ---------
+    files : [RUN]...
+        Runs, for fit, residuals and series.
+
+    Options
+    -------
+    out : FILE
+        Write the figure to this .png, .pdf or .svg file.
+    kind
+        Kind of figure; series: residuals over time.
+    """
     figure_kind(out)
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     alone = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
@@ -151,19 +197,28 @@ def plot(
 
 @command
 def export(
+    model: str,
     *,
-    model: SavedModel,
-    to: Annotated[
-        Literal["control", "matlab", "json"],
-        Option(help="control: Python; matlab: FOMCON script; json."),
-    ],
-    band: Annotated[Text, Option(metavar="LOW:HIGH", help="Frequency band for control [rad/s].")] = None,
-    order: Annotated[int, Option(help="Order of Oustaloup's filter, for control.")] = 5,
-    out: Annotated[Text, output_file("Write to this file; default standard output.")] = None,
-    force: Force = False,
-    as_json: Json = False,
+    to: Literal["control", "matlab", "json"],
+    band: str | None = None,
+    order: int = 5,
+    out: OptionalOutputFile = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Export a saved model for another tool, to a file or to standard output."""
+    """Export a saved model for another tool, to a file or to standard output.
+
+    Options
+    -------
+    to
+        control: Python; matlab: FOMCON script; json.
+    band : LOW:HIGH
+        Frequency band for control [rad/s].
+    order
+        Order of Oustaloup's filter, for control.
+    out : FILE
+        Write to this file; default standard output.
+    """
     limits = None if band is None else _both_ends(band)
     text = export_text(load_model(model), to, band=limits, order=order)
     if out is None:

@@ -6,13 +6,10 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, ClassVar, Literal
-
-from typer import Argument, Option
+from typing import Annotated, Any, Literal
 
 from ftlm.arm.flexible_link import Form, InputOrder, Law, flexible_link
-from ftlm.cli.framework import numbers, output_file, pairs, ranges
-from ftlm.cli.reading_options import METHOD_PANEL, OUTPUT_PANEL, STRUCTURE_PANEL, Number, Text, Texts
+from ftlm.cli.framework import OptionDetails, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
 from ftlm.estimation.confidence_intervals import Intervals
@@ -23,115 +20,80 @@ from ftlm.structure.order_grid import OrderGrid, order_grid
 from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import INITIAL_CHOICES, Offset, Structure, check_initial
-from ftlm.utils.parameters import parameter
+from ftlm.utils.parameters import flag_of, parameter
 
-SavedModel = Annotated[str, Argument(metavar="MODEL", help="Saved model.")]
-StructureText = Annotated[
-    str,
-    Option(
-        "--structure",
-        rich_help_panel=STRUCTURE_PANEL,
-        help="flexible-link:1|2|both, arm:1|2|both or an equation in words.",
-    ),
-]
-CandidateTexts = Annotated[
-    list[str],
-    Option("--structure", rich_help_panel=STRUCTURE_PANEL, help="Largest structure, several to compare, or auto."),
-]
-GridIncrement = Annotated[float, Option("--increment", help="Increment of the order grid.")]
-BlockPulses = Annotated[
-    int | None,
-    Option("--m", rich_help_panel=METHOD_PANEL, help="Block pulses per run; default 2048, or as many as fit."),
-]
-Threads = Annotated[
-    int | None, Option("--threads", rich_help_panel=METHOD_PANEL, help="Threads; default FTLM_THREADS, or all cores.")
-]
-StoreFile = Annotated[
-    Text,
-    Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Checkpoint file; the same command resumes from it."),
-]
-Out = Annotated[Text, output_file("Write the model to this .json file.", panel=OUTPUT_PANEL)]
-Page = Annotated[str, output_file("Write the page to this file.", metavar="HTML", panel=OUTPUT_PANEL)]
-Report = Annotated[
-    Text, output_file("Write an HTML report to this file.", "--report", metavar="HTML", panel=OUTPUT_PANEL)
-]
-Verbose = Annotated[
-    bool, Option("-v", "--verbose", rich_help_panel=OUTPUT_PANEL, help="Print all details and all warnings.")
-]
-LossOption = Annotated[
-    Loss | None,
-    Option(rich_help_panel=METHOD_PANEL, help="Loss of residuals; huber resists outliers; default squares."),
-]
-NoiseDeviations = Annotated[
-    Texts, Option(metavar="OUTPUT=A", help="Noise standard deviation of an output; default the fit's residual.")
-]
-Orders = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix an order.")]
-Fixed = Annotated[Texts, Option(metavar="NAME=VALUE", rich_help_panel=STRUCTURE_PANEL, help="Fix a coefficient.")]
-ParameterBounds = Annotated[
-    Texts,
-    Option(metavar="NAME=LOW:HIGH", rich_help_panel=METHOD_PANEL, help="Bounds of a parameter; inf for an open side."),
-]
-Delay = Annotated[
-    Texts,
-    Option(metavar="INPUT=SECONDS", rich_help_panel=STRUCTURE_PANEL, help="Delay of an input; LOW:HIGH is estimated."),
-]
+#: Options of the flexible link, in the order of messages.
+LINK_OPTIONS = ("cross_stage", "cross_sensitivity", "cross_damping", "friction", "laws", "form", "input_order")
 
 
-def methods_with(*options: str) -> tuple[str, ...]:
-    """Return the names of the methods of estimation that have these options."""
-    return tuple(name for name, method in METHODS_BY_NAME.items() if set(options) <= {f.name for f in fields(method)})
+class MethodOptions:
+    """Base of options of methods of estimation; None stands for an option that is not given."""
+
+    @staticmethod
+    def methods_of(option: str) -> tuple[str, ...]:
+        """Return the names of the methods that have an option."""
+        field_name = "order_grid" if option == "increment" else option
+        return tuple(n for n, kind in METHODS_BY_NAME.items() if field_name in {f.name for f in fields(kind)})
 
 
 @dataclass(frozen=True)
 class StructureOptions:
-    """Options that modify a structure; None for an option that is not given."""
+    """Options that modify a structure; None for an option that is not given.
 
-    panel: ClassVar[str] = STRUCTURE_PANEL
+    Structure
+    ---------
+    only : OUTPUT
+        Fit the equation of this output only; default all.
+    coupling
+        Other outputs in an equation; default measured for a link.
+    cross_stage
+        Terms of the other stage of the arm; default none.
+    cross_sensitivity
+        Deflections also follow hub angles (gauge and cable).
+    cross_damping
+        With --cross-stage inertial: rate of the other deflection.
+    friction
+        Add Coulomb friction of the hubs.
+    laws
+        Order law; velocities: also gamma = mu; default none.
+    form
+        Equation of the deflection: (15) or (23); default lagrange.
+    input_order
+        Order of the current in the published form.
+    sensor_filter : stock|HZ[:DAMPING]
+        Low-pass filter of the sensors; stock: 2 Hz, damping 0.9.
+    filtered_signals : SIGNAL
+        Signal of an equation in words that passed the filter.
+    orders : NAME=VALUE
+        Fix an order.
+    saturation : INPUT=LIMIT
+        Saturation limit of an input; LOW:HIGH is estimated.
+    dead_zone : INPUT=LIMIT
+        Dead zone of an input; LOW:HIGH is estimated.
+    initial
+        auto, rest, caputo, history, or exponents of t: 0,1.
+    offset
+        Offset of each equation and run; default the equation's.
+    """
 
-    only: Annotated[Text, Option(metavar="OUTPUT", help="Fit the equation of this output only; default all.")] = None
-    coupling: Annotated[
-        Literal["measured", "simulated"] | None,
-        Option(help="Other outputs in an equation; default measured for a link."),
-    ] = None
-    cross_stage: Annotated[
-        Literal["torques", "inertial"] | None, Option(help="Terms of the other stage of the arm; default none.")
-    ] = None
-    cross_sensitivity: Annotated[
-        bool, Option("--cross-sensitivity", help="Deflections also follow hub angles (gauge and cable).")
-    ] = False
-    cross_damping: Annotated[
-        bool, Option("--cross-damping", help="With --cross-stage inertial: rate of the other deflection.")
-    ] = False
-    friction: Annotated[bool, Option("--friction", help="Add Coulomb friction of the hubs.")] = False
-    laws: Annotated[
-        Literal["none", "orders", "velocities"] | None,
-        Option(help="Order law; velocities: also gamma = mu; default none."),
-    ] = None
-    form: Annotated[
-        Form | None,
-        Option(help="Equation of the deflection: (15) or (23); default lagrange."),
-    ] = None
-    input_order: Annotated[InputOrder | None, Option(help="Order of the current in the published form.")] = None
-    sensor_filter: Annotated[
-        Text, Option(metavar="stock|HZ[:DAMPING]", help="Low-pass filter of the sensors; stock: 2 Hz, damping 0.9.")
-    ] = None
-    filtered_signals: Annotated[
-        Texts, Option(metavar="SIGNAL", help="Signal of an equation in words that passed the filter.")
-    ] = None
-    orders: Orders = None
-    fixed: Fixed = None
-    delay: Delay = None
-    saturation: Annotated[
-        Texts, Option(metavar="INPUT=LIMIT", help="Saturation limit of an input; LOW:HIGH is estimated.")
-    ] = None
-    dead_zone: Annotated[Texts, Option(metavar="INPUT=LIMIT", help="Dead zone of an input; LOW:HIGH is estimated.")] = (
-        None
-    )
-    initial: Annotated[str, Option(help="auto, rest, caputo, history, or exponents of t: 0,1.")] = "auto"
-    offset: Annotated[
-        Offset | None,
-        Option(help="Offset of each equation and run; default the equation's."),
-    ] = None
+    only: str | None = None
+    coupling: Literal["measured", "simulated"] | None = None
+    cross_stage: Literal["torques", "inertial"] | None = None
+    cross_sensitivity: bool = False
+    cross_damping: bool = False
+    friction: bool = False
+    laws: Literal["none", "orders", "velocities"] | None = None
+    form: Form | None = None
+    input_order: InputOrder | None = None
+    sensor_filter: str | None = None
+    filtered_signals: list[str] | None = None
+    orders: list[str] | None = None
+    fixed: list[str] | None = None
+    delay: list[str] | None = None
+    saturation: list[str] | None = None
+    dead_zone: list[str] | None = None
+    initial: str = "auto"
+    offset: Offset | None = None
 
     def structure(self, text: str, *, alone: bool = False) -> Structure:
         """Return the structure of `text` with the options applied; ``alone`` omits the other stage."""
@@ -174,10 +136,7 @@ class StructureOptions:
 
     def _check_equation(self, count: int) -> None:
         """Raise for options of the flexible link, given the number of equations."""
-        given = self._link_options() | {
-            "--coupling": self.coupling is not None and count == 1,
-        }
-        wrong = [option for option, is_given in given.items() if is_given]
+        wrong = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if wrong:
             owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
             kind = "one equation in words" if count == 1 else "equations in words"
@@ -186,17 +145,9 @@ class StructureOptions:
                 "out, or use --structure flexible-link:1, :2 or :both"
             )
 
-    def _link_options(self) -> dict[str, bool]:
-        """Whether each option of the flexible link is given."""
-        return {
-            "--cross-stage": self.cross_stage is not None,
-            "--cross-sensitivity": self.cross_sensitivity,
-            "--cross-damping": self.cross_damping,
-            "--friction": self.friction,
-            "--laws": self.laws is not None,
-            "--form": self.form is not None,
-            "--input-order": self.input_order is not None,
-        }
+    def _flags(self, *names: str) -> list[str]:
+        """Flags of those of some options that are given."""
+        return [flag_of(name) for name in names if getattr(self, name)]
 
     def _sensor(self) -> SensorFilter | None:
         """Sensor filter of signals in equations."""
@@ -224,9 +175,7 @@ class StructureOptions:
         nearly integer order has hardly any memory. So runs start from the link's angle and velocity unless a history is
         requested.
         """
-        given = self._link_options() | {"--coupling": self.coupling is not None}
-        given |= {"--sensor-filter": self.sensor_filter is not None, "--filtered-signals": bool(self.filtered_signals)}
-        wrong = [option for option, is_given in given.items() if is_given]
+        wrong = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
         if wrong:
             raise ModelError(
                 f"{', '.join(wrong)}: --structure {text} has its own; leave {'it' if len(wrong) == 1 else 'them'} out, "
@@ -290,17 +239,19 @@ class StructureOptions:
 
 
 @dataclass(frozen=True)
-class OrderGridOptions:
-    """Order grid of a search and its norm; None for an option that is not given."""
+class OrderGridOptions(MethodOptions):
+    """Order grid of a search; None for an option that is not given.
 
-    panel: ClassVar[str] = METHOD_PANEL
-    methods: ClassVar[tuple[str, ...]] = methods_with("order_grid", "norm")
+    Method
+    ------
+    order_grid : NAME=LOW:HIGH:STEP
+        Values of an order; alpha stands for every alpha.
+    increment
+        Increment of the order grid; default 0.05.
+    """
 
-    order_grid: Annotated[
-        Texts, Option(metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha stands for every alpha.")
-    ] = None
-    increment: Annotated[Number, Option(help="Increment of the order grid; default 0.05.")] = None
-    norm: Annotated[Norm | None, Option(help="Norm of errors: l1 (45) or l2 (46); default l1.")] = None
+    order_grid: list[str] | None = None
+    increment: float | None = None
 
     def grid(self) -> OrderGrid | None:
         """Order grid of the search; None without options."""
@@ -313,57 +264,81 @@ class OrderGridOptions:
 
 
 @dataclass(frozen=True)
-class RankingOptions:
-    """Options of the ranking of candidates; None for an option that is not given."""
+class RankingOptions(MethodOptions):
+    """Options of the ranking of candidates; None for an option that is not given.
 
-    panel: ClassVar[str] = METHOD_PANEL
-    methods: ClassVar[tuple[str, ...]] = methods_with("criterion", "top", "store")
+    Method
+    ------
+    norm
+        Norm of errors: l1 (45) or l2 (46); default l1.
+    criterion
+        Error that ranks candidates; default output-error.
+    top
+        Rows of the ranked table; default 20.
+    store : FILE
+        Checkpoint file, from which the search resumes.
+    """
 
-    criterion: Annotated[Criterion | None, Option(help="Error that ranks candidates; default output-error.")] = None
-    top: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
-    store: Annotated[Text, Option(metavar="FILE", help="Checkpoint file, from which the search resumes.")] = None
-
-
-@dataclass(frozen=True)
-class MultiInnovationOptions:
-    """Options of the multi-innovation method; None for an option that is not given."""
-
-    panel: ClassVar[str] = METHOD_PANEL
-    methods: ClassVar[tuple[str, ...]] = methods_with("innovation_length", "prior_covariance", "row_basis")
-
-    innovation_length: Annotated[int | None, Option(help="Innovation length p; default 7.")] = None
-    prior_covariance: Annotated[Number, Option(help="Prior covariance K0 of the coefficients; default weak.")] = None
-    row_basis: Annotated[RowBasis | None, Option(help="Basis of the rows of (44); default haar.")] = None
+    norm: Norm | None = None
+    criterion: Criterion | None = None
+    top: int | None = None
+    store: str | None = None
 
 
 @dataclass(frozen=True)
-class OutputErrorOptions:
-    """Options of the output-error method; None for an option that is not given."""
+class MultiInnovationOptions(MethodOptions):
+    """Options of the multi-innovation method; None for an option that is not given.
 
-    panel: ClassVar[str] = METHOD_PANEL
-    methods: ClassVar[tuple[str, ...]] = methods_with("loss", "intervals", "start", "reference", "noise", "bounds")
+    Method
+    ------
+    innovation_length
+        Innovation length p; default 7.
+    prior_covariance
+        Prior covariance K0 of the coefficients; default weak.
+    row_basis
+        Basis of the rows of (44); default haar.
+    """
 
-    loss: LossOption = None
-    intervals: Annotated[
-        Intervals | None,
-        Option(help="Confidence intervals: Wald, profile likelihood; default auto."),
-    ] = None
-    start: Annotated[Text, Option(metavar="MODEL", help="Saved model as an additional initial guess.")] = None
-    reference: Annotated[
-        Text, Option(metavar="SIGNAL", help="Reference signal of a closed loop; also name it with -u.")
-    ] = None
-    noise: Annotated[Noise | None, Option(help="Noise of the output; ar: an autoregression; default white.")] = None
-    bounds: ParameterBounds = None
+    innovation_length: int | None = None
+    prior_covariance: float | None = None
+    row_basis: RowBasis | None = None
 
 
 @dataclass(frozen=True)
-class GeneticOptions:
-    """Options of the genetic algorithm; None for an option that is not given."""
+class OutputErrorOptions(MethodOptions):
+    """Options of the output-error method; None for an option that is not given.
 
-    panel: ClassVar[str] = METHOD_PANEL
-    methods: ClassVar[tuple[str, ...]] = methods_with("seeds", "evaluations")
+    Method
+    ------
+    intervals
+        Confidence intervals: Wald, profile likelihood; default auto.
+    start : MODEL
+        Saved model as an additional initial guess.
+    reference : SIGNAL
+        Reference signal of a closed loop; also name it with -u.
+    noise
+        Noise of the output; ar: an autoregression; default white.
+    """
 
-    seeds: Annotated[
-        list[int] | None, Option("--seeds", min=0, help="Seed of the genetic algorithm; several are several runs.")
-    ] = None
-    evaluations: Annotated[int | None, Option(help="Evaluations per seed of the genetic algorithm.")] = None
+    loss: Loss | None = None
+    intervals: Intervals | None = None
+    start: str | None = None
+    reference: str | None = None
+    noise: Noise | None = None
+    bounds: list[str] | None = None
+
+
+@dataclass(frozen=True)
+class GeneticOptions(MethodOptions):
+    """Options of the genetic algorithm; None for an option that is not given.
+
+    Method
+    ------
+    seeds
+        Seed of the genetic algorithm; several are several runs.
+    evaluations
+        Evaluations per seed of the genetic algorithm.
+    """
+
+    seeds: Annotated[list[int] | None, OptionDetails(min=0)] = None
+    evaluations: int | None = None

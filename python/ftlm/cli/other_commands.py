@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-from typer import Argument, Option
-
-from ftlm.app.server import DEFAULT_PORT, serve
-from ftlm.cli.framework import command, print_text, show_json
-from ftlm.cli.options import GeneticOptions, GridIncrement, Page, Threads, Verbose
-from ftlm.cli.reading_options import Files, Force, Json, ReadingOptions, Text, Texts, given_fields
+from ftlm.app.server import serve
+from ftlm.cli.framework import NonNegative, OutputFile, Positive, command, print_text, show_json
+from ftlm.cli.options import GeneticOptions
+from ftlm.cli.reading_options import ReadingOptions, given_fields
 from ftlm.errors import ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.progress import Progress
@@ -31,18 +28,27 @@ DEMO_SECONDS = 22.0
 @command
 def demo(
     *,
-    out: Annotated[str, Option("-o", "--out", metavar="FOLDER", help="Folder to write to.")] = "ftlm-demo",
-    increment: GridIncrement = 0.1,
-    noise: Annotated[float, Option(help="Noise on every angle [rad].")] = 1e-4,
-    seed: Annotated[int, Option(min=0, help="Seed of the noise.")] = 1,
-    threads: Threads = None,
-    force: Force = False,
-    verbose: Verbose = False,
-    as_json: Json = False,
+    out: str = "ftlm-demo",
+    increment: float = 0.1,
+    noise: float = 1e-4,
+    seed: NonNegative = 1,
+    threads: int | None = None,
+    force: bool = False,
+    verbose: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Simulate both stages, identify every equation with p = 1, 3, 5, 7, and write models, tables and charts.
 
     The paper's order grid has the increment 0.05, which takes minutes.
+
+    Options
+    -------
+    out : FOLDER
+        Folder to write to.
+    noise
+        Noise on every angle [rad].
+    seed
+        Seed of the noise.
     """
     with Progress("", quiet=as_json) as progress:
         progress.expect("the demo", estimate_duration(DEMO_SECONDS * (0.1 / increment) ** 2, check_threads(threads)))
@@ -69,25 +75,48 @@ def demo(
 @command
 def reproduce(
     *,
-    out: Page = "paper.html",
-    save: Annotated[Text, Option(metavar="FOLDER", help="Also write runs, models and tables to this folder.")] = None,
-    square: Annotated[Text, Option(metavar="FILE", help="Measured run to identify from.")] = None,
-    sine: Annotated[Text, Option(metavar="FILE", help="Measured run to validate on.")] = None,
+    out: OutputFile = "paper.html",
+    save: str | None = None,
+    square: str | None = None,
+    sine: str | None = None,
     reading: ReadingOptions,
-    increment: GridIncrement = 0.05,
-    noise: Annotated[float, Option(help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
-    seed: Annotated[int, Option(min=0, help="Seed of that noise.")] = 1,
-    arms: Annotated[
-        Texts, Option("--arms", metavar="ARM", help="Simulated arm for the verdicts; several, or all.")
-    ] = None,
-    records: Annotated[int, Option(min=1, help="Records per arm, with different noise.")] = 3,
-    rivals_increment: Annotated[float, Option(help="Smallest increment in the comparison with the GA.")] = CONTEST_STEP,
+    increment: float = 0.05,
+    noise: float = 1e-4,
+    seed: NonNegative = 1,
+    arms: list[str] | None = None,
+    records: Positive = 3,
+    rivals_increment: float = CONTEST_STEP,
     genetic: GeneticOptions,
-    threads: Threads = None,
-    force: Force = False,
-    as_json: Json = False,
+    threads: int | None = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Recompute the tables and figures of the paper on simulated or measured runs, as one HTML page."""
+    """Recompute the tables and figures of the paper on simulated or measured runs, as one HTML page.
+
+    Output
+    ------
+    out : HTML
+        Write the page to this file.
+
+    Options
+    -------
+    save : FOLDER
+        Also write runs, models and tables to this folder.
+    square : FILE
+        Measured run to identify from.
+    sine : FILE
+        Measured run to validate on.
+    noise
+        Noise on every angle of the virtual rig [rad].
+    seed
+        Seed of that noise.
+    arms : ARM
+        Simulated arm for the verdicts; several, or all.
+    records
+        Records per arm, with different noise.
+    rivals_increment
+        Smallest increment in the comparison with the GA.
+    """
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
@@ -118,18 +147,27 @@ def reproduce(
 
 @command
 def orders(
+    files: list[str],
     *,
-    files: Files,
-    out: Page = "orders.html",
+    out: OutputFile = "orders.html",
     reading: ReadingOptions,
-    filtered: Annotated[
-        bool, Option("--filtered/--no-filtered", help="Whether deflections passed the stock low-pass.")
-    ] = True,
-    threads: Threads = None,
-    force: Force = False,
-    as_json: Json = False,
+    filtered: bool = True,
+    threads: int | None = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Compare integer and fractional orders of the arm's links by cross-validation over runs, as an HTML page."""
+    """Compare integer and fractional orders of the arm's links by cross-validation over runs, as an HTML page.
+
+    Output
+    ------
+    out : HTML
+        Write the page to this file.
+
+    Options
+    -------
+    filtered
+        Whether deflections passed the stock low-pass.
+    """
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
         found = cross_validate_orders(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
@@ -143,15 +181,23 @@ def orders(
 
 @command
 def app(
+    files: list[str] | None = None,
     *,
-    files: Annotated[list[str] | None, Argument(metavar="[FILE...]", help="Measured files to open.")] = None,
-    port: Annotated[
-        int | None,
-        Option(metavar="PORT", help=f"Port of 127.0.0.1; default {DEFAULT_PORT}, or a free one."),
-    ] = None,
-    browser: Annotated[
-        bool, Option("--browser/--no-browser", help="Open a browser, or only print the address.")
-    ] = True,
+    port: int | None = None,
+    browser: bool = True,
 ) -> None:
-    """Start the local web application for identification in a browser; Ctrl-C stops it."""
+    """Start the local web application for identification in a browser; Ctrl-C stops it.
+
+    Arguments
+    ---------
+    files : [FILE...]
+        Measured files to open.
+
+    Options
+    -------
+    port : PORT
+        Port of 127.0.0.1; default 8347, or a free one.
+    browser
+        Open a browser, or only print the address.
+    """
     serve(files or [], port=port, browser=browser)

@@ -5,44 +5,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Literal
-
-from typer import Argument, Option
+from typing import Any, Literal
 
 from ftlm.cli.framework import announce_reading, interval, pairs
 from ftlm.data.run import Run
 from ftlm.data.sampling import MissingPolicy
 from ftlm.errors import DataError, ModelError
+from ftlm.io.column_roles import ColumnSelection
 from ftlm.io.dialect import Layout
 from ftlm.io.load import LoadOptions, Signals, load_selection, run_paths, select_columns
-from ftlm.io.preview import OpenedFile, open_file
+from ftlm.io.preview import OpenedFile, preview_selection
 from ftlm.structure.structure import Structure
 
-#: Panels of options in a command's help.
-FILE_PANEL, STRUCTURE_PANEL, METHOD_PANEL, OUTPUT_PANEL = "File", "Structure", "Method", "Output"
-#: Types of optional options.
-Text = str | None
-Number = float | None
-Texts = list[str] | None
-
-Files = Annotated[list[str], Argument(metavar="FILE...", help="Measured files; several files are several runs.")]
-Force = Annotated[bool, Option("--force", rich_help_panel=OUTPUT_PANEL, help="Overwrite existing files.")]
-Json = Annotated[bool, Option("--json", rich_help_panel=OUTPUT_PANEL, help="Print the result as JSON.")]
 #: Options of a text file's layout; `layout_options` collects them from a dataclass.
-Separator = Annotated[
-    Literal["comma", "semicolon", "tab", "space"] | None,
-    Option(help="Separator of cells; default detected."),
-]
-Decimal = Annotated[Literal["point", "comma"] | None, Option(help="Decimal mark; default detected.")]
-Thousands = Annotated[
-    Literal["none", "point", "comma", "space", "apostrophe"] | None,
-    Option(help="Mark between groups of thousands; default detected."),
-]
-SkippedLines = Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default detected.")]
-HeaderLines = Annotated[
-    int | None, Option(metavar="0|1|2", help="Header lines: none, names, names and units; default detected.")
-]
-Sheet = Annotated[Text, Option(help="Sheet of a workbook.")]
 
 
 def layout_options(record: object) -> dict[str, Any]:
@@ -53,47 +28,60 @@ def layout_options(record: object) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """Options for reading files."""
+    """Options for reading files.
 
-    panel: ClassVar[str] = FILE_PANEL
+    File
+    ----
+    time
+        Time column; default found by its name.
+    time_unit
+        Unit of the time column; default its header's, or s.
+    step
+        Sampling interval [s] of files without a time column.
+    inputs : NAME=COLUMN
+        Input; NAME alone if the column has that name.
+    outputs : NAME=COLUMN
+        Output; NAME alone if the column has that name.
+    units : NAME=UNIT
+        Unit of a signal, such as deg.
+    columns : TOML
+        File that names columns and units.
+    intersample : NAME=zoh|foh
+        Hold of an input between samples; default zoh.
+    window : FROM:TO
+        Part of the run, in seconds [s] since its first row.
+    resample : STEP
+        Resample irregular rows to this step [s].
+    missing
+        Missing values; weight: outputs only, hold: inputs too.
+    encoding
+        Text encoding, such as cp1252; default detected.
+    dates
+        Order of day and month in ambiguous dates.
+    detrend
+        Subtract the mean or a straight line from every signal.
+    """
 
-    time: Annotated[Text, Option(help="Time column; default found by its name.")] = None
-    time_unit: Annotated[
-        Literal["s", "ms", "us", "min", "h"] | None, Option(help="Unit of the time column; default its header's, or s.")
-    ] = None
-    step: Annotated[Number, Option(help="Sampling interval [s] of files without a time column.")] = None
-    inputs: Annotated[
-        Texts, Option("-u", "--inputs", metavar="NAME=COLUMN", help="Input; NAME alone if the column has that name.")
-    ] = None
-    outputs: Annotated[
-        Texts, Option("-y", "--outputs", metavar="NAME=COLUMN", help="Output; NAME alone if the column has that name.")
-    ] = None
-    units: Annotated[Texts, Option(metavar="NAME=UNIT", help="Unit of a signal, such as deg.")] = None
-    columns: Annotated[Text, Option(metavar="TOML", help="File that names columns and units.")] = None
-    intersample: Annotated[
-        Texts, Option(metavar="NAME=zoh|foh", help="Hold of an input between samples; default zoh.")
-    ] = None
-    window: Annotated[Text, Option(metavar="FROM:TO", help="Part of the run, in seconds [s] since its first row.")] = (
-        None
-    )
-    resample: Annotated[Number, Option(metavar="STEP", help="Resample irregular rows to this step [s].")] = None
-    missing: Annotated[
-        MissingPolicy | None,
-        Option(help="Missing values; weight: outputs only, hold: inputs too."),
-    ] = None
-    encoding: Annotated[Text, Option(help="Text encoding, such as cp1252; default detected.")] = None
-    separator: Separator = None
-    decimal: Decimal = None
-    thousands: Thousands = None
-    skip: SkippedLines = None
-    header: HeaderLines = None
-    dates: Annotated[Literal["ymd", "dmy", "mdy"] | None, Option(help="Order of day and month in ambiguous dates.")] = (
-        None
-    )
-    sheet: Sheet = None
-    detrend: Annotated[
-        Literal["constant", "linear"] | None, Option(help="Subtract the mean or a straight line from every signal.")
-    ] = None
+    time: str | None = None
+    time_unit: Literal["s", "ms", "us", "min", "h"] | None = None
+    step: float | None = None
+    inputs: list[str] | None = None
+    outputs: list[str] | None = None
+    units: list[str] | None = None
+    columns: str | None = None
+    intersample: list[str] | None = None
+    window: str | None = None
+    resample: float | None = None
+    missing: MissingPolicy | None = None
+    encoding: str | None = None
+    separator: Literal["comma", "semicolon", "tab", "space"] | None = None
+    decimal: Literal["point", "comma"] | None = None
+    thousands: Literal["none", "point", "comma", "space", "apostrophe"] | None = None
+    skip: int | None = None
+    header: int | None = None
+    dates: Literal["ymd", "dmy", "mdy"] | None = None
+    sheet: str | None = None
+    detrend: Literal["constant", "linear"] | None = None
 
     def runs(
         self, files: Sequence[str] | None, structure: Structure | None = None, *, apart: bool = False
@@ -127,6 +115,10 @@ class ReadingOptions:
         return [self._load(path, signals) for path in paths]
 
     def _load(self, path: str | list[str], signals: Signals | None) -> Run:
+        return load_selection(path, *self._selection(), signals)
+
+    def _selection(self) -> tuple[ColumnSelection, LoadOptions]:
+        """Columns, layout and further arguments of :func:`ftlm.load`."""
         wanted = select_columns(
             self.columns,
             self.time,
@@ -137,32 +129,15 @@ class ReadingOptions:
             pairs("--intersample", self.intersample),
             layout_options(self),
         )
-        options = LoadOptions(self._window(), self.resample, None, self.time_unit, self.missing)
-        return load_selection(path, wanted, options, signals)
-
-    def _window(self) -> tuple[float | None, float | None] | None:
-        return None if self.window is None else interval(self.window, "--window", "1.1:19.5")
+        window = None if self.window is None else interval(self.window, "--window", "1.1:19.5")
+        return wanted, LoadOptions(window, self.resample, None, self.time_unit, self.missing)
 
     def preview_file(self, file: str) -> OpenedFile:
         """Preview a file that is not loaded as a run."""
         if self.detrend is not None:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
         announce_reading([file])
-        return open_file(
-            file,
-            time=self.time,
-            step=self.step,
-            inputs=pairs("-u", self.inputs) or None,
-            outputs=pairs("-y", self.outputs) or None,
-            units=pairs("--units", self.units),
-            columns=self.columns,
-            time_unit=self.time_unit,
-            intersample=pairs("--intersample", self.intersample),
-            layout=layout_options(self),
-            window=self._window(),
-            resample=self.resample,
-            missing=self.missing,
-        )
+        return preview_selection(file, *self._selection())
 
 
 def given_fields(*records: Any) -> dict[str, Any]:

@@ -9,15 +9,14 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import metadata
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import typer
-from typer import Option
 
 from ftlm import _core
 from ftlm.arm.flexible_link import flexible_link
-from ftlm.cli.framework import command, numbers, parse_numbers
-from ftlm.cli.reading_options import Force, Json, Number, Text, Texts, given_fields
+from ftlm.cli.framework import NonNegative, command, numbers, parse_numbers
+from ftlm.cli.reading_options import given_fields
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.linear import Streaming, estimate_coefficients
@@ -42,7 +41,10 @@ _READER_PACKAGES = {
 
 
 @command
-def doctor(*, as_json: Json = False) -> None:
+def doctor(
+    *,
+    as_json: bool = False,
+) -> None:
     """Print versions, cores, vector unit, and whether the rig's driver is installed."""
     about: dict[str, Any] = {
         "ftlm": _core.__version__,
@@ -74,14 +76,24 @@ def _installed_version(package: str) -> str | None:
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of the identification during a recording."""
+    """Options of the identification during a recording.
 
-    live: Annotated[
-        Text, Option(metavar="STRUCTURE", help="Identify while recording: flexible-link:1, :2, an equation.")
-    ] = None
-    orders: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix an order of --live; default the arm's.")] = None
-    innovation_length: Annotated[int | None, Option(help="Innovation length of --live; default 7.")] = None
-    prior_covariance: Annotated[Number, Option(help="Prior covariance of --live; default weak.")] = None
+    Options
+    -------
+    live : STRUCTURE
+        Identify while recording: flexible-link:1, :2, an equation.
+    orders : NAME=VALUE
+        Fix an order of --live; default the arm's.
+    innovation_length
+        Innovation length of --live; default 7.
+    prior_covariance
+        Prior covariance of --live; default weak.
+    """
+
+    live: str | None = None
+    orders: list[str] | None = None
+    innovation_length: int | None = None
+    prior_covariance: float | None = None
 
     def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
         """Return the streaming estimator for a rate [Hz] and a longest run [s]; None if not requested."""
@@ -134,39 +146,72 @@ class LiveOptions:
 @command
 def record(
     *,
-    out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Write the run to this .csv or .parquet file.")],
-    rig: Annotated[str, Option(help="Rig: virtual or q8.")] = "virtual",
-    shape: Annotated[str, Option("--input", help="square, sine, chirp, multisine, prbs, doublet or csv.")] = "square",
-    amplitude: Annotated[
-        str, Option(metavar="A or A1:A2", help="Amplitude of the current [A], of both motors or each.")
-    ] = "0.3",
-    period: Annotated[Number, Option(help="Period, or clock of a prbs [s].")] = None,
-    band: Annotated[str, Option(metavar="LOW:HIGH", help="Frequency band of chirp and multisine [Hz].")] = "0.1:20",
-    ramp: Annotated[float, Option(help="Time over which the amplitude grows [s].")] = 0.0,
-    file: Annotated[Text, Option(help="Currents I1, I2 [A] for --input csv.")] = None,
-    duration: Annotated[float, Option(help="Length of the run [s].")] = 10.0,
-    limit: Annotated[float, Option(help="Longest permitted run, at most 600 [s].")] = 30.0,
-    rate: Annotated[float, Option(help="Sampling rate [Hz].")] = 500.0,
-    seed: Annotated[int, Option(min=0, help="Seed of noise and random inputs.")] = 0,
-    parameters: Annotated[
-        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, measured-lqr, linear.")
-    ] = "effective",
-    offset: Annotated[
-        Text, Option(metavar="A1:A2", help="Virtual arm: current in addition to the command [A].")
-    ] = None,
-    real_time: Annotated[bool, Option("--real-time", help="Run the virtual rig in real time.")] = False,
-    sensor_filter: Annotated[
-        Literal["stock"] | None,
-        Option(metavar="stock", help="Record behind the stock 2 Hz low-pass filter; default none."),
-    ] = None,
-    watchdog: Annotated[float, Option(help="Time after which the motors are stopped [s].")] = 0.1,
-    arm: Annotated[bool, Option("--arm", help="Confirm that a real arm may move.")] = False,
-    board: Annotated[str, Option(help="Identifier of the Q8-USB board.")] = "0",
+    out: str,
+    rig: str = "virtual",
+    input: str = "square",
+    amplitude: str = "0.3",
+    period: float | None = None,
+    band: str = "0.1:20",
+    ramp: float = 0.0,
+    file: str | None = None,
+    duration: float = 10.0,
+    limit: float = 30.0,
+    rate: float = 500.0,
+    seed: NonNegative = 0,
+    parameters: str = "effective",
+    offset: str | None = None,
+    real_time: bool = False,
+    sensor_filter: Literal["stock"] | None = None,
+    watchdog: float = 0.1,
+    arm: bool = False,
+    board: str = "0",
     live: LiveOptions,
-    force: Force = False,
-    as_json: Json = False,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
-    """Run an experiment on a rig, simulated by default, and record it as a run."""
+    """Run an experiment on a rig, simulated by default, and record it as a run.
+
+    Options
+    -------
+    out : FILE
+        Write the run to this .csv or .parquet file.
+    rig
+        Rig: virtual or q8.
+    input
+        square, sine, chirp, multisine, prbs, doublet or csv.
+    amplitude : A or A1:A2
+        Amplitude of the current [A], of both motors or each.
+    period
+        Period, or clock of a prbs [s].
+    band : LOW:HIGH
+        Frequency band of chirp and multisine [Hz].
+    ramp
+        Time over which the amplitude grows [s].
+    file
+        Currents I1, I2 [A] for --input csv.
+    duration
+        Length of the run [s].
+    limit
+        Longest permitted run, at most 600 [s].
+    rate
+        Sampling rate [Hz].
+    seed
+        Seed of noise and random inputs.
+    parameters : NAME or TOML
+        Virtual arm: effective, measured, measured-lqr, linear.
+    offset : A1:A2
+        Virtual arm: current in addition to the command [A].
+    real_time
+        Run the virtual rig in real time.
+    sensor_filter : stock
+        Record behind the stock 2 Hz low-pass filter; default none.
+    watchdog
+        Time after which the motors are stopped [s].
+    arm
+        Confirm that a real arm may move.
+    board
+        Identifier of the Q8-USB board.
+    """
     currents = parse_numbers("--amplitude", amplitude, 1, 2)
     low, high = parse_numbers("--band", band, 2)
     shift = None if offset is None else parse_numbers("--offset", offset, 2)
@@ -179,7 +224,7 @@ def record(
         with Progress("recording", quiet=as_json) as progress:
             run = experiment.record(
                 rig,
-                input=shape,
+                input=input,
                 amplitude=(currents[0], currents[-1]),
                 period=period,
                 band=(low, high),

@@ -2,112 +2,34 @@
 
 from __future__ import annotations
 
-import math
+import csv
 import re
 import unicodedata
 from collections.abc import Mapping
+from pathlib import Path
 
 from ftlm.errors import DataError
 from ftlm.structure.expression import Expression
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import as_mapping, join_names, nearest
 
-#: SI unit and conversion factor of each accepted signal unit.
-SIGNAL_UNITS: dict[str, tuple[str, float]] = {
-    "": ("", 1.0),
-    "1": ("1", 1.0),
-    "rad": ("rad", 1.0),
-    "deg": ("rad", math.pi / 180.0),
-    "°": ("rad", math.pi / 180.0),
-    "mrad": ("rad", 1e-3),
-    "A": ("A", 1.0),
-    "mA": ("A", 1e-3),
-    "V": ("V", 1.0),
-    "mV": ("V", 1e-3),
-    "m": ("m", 1.0),
-    "cm": ("m", 1e-2),
-    "mm": ("m", 1e-3),
-    "s": ("s", 1.0),
-    "N": ("N", 1.0),
-    **dict.fromkeys(("N·m", "N⋅m", "N*m", "N.m", "Nm"), ("N·m", 1.0)),
-    **dict.fromkeys(("degC", "°C", "C"), ("degC", 1.0)),
-    "K": ("K", 1.0),
-    "rad/s": ("rad/s", 1.0),
-    "deg/s": ("rad/s", math.pi / 180.0),
-    "rpm": ("rad/s", 2.0 * math.pi / 60.0),
-    "m/s": ("m/s", 1.0),
-    "m/s^2": ("m/s^2", 1.0),
-    "m/s²": ("m/s^2", 1.0),
-    "g": ("m/s^2", 9.80665),
-    "Pa": ("Pa", 1.0),
-    "kPa": ("Pa", 1e3),
-    "W": ("W", 1.0),
-    "Hz": ("Hz", 1.0),
-    "hPa": ("Pa", 1e2),
-    "MPa": ("Pa", 1e6),
-    "mbar": ("Pa", 1e2),
-    "bar": ("Pa", 1e5),
-    "kN": ("N", 1e3),
-    "mN·m": ("N·m", 1e-3),
-    "mNm": ("N·m", 1e-3),
-    "kW": ("W", 1e3),
-    "kHz": ("Hz", 1e3),
-    "kV": ("V", 1e3),
-    "mm/s": ("m/s", 1e-3),
-    "km/h": ("m/s", 1.0 / 3.6),
-    "µm": ("m", 1e-6),
-    "µA": ("A", 1e-6),
-    "µV": ("V", 1e-6),
-}
-TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0, "h": 3600.0}
 
-#: Spellings of time units in column headers, case-folded.
-_TIME_UNIT_ALIASES = {
-    name: unit
-    for unit, names in {
-        "s": "s sec secs second seconds sekunde sekunden sek",
-        "ms": "ms msec millisecond milliseconds millisekunden millisec millisecs msek",
-        # Of both the micro sign and the letter mu, into which casefold turns it.
-        "us": "us μs usec microsecond microseconds mikrosekunden",
-        "µs": "µs",
-        "min": "min minute minutes minuten",
-        "h": "h hr hour hours stunden std",
-    }.items()
-    for name in names.split()
-}
-#: Spellings of signal units in files, case-folded and without spaces; "" marks known units without conversion.
-_SIGNAL_UNIT_ALIASES = {
-    name: unit
-    for unit, names in {
-        "deg": "degree degrees degs grad grd winkelgrad",
-        "rad": "radian radians radiant",
-        "deg/s": "°/s deg/sec dps grad/s grd/s degree/s degrees/s degrees/sec",
-        "rad/s": "rad/sec rads/s rad·s^-1",
-        "rpm": "rpm u/min 1/min r/min rev/min min^-1 min-1 upm u.p.m r.p.m",
-        "A": "amp amps ampere amperes",
-        "mA": "milliamp milliamps milliampere",
-        "V": "volt volts vdc",
-        "mV": "millivolt millivolts",
-        "m": "metre metres meter meters",
-        "cm": "centimetre centimeter zentimeter",
-        "mm": "millimetre millimetres millimeter millimeters",
-        "µm": "micron microns um",
-        "µA": "ua",
-        "µV": "uv",
-        "N": "newton newtons",
-        "N·m": "newtonmeter newtonmetre newtonmetres newtonmeters",
-        "degC": "celsius gradcelsius gradc degcelsius",
-        "K": "kelvin",
-        "W": "watt watts",
-        "Hz": "hertz",
-        "Pa": "pascal",
-        "m/s^2": "m/s2 m/s^2 m/s/s m/sec^2 m/sec2",
-        "m/s": "m/sec",
-        "": "% - db mhz mw kg l/min m3/h nm ohm ω mω kω ma 1/s s^-1 a.u none count counts lsb j kj ah vac vrms arms "
-        "degf °f ft inch psi lbf kgf gauss mpa mn",
-    }.items()
-    for name in names.split()
-}
+def _read_units(kind: str) -> list[tuple[str, str, float, list[str]]]:
+    """Return the units of signals or of time in ``units.csv``: name, SI unit, conversion factor and spellings."""
+    with Path(__file__).with_name("units.csv").open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["kind"] == kind]
+    return [(row["unit"], row["si"], float(row["factor"]), row["spellings"].split()) for row in rows]
+
+
+_SIGNAL_ROWS, _TIME_ROWS = _read_units("signal"), _read_units("time")
+#: SI unit and conversion factor of each accepted signal unit.
+SIGNAL_UNITS = {unit: (si, factor) for unit, si, factor, _ in _SIGNAL_ROWS}
+#: Seconds of each unit of time.
+TIME_UNITS = {unit: factor for unit, _, factor, _ in _TIME_ROWS}
+#: Unit of each spelling in column headers, case-folded, with both the micro sign and the letter mu, into which
+#: casefold turns it; those of signals without spaces, and "" for known units without conversion.
+_TIME_UNIT_ALIASES = {spelling: unit for unit, _, _, spellings in _TIME_ROWS for spelling in spellings}
+_SIGNAL_UNIT_ALIASES = {spelling: unit for unit, _, _, spellings in _SIGNAL_ROWS for spelling in spellings}
 _BRACKETED_UNIT_PATTERN = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
 _UNBRACKETED_UNIT_PATTERN = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*[/,]\s*(\S+)|\s+in\s+(\S+)|_(\S+))")
 _MAX_UNIT_CHARACTERS = 24

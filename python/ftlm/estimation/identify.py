@@ -50,7 +50,7 @@ from ftlm.estimation.nuisance_parameters import (
 from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
 from ftlm.estimation.result import Identification
 from ftlm.estimation.undetermined_start import undetermined_start_findings
-from ftlm.estimation.unstable_plants import SPLIT_CODES, WHOLE_RUN_CODES, unstable_plant_findings
+from ftlm.estimation.unstable_plants import SPLIT_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
 from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
@@ -517,7 +517,7 @@ def assess_fit(fit: Fit) -> Identification:
         fit, replace(model, estimate=_estimate(fit, comparison, None, ())), runs, comparison
     )
     if plant:
-        findings = [*plant, *(f for f in findings if f.code not in WHOLE_RUN_CODES)]
+        findings = [*plant, *(f for f in findings if not f.kind.judges_whole_run)]
     if any(f.code == "plant_unstable_in_pieces" for f in plant):
         # The residuals of simulations that grow say nothing of the model.
         tests, criteria = None, None

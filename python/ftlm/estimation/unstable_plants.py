@@ -32,20 +32,6 @@ MIN_PIECES, MAX_PIECES = 5, 40
 MAX_PIECE_RESIDUAL = 0.3
 #: Findings on plants that no simulation of a whole run follows.
 SPLIT_CODES = ("plant_needs_pieces", "plant_unstable_in_pieces")
-#: Findings on the simulation of a whole run, which an unstable plant does not allow.
-WHOLE_RUN_CODES = (
-    "free_run_grows",
-    "explains_little",
-    "flattered_by_equation_error",
-    "out_of_range",
-    "sampling_coarse",
-    "no_stable_optimum",
-    "instruments_unstable",
-    "unstable_optimum_kept",
-    "offset_missing",
-    "drift_fits",
-    "simulated_from_rest",
-)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.model_checks import join_names, stability_findings
 from ftlm.estimation.result import Identification
-from ftlm.findings import FINDING_TOPICS, LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding
+from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.statistics import NORMAL_95
@@ -36,39 +36,9 @@ MIN_FIT_GAIN = 0.5
 MAX_BURIED_RESIDUAL = 0.99
 #: Findings that explain a poor fit by the data.
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
-NOT_SEPARABLE_TOPIC = FINDING_TOPICS["not_separable"]
-#: Findings that name what a model lacks, and are reported before the residuals that show it.
-MISSING_PART_CODES = (
-    "dynamics_missing",
-    "delay_fits",
-    "lead_fits",
-    "lag_fits",
-    "zero_fits",
-    "mode_fits",
-    "saturation_fits",
-    "dead_zone_fits",
-    "square_fits",
-    "friction_fits",
-    "load_step_fits",
-    "drift_fits",
-    "offset_missing",
-)
+NOT_SEPARABLE_TOPIC = "not_separable"
 #: Findings on an unstable plant: simulations of whole runs do not judge its model.
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
-#: Topics that rules of the verdict cover, so that their findings alone are no reasons: a test of whiteness may fail by
-#: rounding alone, and a parameter may be uncertain, but not by much.
-RULED_TOPICS = (
-    "chaos",
-    "residuals",
-    "closed_loop",
-    "imprecise",
-    "not_separable",
-    "near_identity",
-    "poor_fit",
-    "validation_loss",
-    "unstable",
-    "overflow",
-)
 
 
 @dataclass(frozen=True)
@@ -162,7 +132,7 @@ def validation_with_verdict(result: Identification, comparison: Comparison) -> V
 def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
     """Return the verdict on a result, by the rules of :attr:`ftlm.Identification.verdict`.
 
-    Findings of weight that no rule covers count in the order of :data:`ftlm.findings.FINDING_TOPICS`.
+    Findings of weight that no rule covers count in the order of the topics in ``findings.toml``.
     """
     whole = not any(f.code == "runs_split" for f in result.findings)
     unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
@@ -230,7 +200,7 @@ def saved_findings(known: Estimate) -> list[Finding]:
     """Return all findings that speak against using a saved model, those recorded at the fit first."""
     found = [] if known.against is UNSET else list(known.against)
     unidentifiable = [n for n, e in known.standard_errors.items() if e is None]
-    if unidentifiable and not any(f.topic is NOT_SEPARABLE_TOPIC for f in found):
+    if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in found):
         found.append(
             make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
         )
@@ -254,7 +224,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     if unidentifiable and "run_forgets" not in codes:
         yield make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
     yield from (f for f in result.findings if f.code == "equation_says_identity")
-    yield from (f for f in result.findings if f.code in MISSING_PART_CODES)
+    yield from (f for f in result.findings if f.kind.names_missing_part)
     yield from _residuals(result)
     if joint is not None and not joint.converged and "not_converged" not in codes:
         yield make_finding("not_converged")
@@ -270,7 +240,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     if hidden:
         yield make_finding("offset_hidden", output=", ".join(hidden), shown=join_names(list(hidden)))
     for group in group_findings(result.findings):
-        if group.first_finding.kind.topic not in RULED_TOPICS and group.first_finding.level in (
+        if not group.first_finding.topic.has_rule and group.first_finding.level in (
             LEVEL_DO_NOT_USE,
             LEVEL_WITH_CARE,
         ):

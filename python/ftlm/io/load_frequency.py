@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ftlm.data.frequency_data import FREQUENCY_UNITS, FrequencyData, frequency_factor
+from ftlm.data.units import SIGNAL_UNITS, parse_unit
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import split_unit
 from ftlm.io.dialect import Layout
@@ -54,17 +55,7 @@ _MINUS_PREFIX_PATTERN = re.compile(r"^(?:-|−|–|neg|minus)")
 #: Ohm sign, a look-alike of the Greek letter.
 _OHM_SIGN = "\u2126"
 _SI_PREFIX_FACTORS = {"": 1.0, "m": 1e-3, "k": 1e3, "M": 1e6, "µ": 1e-6, "u": 1e-6, "G": 1e9}
-_PHASE_UNIT_FACTORS = {
-    "deg": np.pi / 180.0,
-    "°": np.pi / 180.0,
-    "degree": np.pi / 180.0,
-    "degrees": np.pi / 180.0,
-    "grad": np.pi / 180.0,
-    "rad": 1.0,
-    "radian": 1.0,
-    "radians": 1.0,
-    "mrad": 1e-3,
-}
+_PHASE_UNITS = ("deg", "rad", "mrad")
 _DIMENSIONLESS_UNITS = ("", "1", "-", "abs", "lin", "linear")
 #: Longer column names are not compared with the names of parts.
 _MAX_PART_NAME_CHARACTERS = 60
@@ -253,11 +244,17 @@ def _unit_kind(unit: str) -> str | None:
     """Return the quantity of a unit: ``frequency``, ``phase`` or ``size``; None if unknown."""
     if unit in FREQUENCY_UNITS or unit.casefold() in ("hz", "rad/s", "khz", "rad/sec", "1/s"):
         return "frequency"
-    if unit.casefold() in _PHASE_UNIT_FACTORS:
+    if _phase_unit(unit) is not None:
         return "phase"
     if unit.casefold() in ("db", "abs") or _ohms(unit) is not None:
         return "size"
     return None
+
+
+def _phase_unit(unit: str) -> str | None:
+    """Return the unit of a phase; None for other units."""
+    known = parse_unit(unit.casefold())
+    return "deg" if known == "°" else known if known in _PHASE_UNITS else None
 
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
@@ -370,9 +367,8 @@ def _polar(
             "part, which does not apply to magnitudes in dB; give real and imaginary part, or name the columns with "
             f"{parameter('columns', PART_COLUMNS)}"
         )
-    written = _PHASE_UNIT_FACTORS.get(angle.unit.casefold())
-    stated = None if written is None else "rad" if written == 1.0 else "mrad" if written == 1e-3 else "deg"
-    radians = _PHASE_UNIT_FACTORS[_resolve_unit("phase", angle, phase_unit, ("deg", "rad", "mrad"), stated, notes)]
+    stated = _phase_unit(angle.unit)
+    radians = SIGNAL_UNITS[_resolve_unit("phase", angle, phase_unit, _PHASE_UNITS, stated, notes)][1]
     factor, unit = (1.0, "") if decibels == "dB" else _magnitude_scale(size)
     if decibels == "dB":
         values = 10.0 ** (values / 20.0)

@@ -249,7 +249,11 @@ def open_file(
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
     wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
-    options = LoadOptions(window, resample, None, time_unit, missing)
+    return preview_selection(path, wanted, LoadOptions(window, resample, None, time_unit, missing))
+
+
+def preview_selection(path: PathLike, wanted: ColumnSelection, options: LoadOptions) -> OpenedFile:
+    """Preview a file with a selection of its columns."""
     (table,) = read_tables(path, wanted.layout)
     return _FilePreview(table, Pool([table]), wanted, options).result(os.fspath(path))
 

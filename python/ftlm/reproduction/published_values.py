@@ -63,21 +63,26 @@ class PublishedRow:
         return self.error, self.rmse, self.nr
 
 
+def read_paper_table(name: str) -> list[dict[str, str]]:
+    """Return the rows of a csv file beside this module, by column."""
+    with Path(__file__).with_name(name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def _read_rows() -> dict[tuple[str, str, str], PublishedRow]:
     """Return the rows of Tables 4 to 7 by table, angle and model."""
 
     def values(record: Mapping[str, str], names: Sequence[str]) -> dict[str, float]:
         return {name: Exact(record[name]) for name in names if record[name]}
 
-    with Path(__file__).with_name("published_tables.csv").open(encoding="utf-8", newline="") as file:
-        return {
-            (each["table"], each["angle"], each["model"]): PublishedRow(
-                values(each, ORDER_LETTERS),
-                values(each, COEFFICIENT_LETTERS),
-                **values(each, ("error", "rmse", "nr")),
-            )
-            for each in csv.DictReader(file)
-        }
+    return {
+        (each["table"], each["angle"], each["model"]): PublishedRow(
+            values(each, ORDER_LETTERS),
+            values(each, COEFFICIENT_LETTERS),
+            **values(each, ("error", "rmse", "nr")),
+        )
+        for each in read_paper_table("published_tables.csv")
+    }
 
 
 _ROWS_BY_PLACE = _read_rows()
@@ -95,21 +100,8 @@ TABLE_7_CRITERIA = {
     o: tuple(_ROWS_BY_PLACE["7", o, model].criteria for model in ("genetic", "multi-innovation")) for o in ANGLE_NAMES
 }
 #: Table 3: value and printed unit, with the paper's names.
-TABLE_3: dict[str, tuple[float, str]] = {
-    "L_1": (0.3493, "m"),
-    "L_2": (0.2975, "m"),
-    "J_11": (0.0635, "kg m²"),
-    "J_12": (0.1704, "kg m²"),
-    "B_11": (4.0, "Nm²"),
-    "B_12": (0.421, "Nm²"),
-    "J_21": (0.003, "kg m²"),
-    "J_22": (0.0064, "kg m²"),
-    "B_21": (1.5, "Nm²"),
-    "B_22": (0.856, "Nm²"),
-    "K_s1": (2.69, "Nm²"),
-    "K_s2": (0.463, "Nm²"),
-    "K_τ1": (0.119, "Nm²"),
-    "K_τ2": (0.0234, "Nm²"),
+TABLE_3 = {
+    each["parameter"]: (float(each["value"]), each["unit"]) for each in read_paper_table("published_parameters.csv")
 }
 
 

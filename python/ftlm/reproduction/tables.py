@@ -263,41 +263,20 @@ def fits_table(stage: Stage) -> Table:
     )
 
 
-#: Table 1: symbols, descriptions, and names in ftlm.
-SYMBOL_ROWS = (
-    ("θ₁₁, θ₂₁", "hub angles: how far each motor has turned", "theta11, theta21 [rad]"),
-    ("θ₁₂, θ₂₂", "deflection angles: how far each link bends at its root", "theta12, theta22 [rad]"),
-    ("I₁, I₂", "motor currents", "I1, I2 [A]"),
-    ("T₁, T₂", "motor torques, proportional to the currents", "LinkParameters.torque_constant [N m/A]"),
-    ("V", "viscoelastic potential energy of a link, (7)", "LinkParameters.stiffness"),
-    ("Tr₁₁, Tr₁₂, Tr", "kinetic energies of motor, link and both, (8), (9)", "hub_inertia, link_inertia"),
-    ("Q₁₁, Q₁₂", "generalized forces: motor, hub friction, link friction, (10), (11)", "hub_friction, link_friction"),
-    ("D^α θ", "highest derivative of an equation", "alpha1 … alpha4"),
-    ("D^γ θ₁₁, D^γ θ₂₁", "derivative of the hub angle in the hub's friction", "gamma1, gamma3 (gamma2, gamma4 follow)"),
-    ("D^β θ₁₂, D^β θ₂₂", "derivative of the deflection in the link's elasticity", "beta2, beta4 (beta1, beta3 follow)"),
-    ("D^μ θ₁₂, D^μ θ₂₂", "derivative of the deflection in the link's friction", "mu2, mu4 (mu1, mu3 follow)"),
-)
-#: Table 2: the seven steps with their functions.
-PROCEDURE_STEPS = (
-    ("Record currents and angles", "rig.record, load", "point samples with units"),
-    ("Choose M, make the operational matrix", "operational_matrix, haar_matrix", "truncated power series in its place"),
-    ("Form the integral equation, (38)", "flexible_link, equation", "divided by D^α, exactly"),
-    ("Expand the data in Haar wavelets, (39)", "haar_transform", "a change of basis; pulse means are equivalent"),
-    ("Vary the orders, coefficients by (44)", "search_orders, multi_innovation_trace", "closed form of (44)"),
-    ("Simulate, and sum the errors, (45)", "compare, simulate", "both errors, separately"),
-    ("Take the orders of the smallest error", "SearchResult.table, .model", "every candidate is counted"),
-)
-
-
 def description_tables() -> list[Table]:
     """Tables 1 and 2: symbols, and every step with its function."""
-    rows = [
-        [f"{k}. {step}", Markup(", ").join(Markup("<code>{}</code>").format(f) for f in functions.split(", ")), how]
-        for k, (step, functions, how) in enumerate(PROCEDURE_STEPS, 1)
+    steps = [
+        [
+            f"{k}. {each['step']}",
+            Markup(", ").join(Markup("<code>{}</code>").format(f) for f in each["functions"].split(", ")),
+            each["how"],
+        ]
+        for k, each in enumerate(printed.read_paper_table("paper_procedure.csv"), 1)
     ]
+    symbols = [list(each.values()) for each in printed.read_paper_table("paper_symbols.csv")]
     return [
-        Table("Table 1. Symbols", ("symbol", "what it is", "name here"), SYMBOL_ROWS, wrap=True),
-        Table("Table 2. The seven steps, with the functions of ftlm", ("step", "function", "how"), rows, wrap=True),
+        Table("Table 1. Symbols", ("symbol", "what it is", "name here"), symbols, wrap=True),
+        Table("Table 2. The seven steps, with the functions of ftlm", ("step", "function", "how"), steps, wrap=True),
     ]
 
 
