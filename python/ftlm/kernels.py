@@ -29,6 +29,7 @@ from ftlm.utils.validation import (
     check_integer,
     check_pulses,
     check_threads,
+    finite_floats,
     real_number,
     short_repr,
     whole_number,
@@ -112,7 +113,7 @@ def block_pulse_kernel(order: ArrayLike, m: int, *, step: float, derivative: boo
     -----
     O(m) an order.
     """
-    orders, pulses = _finite("order", order), check_pulses(m)
+    orders, pulses = finite_floats("order", order), check_pulses(m)
     kernels = _core.block_pulse_kernels(orders.ravel(), pulses, real_number("step", step), derivative=derivative)
     return kernels.reshape(*orders.shape, pulses)
 
@@ -148,7 +149,7 @@ def integrate(x: ArrayLike, order: ArrayLike, *, step: float) -> NDArray[np.floa
     O(m log m) an integral. Signals of one order share their kernel and its spectrum.
     Memory beyond the result is about one byte a value, and once more the result's if ``x`` is broadcast.
     """
-    values, orders = _finite("x", x), _finite("order", order)
+    values, orders = finite_floats("x", x), finite_floats("order", order)
     m = _length("x", values)
     lead = _broadcast({"x": values.shape[:-1], "order": orders.shape})
     distinct, groups = np.unique(np.broadcast_to(orders, lead), return_inverse=True)
@@ -258,7 +259,7 @@ def multi_innovation(
     Without ``trace`` the estimate is computed in closed form by QR, O(M k^2): row i of M has the weight
     min(p, M - i + 1).
     """
-    regressors, outputs = _finite("Q", Q), _finite("m", m)
+    regressors, outputs = finite_floats("Q", Q), finite_floats("m", m)
     if regressors.ndim < 2 or outputs.ndim < 1 or regressors.shape[-2] != outputs.shape[-1] or not outputs.shape[-1]:
         raise DataError(
             f"Q has shape {regressors.shape}, m {outputs.shape}; give (..., M, k) and (..., M) with M of at least 1"
@@ -300,7 +301,7 @@ def errors(measured: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
     DataError
         Measured values that are not finite real numbers, or shapes that do not broadcast.
     """
-    y, prediction = _finite("measured", measured), as_floats("predicted", predicted, gaps=True)
+    y, prediction = finite_floats("measured", measured), as_floats("predicted", predicted, gaps=True)
     m = _length("measured", y)
     if _length("predicted", prediction) != m:
         raise DataError(f"measured has shape {y.shape}, predicted {prediction.shape}; give arrays of one length")
@@ -353,7 +354,7 @@ class Candidates:
 
     @check_arguments
     def __init__(self, signals: ArrayLike, terms: Sequence[int], *, output: int = 0, step: float) -> None:
-        table = _finite("signals", signals)
+        table = finite_floats("signals", signals)
         if table.ndim != 2 or not table.size:
             raise DataError(f"signals has shape {table.shape}; give pulse means of shape (signals, M)")
         self._signals, self._terms = table, np.array(_signal_rows(terms, output, len(table)))
@@ -466,15 +467,16 @@ class Candidates:
         """
         table = self._orders(orders)
         check_choice("norm", norm, ("l1", "l2"))
+        highest = real_number("limit", limit)
+        if math.isnan(highest):
+            raise ModelError(f"{parameter('limit', limit)} is not a number; give one, or inf for none")
         if coefficients is None:
             found = self.coefficients(table, p=p, prior_covariance=prior_covariance, rows=rows)
         else:
             found = self._check_shape(as_floats("coefficients", coefficients, gaps=True), len(table))
         scores = np.full(len(table), np.inf)
         known = np.all(np.isfinite(found), axis=1)
-        scores[known] = self._points[norm].scores(
-            np.hstack([table, found])[known], real_number("limit", limit), check_threads(threads)
-        )
+        scores[known] = self._points[norm].scores(np.hstack([table, found])[known], highest, check_threads(threads))
         return scores, found
 
     @check_arguments
@@ -501,7 +503,7 @@ class Candidates:
         O(k M log M) a tuple and O(M log^2 M) for its own terms.
         """
         table = self._orders(orders)
-        numbers = self._check_shape(_finite("coefficients", coefficients), len(table))
+        numbers = self._check_shape(finite_floats("coefficients", coefficients), len(table))
         m, own = self._signals.shape[1], self._terms == self._output
         divisor = np.zeros((len(table), m))
         divisor[:, 0] = 1.0
@@ -534,7 +536,7 @@ class Candidates:
 
     def _orders(self, orders: ArrayLike) -> NDArray[np.float64]:
         """Return order tuples as a table."""
-        table = _finite("orders", orders)
+        table = finite_floats("orders", orders)
         width = 1 + len(self._terms)
         if table.ndim != 2 or table.shape[1] != width:
             raise DataError(f"orders has shape {table.shape}; give (N, {width}): alpha, then the order of each term")
@@ -644,7 +646,7 @@ class Recursion:
         fixed: Sequence[float | None] | None = None,
     ) -> None:
         rows = _signal_rows(terms, output, len(hold))
-        numbers = _finite("orders", orders)
+        numbers = finite_floats("orders", orders)
         if numbers.shape != (1 + len(rows),):
             raise DataError(
                 f"orders has shape {numbers.shape}; give ({1 + len(rows)},): alpha, then one order per term"
@@ -689,7 +691,7 @@ class Recursion:
         ConvergenceError
             A covariance that is no longer positive by rounding.
         """
-        table = _finite("samples", samples)
+        table = finite_floats("samples", samples)
         if table.ndim != 2 or table.shape[1] != self._count:
             raise DataError(f"samples has shape {table.shape}; give (n, {self._count}), one column per signal")
         return self._core.push(table)
@@ -716,20 +718,9 @@ def _signal_rows(terms: Sequence[int], output: int, count: int) -> list[int]:
     return [int(term) for term in terms]
 
 
-def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Return an array of finite real numbers."""
-    array = as_floats(name, values)
-    if not np.isfinite(array).all():
-        bad = np.argwhere(~np.isfinite(array))
-        raise DataError(
-            f"{name} is not finite at index {bad[0].tolist()} ({len(bad)} such values in all); remove or replace them"
-        )
-    return array
-
-
 def _rows(name: str, values: ArrayLike) -> tuple[NDArray[np.float64], tuple[int, ...]]:
     """Return signals as rows of a table, and the shape of their leading axes."""
-    array = _finite(name, values)
+    array = finite_floats(name, values)
     return array.reshape(-1, _length(name, array)), array.shape[:-1]
 
 
@@ -768,7 +759,7 @@ def _with_kernels(
 ) -> NDArray[np.float64]:
     """Apply ``work(kernels, rows, number of the kernel of each row)`` to broadcast kernels and vectors."""
     columns, of = _rows("kernel", kernel)
-    values = _finite(name, vectors)
+    values = finite_floats(name, vectors)
     m = _length(name, values)
     if columns.shape[1] != m:
         raise DataError(f"kernel has {columns.shape[1]} terms and {name} {m}; give kernels of the vectors' length")

@@ -216,7 +216,7 @@ BAD = {
     ),
     "NaN in a row": (
         DATA,
-        "x is not finite at index 4 (1 such values in all)",
+        "x is not finite at index [1, 4] (1 such values in all)",
         lambda: ftlm.fractional_derivative([Y, spoiled(4)], 0.5, step=1),
     ),
     "infinity before a transform": (

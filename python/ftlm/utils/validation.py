@@ -320,11 +320,31 @@ def as_complex(name: str, values: object) -> NDArray[np.complex128]:
         return np.asarray(array, dtype=np.complex128, order="C")
 
 
+def finite_floats(name: str, values: object) -> NDArray[np.float64]:
+    """Return a float64 array of finite real numbers.
+
+    Raises
+    ------
+    DataError
+        As :func:`as_floats`, and values that are not finite, with the first index and the count.
+    """
+    array = as_floats(name, values)
+    if not np.isfinite(array).all():
+        if array.ndim == 0:
+            raise DataError(f"{setting(name)} {array} is not finite; give a finite number")
+        bad = np.argwhere(~np.isfinite(array))
+        index = bad[0].tolist() if array.ndim > 1 else int(bad[0, 0])
+        raise DataError(
+            f"{name} is not finite at index {index} ({len(bad)} such values in all); remove or replace them"
+        )
+    return array
+
+
 def apply_along_axis(
     name: str, values: ArrayLike, axis: int, work: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> NDArray[np.float64]:
     """Apply ``work``, which maps rows to rows, along one axis of an array."""
-    array = as_floats(name, values)
+    array = finite_floats(name, values)
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
     moved = np.moveaxis(array, axis, -1)

@@ -47,7 +47,7 @@ pub(crate) struct SampledSimulation {
 
 /// Terms of an equation at a parameter point.
 struct Terms {
-    /// Distinct integration orders, and the place of each term in them.
+    /// Distinct integration orders η, and the index of each term's η among them.
     etas: Vec<f64>,
     places: Vec<usize>,
     coefficients: Vec<f64>,
@@ -58,9 +58,9 @@ struct Terms {
 /// Derivatives of the coefficient and of the integration order of each term with respect to a parameter.
 type Slopes = Vec<(f64, f64)>;
 
-/// One column of the design matrix: its samples are Σ of function × source.
+/// Response of an equation from rest to one input, with weights in place of the coefficients of that input's terms.
 struct Column {
-    /// Weight of each term, which replaces its coefficient, for a column of the response from rest.
+    /// Weight of each term of the equation. Weights of other terms are not used.
     weights: Vec<f64>,
     input: usize,
 }
@@ -332,8 +332,8 @@ fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: u
 }
 
 impl Run {
-    /// Samples of an equation from rest with each of these lists of weights of its input terms, and of its response to
-    /// each initial term.
+    /// Samples of an equation from rest, once for each list in `asked` of weights that replace its coefficients, and
+    /// samples of its response to each initial term t^e with e in `exponents`.
     fn responses(
         &self,
         experiment: &Experiment,
@@ -414,9 +414,9 @@ impl Run {
         self.columns(experiment, asked.len(), functions.iter().copied().zip(spectra))
     }
 
-    /// Compute the compared samples of columns from functions, each with its column and its input.
+    /// Compared samples of `count` columns, each the sum of the transforms of `functions` with its index.
     ///
-    /// A function without an input is a response of its own.
+    /// A transform with an input is multiplied by the jumps of that input. One without is the response to initial terms.
     fn columns(
         &self,
         experiment: &Experiment,
