@@ -76,6 +76,15 @@ Delay = Annotated[
     Option(metavar="INPUT=SECONDS", rich_help_panel=STRUCTURE_PANEL, help="Delay of an input; LOW:HIGH is estimated."),
 ]
 
+DrivenBy = Annotated[
+    Texts,
+    Option(
+        metavar="OUTPUT=SIGNAL,…",
+        rich_help_panel=STRUCTURE_PANEL,
+        help="With auto: signals that drive an output; default all inputs.",
+    ),
+]
+
 
 def methods_with(*options: str) -> tuple[str, ...]:
     """Return the names of the methods of estimation that have these options."""
