@@ -117,11 +117,15 @@ impl FrictionModel {
             if signal >= signals || self.equations.iter().any(|e| e.output == signal) {
                 return refuse("a free limit of what is no input", "limit inputs only");
             }
-            if law == InputLaw::Delay || self.inputs[..k].iter().any(|i| i.signal == signal) {
-                return refuse("a free delay beside friction, or two free numbers of an input", "give the delay");
+            if self.inputs[..k].iter().any(|i| i.signal == signal) {
+                return refuse("two free numbers of an input beside friction", "give one of them");
             }
-            if !(0.0 <= low && low <= high && high.is_finite()) {
-                return refuse("bounds of a limit that do not rise from 0", "give two rising values from 0");
+            let is_in_range = low.is_finite() && (low >= 0.0 || law == InputLaw::Delay);
+            if !(is_in_range && low <= high && high.is_finite()) {
+                return refuse(
+                    "bounds of a delay or limit that do not rise",
+                    "give two rising values, of a limit from 0",
+                );
             }
         }
         if self.order_bounds.iter().any(|(low, high)| low.is_nan() || high.is_nan() || low > high) {
@@ -223,7 +227,9 @@ impl FrictionModel {
         let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
         let mut bent = Vec::with_capacity(self.inputs.len());
         for (input, &value) in self.inputs.iter().zip(values) {
-            let (means, slope) = input.law.apply(&signals[input.signal], value, record.step(), 0.0)?;
+            let means = &signals[input.signal];
+            let before = if self.initial.is_at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
+            let (means, slope) = input.law.apply(means, value, record.step(), before)?;
             signals[input.signal] = means;
             bent.push(slope);
         }

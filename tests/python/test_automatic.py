@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,28 @@ def test_identify_and_select_find_the_same_model_by_auto(tmp_path: Path) -> None
     wrong = CliRunner().invoke(app, ["identify", *words, "--orders", "alpha=1"])
     assert wrong.exit_code == 2
     assert "--orders: options of a given structure, not used with --structure auto" in wrong.output
+
+
+def test_the_command_line_says_which_signals_drive_an_output(tmp_path: Path) -> None:
+    """Of two lags in series, the second one is driven by the first."""
+    chain = ftlm.equation("D y = -3 y + 3 u; D z = -1 z + 2 y")
+    g, rows = np.random.default_rng(4), 600
+    u = np.repeat(g.choice([-1.0, 1.0], size=rows // 20), 20)
+    drive = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": np.zeros(rows), "z": np.zeros(rows)})
+    run = ftlm.Model(replace(chain, coupling="simulated")).simulate(drive)
+    run = run.with_outputs({n: run[n] + 0.01 * np.std(run[n]) * g.normal(size=rows) for n in ("y", "z")})
+    run.to_csv(tmp_path / "chain.csv")
+    words = [str(tmp_path / "chain.csv"), "-u", "u", "-y", "y", "-y", "z", "--delay", "u=0", "--threads", "1"]
+    for command in ("identify", "select"):
+        found = CliRunner().invoke(app, [command, *words, "--structure", "auto", "--driven-by", "z=y"])
+        assert found.exit_code == 0, found.output
+        assert "D^1 z = a0_z z + b0_z y" in found.output, found.output
+        wrong = CliRunner().invoke(app, [command, *words, "--structure", "auto", "--driven-by", "z=v,u"])
+        assert wrong.exit_code == 2
+        assert "--driven-by: 'v' cannot drive z" in wrong.output
+        idle = CliRunner().invoke(app, [command, *words, "--structure", "D y = a y + b u", "--driven-by", "z=y"])
+        assert idle.exit_code == 2
+        assert "--driven-by is used with" in idle.output
 
 
 def controlled_record(seed: int, rows: int, time_constant: float, gain: float) -> ftlm.Run:

@@ -474,3 +474,13 @@ def test_gains_of_a_panel_of_first_rows():
     off = [v for key, off in wrong.items() if key[0] == "one lag too few" for v in off]
     assert beta.ppf(0.025, sum(off), len(off) - sum(off) + 1) <= 0.25
     assert 0.9 <= np.mean(covered) <= 0.99
+
+
+def test_a_level_is_found_on_a_record_that_is_too_long_for_the_offset_test(monkeypatch):
+    monkeypatch.setattr("ftlm.estimation.identify.MAX_OFFSET_TEST_SAMPLES", 100)
+    g = np.random.default_rng(5)
+    u = np.repeat(g.choice([-1.0, 1.0], 40), 25)
+    y = 30.0 + plant([1.2], [0.5, 1.0], u, 0.05) + 0.01 * g.standard_normal(u.size)
+    found = ftlm.identify(run_of(u, y, 0.05), ftlm.equation(WORDS))
+    assert "level_estimated" in codes(found)
+    assert gain_of(found) == pytest.approx(1.2, rel=0.01)

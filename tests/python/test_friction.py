@@ -258,13 +258,28 @@ def test_a_negative_coefficient_is_refused() -> None:
     ("options", "said"),
     [
         ({"initial": "history"}, "initial='caputo'"),
-        ({"delay": {"u": (0.0, 0.1)}}, "delay of u is free"),
         ({"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "u, which drives it, passed the sensor filter"),
     ],
 )
 def test_what_a_march_does_not_know_is_refused(options, said: str) -> None:
     with pytest.raises(ModelError, match=said):
         ftlm.equation(BLOCK, **options)
+
+
+@pytest.mark.parametrize("delay", [0.053, 0.06])
+def test_a_free_delay_is_estimated_beside_friction(delay: float) -> None:
+    """A delay within a row and one of whole rows, from bounds far from both."""
+    g, rows = np.random.default_rng(3), 1500
+    u = np.repeat(g.uniform(-3.0, 3.0, rows // 40 + 1), 40)[:rows]
+    quiet = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": np.zeros(rows)})
+    truth = ftlm.equation("D^2 y = - 2 D y + 10 u - 6*sign(D y)", delay={"u": delay})
+    y = ftlm.Model(truth).simulate(quiet)["y"]
+    run = quiet.with_outputs({"y": y + 0.01 * np.std(y) * g.standard_normal(rows)})
+    found = ftlm.identify(run, ftlm.equation("D^2 y = - a D y + b u(t - 0:0.2) - fc*sign(D y)"))
+    assert found.fit["y"] > 98.5
+    for name, value in {"a": 2.0, "b": 10.0, "fc": 6.0, "delay_u": delay}.items():
+        one = found.parameters[name]
+        assert abs(one.value - value) < 4.0 * one.standard_error < 0.05 * value
 
 
 def test_a_file_keeps_it(tmp_path) -> None:

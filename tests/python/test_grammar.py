@@ -130,8 +130,7 @@ def structures(draw):
             terms.append(f"{sign} {coefficient} {'' if order == '0' else f'D^{order} '}{signal}")
     friction = draw(st.sampled_from(["", " - fc*sign(D y)", " - 0.5 sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"]))
     limits = {}
-    delays = NUMBERS if friction else st.one_of(NUMBERS, INTERVALS)
-    delay = draw(st.dictionaries(st.just("v"), delays))
+    delay = draw(st.dictionaries(st.just("v"), st.one_of(NUMBERS, INTERVALS)))
     for kind, signal in (("saturation", "u"), ("dead_zone", "v")):
         if draw(st.booleans()) and signal not in delay:
             limits[kind] = {signal: draw(NUMBERS)}

@@ -419,7 +419,7 @@ def functions_behind():
         "inspect": reading,
         "doctor": (),
         "record": (run, Streaming, ftlm.equation),
-        "identify": (*estimation, ftlm.identify, ftlm.order_grid, *METHODS_BY_NAME.values()),
+        "identify": (*estimation, ftlm.identify, ftlm.select, ftlm.order_grid, *METHODS_BY_NAME.values()),
         "search": (*estimation, ftlm.identify, ftlm.search_orders, ftlm.order_grid),
         "certify": (*estimation, ftlm.identify, ftlm.certify_orders, ftlm.order_grid),
         "resume": (ftlm.resume_search,),

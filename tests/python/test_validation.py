@@ -299,5 +299,9 @@ def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monk
         patch.setattr(past, "simulate_samples", counted)
         assert past.runs_in_motion(model, [from_rest, cut]) == ["cut"]
     assert simulated == ["from rest", "from rest", "cut", "cut"]
+    with monkeypatch.context() as patch:
+        # The first part of a long run is enough.
+        patch.setattr(past, "MAX_START_SAMPLES", 200)
+        assert past.runs_in_motion(model, [from_rest, cut]) == ["cut"]
     asked = ftlm.Model(replace(model.structure, initial="history"))
     assert ftlm.compare(asked, cut).fit["y"] > ftlm.compare(model, cut).fit["y"] + 1.0

@@ -34,6 +34,8 @@ fixed : NAME=VALUE
     Fix a coefficient.
 delay : INPUT=SECONDS
     Delay of an input; LOW:HIGH is estimated.
+driven_by : OUTPUT=SIGNAL,…
+    With auto: signals that drive an output; default all inputs.
 
 Method
 ------

@@ -86,6 +86,7 @@ def select_structure(
     candidates: str | Structure | Sequence[Structure],
     shape: StructureOptions,
     *,
+    driven_by: list[str] | None = None,
     validation: str | Sequence[Run] | None = None,
     threads: int | None,
     store: str | None = None,
@@ -93,11 +94,12 @@ def select_structure(
 ) -> Selection:
     """Select a structure with a progress bar; ``"auto"`` takes the delays and the output of the options."""
     automatic, listed = isinstance(candidates, str), isinstance(candidates, list)
+    drivers = {name: text.split(",") for name, text in pairs("--driven-by", driven_by).items()}
     if automatic and shape.only is not None:
         runs = [run.select([shape.only, *run.inputs]) for run in runs]
     tried = [candidates] if isinstance(candidates, Structure) else candidates
     grown = (
-        [IntegerOrderForm(4, 3).structure(problem) for problem in automatic_problems(runs)]
+        [IntegerOrderForm(4, 3).structure(problem) for problem in automatic_problems(runs, driven_by=drivers)]
         if isinstance(tried, str)
         else tried
     )
@@ -109,6 +111,7 @@ def select_structure(
             candidates,
             validation=validation,
             delay=ranges("--delay", shape.delay) if automatic else None,
+            driven_by=drivers or None,
             threads=threads,
             # The number of candidates depends on which terms improve the prediction.
             progress=progress if listed else progress.so_far,
@@ -136,6 +139,7 @@ def identify(
     ranking: RankingOptions,
     weighting: MultiInnovationOptions,
     genetic: GeneticOptions,
+    driven_by: list[str] | None = None,
     m: int | None = None,
     threads: int | None = None,
     out: OptionalOutputFile = None,
@@ -163,6 +167,8 @@ def identify(
         Validate the model on this run.
     """
     equation = check_structures([structure], shape)
+    if driven_by and structure != "auto":
+        raise ModelError("--driven-by is used with --structure auto; give the terms to the equation instead")
     given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
     given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
     given |= {} if fit.start is None else {"start": load_model(fit.start)}
@@ -171,7 +177,9 @@ def identify(
     runs = reading.runs(files, equation)
     # The window is of the runs that are identified from.
     others = replace(reading, window=None).runs([validation], equation) if validation is not None else []
-    selection = select_structure(runs, "auto", shape, threads=threads, quiet=as_json) if structure == "auto" else None
+    selection = None
+    if structure == "auto":
+        selection = select_structure(runs, "auto", shape, driven_by=driven_by, threads=threads, quiet=as_json)
     wanted = shape.structure_for_runs(structure, runs) if selection is None else selection.structure
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(ranking.store, "the same command"), Progress(label, quiet=as_json) as progress:
@@ -528,6 +536,7 @@ def select(
     structures: list[str],
     reading: ReadingOptions,
     shape: StructureOptions,
+    driven_by: list[str] | None = None,
     validation: str | None = None,
     threads: int | None = None,
     store: str | None = None,
@@ -562,7 +571,14 @@ def select(
     judges = replace(reading, window=None).runs([str(validation)], equation) if of_its_own else validation
     with resumable(store, "the same command"):
         found = select_structure(
-            runs, candidates, shape, validation=judges, threads=threads, store=store, quiet=as_json
+            runs,
+            candidates,
+            shape,
+            driven_by=driven_by,
+            validation=judges,
+            threads=threads,
+            store=store,
+            quiet=as_json,
         )
     if out is not None:
         found.best.model.save(out, force=force)

@@ -163,13 +163,14 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     if moved is not None:
         return moved
     # In a nonlinear model a constant has no constant sensitivity: it determines where a body rests.
-    if fit.task.structure.offset != "none" or not structure.is_linear or not _is_testable(fit.task.runs):
+    if fit.task.structure.offset != "none" or not structure.is_linear:
         return hypotheses.take(structure, fit)
     shown = _shows_level(fit)
     level = _fit_with_level(fit, structure, hypotheses, shown=True) if shown else None
     if level is not None:
         return level
-    said = unrequested_offset_findings(fit_offset_test(fit), fit.model.outputs) or _history_offset_findings(fit)
+    test = fit_offset_test(fit) if _is_testable(fit.task.runs) else None
+    said = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
     started = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
     level = _fit_with_level(fit, structure, hypotheses, shown=False) if said and started and not shown else None
     if level is not None:

@@ -222,6 +222,10 @@ def measured_samples(model: Model, run: Run, every: int) -> Floats:
 REST_TEST_LEVEL = 0.01
 
 
+#: Samples of the first part of a run on which its start is tested: what was before it fades.
+MAX_START_SAMPLES = 1 << 15
+
+
 #: Nonzero initial conditions are reported if a history reduces the residual to this ratio, by at least this drop, and
 #: to at most this value, all in standard deviations of the output. A model with a larger residual from rest than the
 #: last value is not conclusive.
@@ -261,7 +265,9 @@ def _requires_history(left: Sequence[StartResiduals]) -> bool:
 
 
 def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
-    """Residuals of simulations from rest and with a history; None if they are not finite."""
+    """Residuals of the first samples from rest and with a history; None if they are not finite."""
+    if run.length > MAX_START_SAMPLES:
+        run = run.window(None, MAX_START_SAMPLES * run.step)
     ends, terms = [], 0
     for start in ("rest", history(run, structure)):
         model = Model(replace(structure, initial=start))

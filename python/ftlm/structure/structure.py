@@ -235,11 +235,6 @@ class Structure:
                 "before the filter, and what was filtered is not given back; let it follow from an equation of its "
                 f"own with {parameter('coupling', 'simulated')}, or leave it out of the filter"
             )
-        if self.free_delays:
-            raise ModelError(
-                f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in "
-                f"seconds, such as a fit without friction estimates it"
-            )
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
         held = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
         if held:

@@ -350,6 +350,9 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
     for fold in folds.parts:
         runs = fold.estimation_runs(structure.outputs)
         try:
+            if runs is not folds.runs and fold.rows is not None and _has_measured_drivers(structure):
+                validation[fold.name] = _validate_equations(structure, fold, joint, refine=fine)
+                continue
             own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
             validation[fold.name] = fold.fit(fitted_model(replace(own, initial=joint.initial), structure))
         except FtlmError as error:
@@ -375,6 +378,22 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         joint=joint,
         refined=fine,
     )
+
+
+def _has_measured_drivers(structure: Structure) -> bool:
+    """Whether measured outputs act as inputs of the equations of other outputs."""
+    others = ({*item.signals} - {item.output} for item in structure.equations)
+    return structure.coupling == "measured" and any(name in structure.outputs for names in others for name in names)
+
+
+def _validate_equations(structure: Structure, fold: Fold, joint: JointFit, *, refine: bool) -> dict[str, float]:
+    """Return the fits on a block, each equation refitted alone: its driving outputs are known where its own is not."""
+    fits: dict[str, float] = {}
+    for output in structure.outputs:
+        alone = replace(structure.equation(output), initial=joint.initial)
+        own = fit(fold.estimation_runs([output]), alone, [joint.values_by_name], refine=refine)
+        fits |= fold.fit(fitted_model(replace(own, initial=joint.initial), alone))
+    return fits
 
 
 def validation_score_bound(joint: JointFit, folds: Folds) -> float:

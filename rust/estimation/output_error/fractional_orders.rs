@@ -116,24 +116,29 @@ impl Terms {
     }
 }
 
-/// Initial terms c t^e of one equation: Laplace transform and its derivative with respect to each exponent.
-struct InitialTerms<'a> {
-    exponents: &'a [f64],
-    values: &'a [f64],
+/// Initial terms c t^e of one equation, which have the Laplace transforms c Γ(e + 1) s^−(e + 1).
+struct InitialTerms {
+    /// e + 1, c Γ(e + 1) and ψ(e + 1) of each term. These are needed at every s.
+    terms: Vec<(f64, f64, f64)>,
 }
 
-impl InitialTerms<'_> {
-    /// Σ c Γ(e + 1) s^−(e + 1), and its derivative with these derivatives of the exponents.
-    fn transform(&self, logarithm: Bin, slopes: &[f64]) -> (Bin, Bin) {
-        let (mut sum, mut slope) = (Bin::default(), Bin::default());
-        for (n, (&e, &c)) in self.exponents.iter().zip(self.values).enumerate() {
-            let term = integration(logarithm, e + 1.0) * (c * libm::tgamma(e + 1.0));
-            sum += term;
-            if let Some(by) = slopes.get(n).filter(|by| **by != 0.0) {
-                slope += term * (Bin::from(digamma(e + 1.0)) - logarithm) * by;
-            }
-        }
-        (sum, slope)
+impl InitialTerms {
+    fn new(exponents: &[f64], values: &[f64]) -> Self {
+        let of = |(e, c): (&f64, &f64)| (e + 1.0, c * libm::tgamma(e + 1.0), digamma(e + 1.0));
+        Self { terms: exponents.iter().zip(values).map(of).collect() }
+    }
+
+    /// Transform of each term; return their sum.
+    fn transforms(&self, logarithm: Bin, out: &mut Vec<Bin>) -> Bin {
+        out.clear();
+        out.extend(self.terms.iter().map(|&(power, weight, _)| integration(logarithm, power) * weight));
+        out.iter().sum()
+    }
+
+    /// Derivative of the sum of the transforms, with these derivatives of the exponents.
+    fn slope(&self, logarithm: Bin, transforms: &[Bin], slopes: &[f64]) -> Bin {
+        let parts = self.terms.iter().zip(transforms).zip(slopes).filter(|(_, by)| **by != 0.0);
+        parts.map(|((term, transform), by)| transform * (Bin::from(term.2) - logarithm) * by).sum()
     }
 }
 
@@ -278,12 +283,12 @@ impl FractionalOrders {
             for (i, structure) in structures.iter().enumerate() {
                 let terms = Terms::of(model, i, point)?;
                 let exponents = model.exponents(experiment, i, structure);
-                let initial = InitialTerms { exponents: &exponents, values: &at.initial[index][i] };
+                let initial = InitialTerms::new(&exponents, &at.initial[index][i]);
                 let asked: Vec<(Slopes, Vec<f64>)> = open
                     .iter()
                     .map(|&p| {
                         let moved = if p < orders {
-                            initial_exponent_slopes(model, (i, p), &point.orders, initial.values.len(), experiment)
+                            initial_exponent_slopes(model, (i, p), &point.orders, initial.terms.len(), experiment)
                         } else {
                             None
                         };
@@ -377,7 +382,7 @@ impl Run {
         &self,
         experiment: &Experiment,
         terms: &Terms,
-        initial: &InitialTerms<'_>,
+        initial: &InitialTerms,
         asked: &[(Slopes, Vec<f64>)],
     ) -> Vec<Vec<f64>> {
         let mut functions: Vec<(usize, Option<usize>)> = Vec::new();
@@ -386,7 +391,7 @@ impl Run {
                 |input: Option<usize>| (0..slopes.len()).any(|k| terms.inputs[k] == input && slopes[k] != (0.0, 0.0));
             let inputs = terms.signals().into_iter().map(Some);
             functions.extend(inputs.filter(|&input| acts(None) || acts(input)).map(|input| (place, input)));
-            if !initial.values.is_empty() && (acts(None) || moved.iter().any(|v| *v != 0.0)) {
+            if !initial.terms.is_empty() && (acts(None) || moved.iter().any(|v| *v != 0.0)) {
                 functions.push((place, None));
             }
         }
@@ -394,15 +399,16 @@ impl Run {
             input.map_or(0.0, |input| terms.start(input, |k| asked[place].0[k].0))
         };
         let starts: Vec<f64> = functions.iter().map(start).collect();
-        let mut powers = Vec::new();
+        let (mut powers, mut transforms) = (Vec::new(), Vec::new());
         let spectra = self.transform.spectra(&starts, |logarithm, values| {
             let response = terms.powers(logarithm, &mut powers);
             let held = integration(logarithm, 1.0);
+            let undriven = initial.transforms(logarithm, &mut transforms);
             for (value, &(place, input)) in values.iter_mut().zip(&functions) {
                 let (slopes, moved) = &asked[place];
                 let weight = |k: usize| Bin::from(slopes[k].0) - logarithm * (terms.coefficients[k] * slopes[k].1);
                 let (driven, changed) = match input {
-                    None => initial.transform(logarithm, moved),
+                    None => (undriven, initial.slope(logarithm, &transforms, moved)),
                     Some(_) => {
                         let sum = terms.sum(input, &powers, |k| terms.coefficients[k].into());
                         (sum * held, terms.sum(input, &powers, weight) * held)
