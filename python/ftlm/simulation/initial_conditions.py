@@ -132,7 +132,7 @@ _WHOLE_RUNS: WeakKeyDictionary[Run, Run] = WeakKeyDictionary()
 
 
 def share_start(masked: Run, whole: Run) -> None:
-    """Take the start of a run with masked outputs from its whole run: masked first rows do not set a plant in motion."""
+    """Take the start of a run with masked outputs from the whole run: masking rows does not set a plant in motion."""
     _WHOLE_RUNS[masked] = whole
 
 

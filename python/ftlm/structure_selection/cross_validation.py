@@ -52,24 +52,25 @@ class Fold:
 
     @property
     def leaves_excitation(self) -> bool:
-        """Whether an input changes outside the validation rows."""
+        """Whether an input changes outside the validation rows, unless none ever changes."""
+        inside = 0
         for run in self.runs:
-            rows = self.rows if run is self.validation_run and self.rows is not None else (0, 0)
+            masked = self.rows if run is self.validation_run and self.rows is not None else (0, 0)
             for name in run.inputs:
-                changes = np.flatnonzero(np.diff(run[name])) + 1
-                if np.any((changes < rows[0]) | (changes >= rows[1])):
+                rows = np.flatnonzero(np.diff(run[name])) + 1
+                within = np.count_nonzero((rows >= masked[0]) & (rows < masked[1]))
+                if within < rows.size:
                     return True
-        return not any(run.inputs for run in self.runs)
+                inside += within
+        return inside == 0
 
     @property
     def has_motion(self) -> bool:
         """Whether an output moves in the validation rows by more than its noise."""
         if self.rows is None:
             return True
-        pairs = [
-            (self.validation_run[n][slice(*self.rows)], self.validation_run[n]) for n in self.validation_run.outputs
-        ]
-        return any(float(np.nanstd(rows)) > math.sqrt(2.0) * white_noise(whole) for rows, whole in pairs)
+        pairs = [(self.validation_run[n], slice(*self.rows)) for n in self.validation_run.outputs]
+        return any(float(np.nanstd(y[rows])) > math.sqrt(2.0) * white_noise(y) for y, rows in pairs)
 
     def estimation_runs(self, outputs: Sequence[str]) -> Runs:
         """Runs for the fit, with the validation samples of the given outputs masked."""
@@ -196,8 +197,7 @@ class Folds:
         blocks = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
         # Without the only rows in which an input changes, a fit has nothing to identify the plant from, and noise about
         # a standstill shows no prediction.
-        excited = [fold for fold in blocks if fold.leaves_excitation] or blocks
-        parts = [fold for fold in excited if fold.has_motion] or excited
+        parts = [fold for fold in blocks if fold.leaves_excitation and fold.has_motion] or blocks
         return cls(every, tuple(parts), f"each of {len(parts)} blocks by a fit without its outputs")
 
     @classmethod
