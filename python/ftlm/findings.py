@@ -953,16 +953,11 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
     "starts_off_zero": FindingKind(
         "initial_conditions",
         LEVEL_FACT,
-        "output {output} starts at {level}, not at rest: initial terms will be estimated; if this is only a sensor "
-        "offset, subtract it, and start the run before the input moves",
+        "output {output} starts at {level}, not at 0: its level or its initial terms will be estimated; some rows at "
+        "rest before an input moves show which",
     ),
     "signal_constant": FindingKind(
         "data", LEVEL_FACT, "{signal} is constant ({level:g}): a dead channel, or nothing happened"
-    ),
-    "signal_in_motion": FindingKind(
-        "initial_conditions",
-        LEVEL_FACT,
-        "{output} does not start at rest (first value {level:.4g}): initial terms will be estimated",
     ),
     # Validation
     "validates_itself": FindingKind(
@@ -970,6 +965,13 @@ FINDING_CATALOGUE: dict[str, FindingKind] = {
         LEVEL_FACT,
         "its outputs are those of {other}, from which the model was identified, so it does not validate the model",
         prefix="{run}: ",
+    ),
+    "validates_partly_itself": FindingKind(
+        "repeated_run",
+        LEVEL_WITH_CARE,
+        "{count} of its {rows} rows are those of {other}, from which the model was identified: they do not validate it",
+        prefix="{run}: ",
+        remedy="validate on rows that were not fitted",
     ),
     "run_of_its_own": FindingKind(
         "repeated_run",

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, cast
 import typer
 from typer import Argument, Option
 
-from ftlm.cli.framework import EXIT_INTERRUPTED, command, numbers, pairs, print_text, ranges, show, show_json
+from ftlm.cli.framework import EXIT_INTERRUPTED, command, interval, numbers, pairs, print_text, ranges, show, show_json
 from ftlm.cli.options import (
     BlockPulses,
     CandidateTexts,
@@ -145,6 +145,29 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
     return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
 
 
+ValidationWindow = Annotated[
+    Text,
+    Option(
+        metavar="FROM:TO",
+        rich_help_panel=OUTPUT_PANEL,
+        help="Part of the validation run, in seconds [s]; default all of it.",
+    ),
+]
+
+
+def validation_runs(
+    reading: ReadingOptions, file: str | None, window: str | None, equation: Structure | None
+) -> list[Run]:
+    """Load the validation run, if there is one, from its own window: --window is that of the runs that are fitted."""
+    if file is None:
+        if window is not None:
+            raise ModelError("--validation-window is a part of the run that --validation names; name its file, too")
+        return []
+    if window is not None:
+        interval(window, "--validation-window", "1.1:19.5")
+    return replace(reading, window=window).runs([file], equation)
+
+
 @command
 def identify(
     *,
@@ -171,6 +194,7 @@ def identify(
     validation: Annotated[
         Text, Option(metavar="FILE", rich_help_panel=OUTPUT_PANEL, help="Validate the model on this run.")
     ] = None,
+    validation_window: ValidationWindow = None,
     force: Force = False,
     verbose: Verbose = False,
     as_json: Json = False,
@@ -183,8 +207,7 @@ def identify(
     given |= {} if fit.bounds is None else {"bounds": ranges("--bounds", fit.bounds)}
     chosen = method_with_options(method, given)
     runs = reading.runs(files, equation)
-    # The window is of the runs that are identified from.
-    others = replace(reading, window=None).runs([validation], equation) if validation is not None else []
+    others = validation_runs(reading, validation, validation_window, equation)
     selection = select_structure(runs, "auto", shape, threads=threads, quiet=as_json) if structure == "auto" else None
     wanted = shape.structure_for_runs(structure, runs) if selection is None else selection.structure
     label = "fitting" if method == "output-error" else "searching orders"
@@ -532,6 +555,7 @@ def select(
             help="Cross-validate over runs or quarters, or on another run.",
         ),
     ] = None,
+    validation_window: ValidationWindow = None,
     threads: Threads = None,
     store: StoreFile = None,
     out: Out = None,
@@ -544,9 +568,8 @@ def select(
     runs = reading.runs(files, equation)
     made = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
     candidates = "auto" if not made else made[0] if len(made) == 1 else made
-    # The window is of the runs that are fitted to.
-    of_its_own = validation not in (None, "runs", "blocks")
-    judges = replace(reading, window=None).runs([str(validation)], equation) if of_its_own else validation
+    of_its_own = validation if validation not in ("runs", "blocks") else None
+    judges = validation_runs(reading, of_its_own, validation_window, equation) or validation
     with resumable(store, "the same command"):
         found = select_structure(
             runs, candidates, shape, validation=judges, threads=threads, store=store, quiet=as_json
