@@ -34,6 +34,7 @@ from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
+from ftlm.validation.information_criteria import InformationCriteria, information_table
 
 DECIBELS_PER_NEPER = 20.0 / np.log(10.0)
 #: Points of a smooth curve over the measured band.
@@ -259,6 +260,9 @@ class FrequencyIdentification:
         Whether the residuals are white over frequency (99 %).
     findings
         Findings about the model.
+    information
+        AIC, AICc and BIC, which compare circuits or equations that were fitted to the same records with the same
+        weights; None if unknown. Real and imaginary parts are samples.
     """
 
     system: Model | Circuit
@@ -274,6 +278,7 @@ class FrequencyIdentification:
     start_counts: tuple[int, int]
     white: bool
     findings: tuple[Finding, ...] = field(default=())
+    information: InformationCriteria | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -435,6 +440,8 @@ class FrequencyIdentification:
             f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {tried} "
             "initial guesses ended here"
         )
+        if self.information is not None:
+            lines.append(str(self.information))
         return "\n".join(
             [
                 *lines,
@@ -509,7 +516,10 @@ class FrequencyIdentification:
         residuals = Section(
             "Residuals" if not new else "Residuals, and the fit to the estimation data",
             [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
-            tables=[Table("Error over the size of the measured response", heads, rows)],
+            tables=[
+                Table("Error over the size of the measured response", heads, rows),
+                *([] if self.information is None else [information_table(self.information)]),
+            ],
             figures=self.figures() if new else figures,
             small=True,
         )
@@ -529,7 +539,9 @@ class FrequencyIdentification:
             what = {"equations": [str(e) for e in self.system.equations]}
         names = ("weights", "values", "standard_errors", "intervals", "chi_squared", "errors", "converged")
         starts = {"starts": list(self.start_counts)}
-        return what | attributes(self, names) | starts | attributes(self, ("white", "findings", "warnings"))
+        return (
+            what | attributes(self, names) | starts | attributes(self, ("white", "information", "findings", "warnings"))
+        )
 
     def __str__(self) -> str:
         return self.summary()

@@ -274,10 +274,10 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
     samples = {n: run[n] - v for n, v in moved.items()}
     read = run.sample_times
     own = None if read is None else {n: read.data[n] - v for n, v in moved.items()}
-    moved = run.with_samples(samples, own)
+    shifted = run.with_samples(samples, own)
     if run in _WHOLE_RUNS:
-        share_start(moved, deviations(_WHOLE_RUNS[run], structure)[0])
-    return moved, levels
+        share_start(shifted, deviations(_WHOLE_RUNS[run], structure)[0])
+    return shifted, levels
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:

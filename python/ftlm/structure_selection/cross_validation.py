@@ -58,7 +58,7 @@ class Fold:
             masked = self.rows if run is self.validation_run and self.rows is not None else (0, 0)
             for name in run.inputs:
                 rows = np.flatnonzero(np.diff(run[name])) + 1
-                within = np.count_nonzero((rows >= masked[0]) & (rows < masked[1]))
+                within = int(np.count_nonzero((rows >= masked[0]) & (rows < masked[1])))
                 if within < rows.size:
                     return True
                 inside += within

@@ -561,7 +561,7 @@ def common_rows(one: Floats, other: Floats) -> int:
     Parts of one recording coincide from the first row of the later one on.
     """
     if one.shape == other.shape and np.array_equal(one, other, equal_nan=True):
-        return one.shape[1]
+        return int(one.shape[1])
     for earlier, later in ((one, other), (other, one)):
         first = next(iter(np.flatnonzero(np.any(np.diff(later) != 0.0, axis=0))), 0)
         head = later[:, first : first + ALIGNMENT_ROWS]
