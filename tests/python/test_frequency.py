@@ -367,3 +367,17 @@ def test_information_criteria_of_spectra_are_those_of_normal_residuals():
     poorer = ftlm.identify_frequency(cell, "R0-p(R1,C1)", weights="uniform")
     assert poorer.information.aicc > known.aicc + 10
     assert found.to_dict()["information"]["bic"] == pytest.approx(known.bic)
+
+
+def test_an_impedance_is_drawn_as_size_over_hertz():
+    f = np.geomspace(0.1, 1e3, 40)
+    z = 10.0 + 100.0 / (1 + 2j * np.pi * f * 0.01)
+    rng = np.random.default_rng(9)
+    z = z * (1 + 0.01 * (rng.standard_normal(40) + 1j * rng.standard_normal(40)))
+    for unit, wanted in (("Ω", ("|Z| [Ω]", "frequency [Hz]")), ("", ("gain [dB]", "frequency [rad/s]"))):
+        record = ftlm.FrequencyData.from_arrays(f, z, frequency_unit="Hz", unit=unit, output="U", input="I")
+        found = ftlm.identify_frequency(record, "D U = a U + r D I + b I")
+        drawn = " ".join(figure._repr_html_() for figure in found.figures())
+        assert all(label in drawn for label in wanted)
+        # The model has a covariance, so both kinds of chart have its band.
+        assert drawn.count("95 % band, from the covariance") == 2

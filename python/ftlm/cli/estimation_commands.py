@@ -569,6 +569,8 @@ def select(
     made = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
     candidates = "auto" if not made else made[0] if len(made) == 1 else made
     of_its_own = validation if validation not in ("runs", "blocks") else None
+    if of_its_own is not None and not Path(of_its_own).exists():
+        raise ModelError(f"--validation {of_its_own!r} is neither runs nor blocks nor a file; check the path")
     judges = validation_runs(reading, of_its_own, validation_window, equation) or validation
     with resumable(store, "the same command"):
         found = select_structure(

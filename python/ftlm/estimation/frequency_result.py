@@ -126,22 +126,60 @@ def curve_chart(
 
 
 def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
-    """Return gain and phase charts of a record and the model with its 95 % band."""
+    """Return gain and phase charts of a record and the model with its 95 % band; of an impedance |Z| over Hz."""
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
     figures = []
     for curve in bode_curves(model, record):
         dots = np.full(curve.omega.size, np.nan)
         dots[np.searchsorted(curve.omega, curve.measured_omega)] = curve.measured
         lines = [("model", curve.values), ("measured", dots)]
-        figures.append(curve_chart(f"{title}: {curve.kind}", curve.label, curve.omega, lines, curve.half_width))
+        if not is_impedance(record):
+            figures.append(curve_chart(f"{title}: {curve.kind}", curve.label, curve.omega, lines, curve.half_width))
+        else:
+            wide = curve.half_width
+            bands = [] if wide is None else [(curve.values - wide, curve.values + wide)]
+            figures.append(_impedance_chart(title, record.unit, curve, lines, bands))
     return figures
+
+
+def _impedance_chart(
+    title: str,
+    unit: str,
+    curve: ResponseCurve,
+    lines: Sequence[tuple[str, Floats]],
+    bands: Sequence[tuple[Floats, Floats]],
+) -> Figure:
+    """Return a chart of the size or the phase of an impedance over frequency in Hz."""
+    is_size = curve.kind == "gain"
+    if is_size:
+        lines = [(name, np.exp(values / DECIBELS_PER_NEPER)) for name, values in lines]
+        bands = [(np.exp(low / DECIBELS_PER_NEPER), np.exp(high / DECIBELS_PER_NEPER)) for low, high in bands]
+    return line_chart(
+        curve.omega / (2.0 * math.pi),
+        lines,
+        log_x=True,
+        log_y=is_size,
+        bands=bands,
+        title=f"{title}: {'|Z|' if is_size else curve.kind}",
+        dots=("measured",),
+        width=SMALL_WIDTH_PX,
+        height=220,
+        x_label="frequency [Hz]",
+        y_label=f"|Z| [{unit}]" if is_size else curve.label,
+        caption="Shade: 95 % band, from the covariance of the fit." if bands else "",
+    )
+
+
+def is_impedance(record: FrequencyData) -> bool:
+    """Whether a record is an impedance, by its unit."""
+    return record.unit.endswith("Ω")
 
 
 def nyquist_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Complex, Complex, str, str]:
     """Return the responses of the model and a record and both axis labels; impedances have -Im upwards."""
     response = model_response(model, record, curve_frequencies(record))
     unit = f" [{record.unit}]" if record.unit else ""
-    if record.unit.endswith("Ω"):
+    if is_impedance(record):
         return response.conj(), record.response.conj(), f"Re Z{unit}", f"−Im Z{unit}"
     return response, record.response, f"real part{unit}", f"imaginary part{unit}"
 
@@ -156,7 +194,7 @@ def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
 def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
     bode, nyquist = bode_figures(model, record), nyquist_figure(model, record)
-    return [nyquist, *bode] if record.unit.endswith("Ω") else [*bode, nyquist]
+    return [nyquist, *bode] if is_impedance(record) else [*bode, nyquist]
 
 
 def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
@@ -166,14 +204,15 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> F
     response = model_response(model, record, omega)
     size = np.abs(record.response[order])
     missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
+    hertz = is_impedance(record)
     return line_chart(
-        omega,
+        omega / (2.0 * math.pi) if hertz else omega,
         [("real part", missed.real), ("imaginary part", missed.imag)],
         log_x=True,
         width=SMALL_WIDTH_PX,
         height=220,
         title=f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: residuals",
-        x_label="frequency [rad/s]",
+        x_label="frequency [Hz]" if hertz else "frequency [rad/s]",
         y_label="model − measured [% of size]",
     )
 
