@@ -58,9 +58,9 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Guess inputs and outputs from column names; both are empty if the names are ambiguous.
 
     References are left out, and a command beside its own measurement, if the other columns have both roles. A single
-    column is an output.
+    column is an output, unless it has the name of an input.
     """
-    if len(columns) == 1:
+    if len(columns) == 1 and not words_of(columns[0]) & _WORDS_BY_ROLE["input"]:
         return [], list(columns)
     measured = {
         _tokens(c) - _WORDS_BY_ROLE["measurement"] for c in columns if _tokens(c) & _WORDS_BY_ROLE["measurement"]
@@ -71,8 +71,9 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         if not words_of(c) & _WORDS_BY_ROLE["reference"]
         and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in measured)
     ]
-    found = _roles_by_words(plant)
-    return found if found[1] else _roles_by_words(columns)
+    found, every = _roles_by_words(plant), _roles_by_words(columns)
+    # A reference and an output are those of a closed loop.
+    return every if not found[1] or (every[0] and not found[0]) else found
 
 
 def _tokens(column: str) -> frozenset[str]:
