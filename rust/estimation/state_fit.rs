@@ -298,7 +298,14 @@ impl<M: StateModel> LeastSquaresProblem for InitialStateProblem<'_, M> {
 /// Evaluations and tolerance of the estimate of an initial state.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 30, tolerance: 1e-6 };
 
-/// Initial state of a run at fixed parameters: best result of local optimizations from its first samples.
+/// Parts of a run whose samples are fitted in turn, from its first sample on, before the whole run.
+///
+/// Over a long motion an error of the initial state becomes an error of phase, or another number of swings before a body
+/// sticks, and the squared error of the whole run has minima far from the least. Over the beginning alone it has one.
+const FIRST_PARTS_OF_RUN: [f64; 3] = [0.125, 0.25, 0.5];
+
+/// Initial state of a run at fixed parameters: best result of local optimizations from its first samples, and from
+/// fits of ever longer beginnings of the run.
 fn estimate_initial_state<M: StateModel>(
     model: &M,
     (orders, coefficients, inputs): (&[f64], &[f64], &[f64]),
@@ -306,11 +313,21 @@ fn estimate_initial_state<M: StateModel>(
     stop: &Stop,
 ) -> Result<Vec<f64>> {
     let problem = InitialStateProblem { model, experiment, orders, coefficients, inputs, stop };
-    let guesses = model.state_guesses(orders, coefficients, experiment);
-    let mut best = (f64::INFINITY, guesses.first().cloned().unwrap_or_default());
-    if best.1.is_empty() {
-        return Ok(best.1);
+    let mut guesses = model.state_guesses(orders, coefficients, experiment);
+    let Some(first) = guesses.first().cloned().filter(|guess| !guess.is_empty()) else { return Ok(Vec::new()) };
+    let mut continued = first.clone();
+    for share in FIRST_PARTS_OF_RUN {
+        let beginning =
+            experiment.clone().with_weights(&experiment.weights, Some(&beginning_weights(experiment, share)))?;
+        let part = InitialStateProblem { experiment: &beginning, ..problem };
+        match minimize(&part, continued.clone(), INITIAL_STATE_SETTINGS) {
+            Ok(found) => continued = found.point,
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            _ => {}
+        }
     }
+    guesses.push(continued);
+    let mut best = (f64::INFINITY, first);
     for guess in guesses {
         match minimize(&problem, guess, INITIAL_STATE_SETTINGS) {
             Ok(found) if found.cost < best.0 => best = (found.cost, found.point),
@@ -320,6 +337,14 @@ fn estimate_initial_state<M: StateModel>(
         }
     }
     Ok(best.1)
+}
+
+/// Weights of the compared samples: 1 in the first part of a run, 0 after it.
+#[allow(clippy::cast_precision_loss)]
+fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
+    let count = experiment.compared_count();
+    let weight = |k: usize| if (k as f64) < share * count as f64 { 1.0 } else { 0.0 };
+    vec![(0..count).map(weight).collect(); experiment.samples.len()]
 }
 
 /// Least-squares fit with weights of the output error from an initial guess.

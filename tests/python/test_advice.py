@@ -270,3 +270,13 @@ def test_the_heating_system_does_not_start_at_rest():
     run = ftlm.Run.from_arrays(step=2.0, inputs={"u": table[:, 1]}, outputs={"T": table[:, 2]}, units={"T": "degC"})
     assert run.advice().codes == ("starts_off_zero",)
     assert "129.3 degC" in str(run.advice())
+
+
+def test_a_command_has_no_quantization():
+    y = np.round(np.sin(0.1 * np.arange(200)), 2)
+    signals = {"inputs": {"u": np.sign(y) + 2.0}, "outputs": {"y": y + 1.0}}
+    figures = {s.name: s for s in ftlm.Run.from_arrays(step=0.1, **signals).inspect().signals}
+    assert figures["u"].quantum == 0.0
+    assert figures["y"].quantum == pytest.approx(0.01)
+    measured = ftlm.Run.from_arrays(step=0.1, **signals, intersample={"u": "foh"}).inspect()
+    assert {s.name: s.quantum for s in measured.signals}["u"] == pytest.approx(1.0)

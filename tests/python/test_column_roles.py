@@ -115,4 +115,20 @@ def test_a_file_with_outputs_alone_is_a_free_response(tmp_path):
     path.write_text("time,angle\n" + "\n".join(f"{t:.12g},{y:.12g}" for t, y in zip(time, angle, strict=True)) + "\n")
     run = ftlm.load(path)
     assert (run.inputs, run.outputs) == ((), ("angle",))
-    assert any("nothing drives 'angle', by the names of the columns" in w for w in run.warnings)
+    assert any("nothing drives 'angle', the only signal" in w for w in run.warnings)
+
+
+@pytest.mark.parametrize(
+    ("names", "inputs", "outputs"),
+    [
+        (["t", "x (mm)"], (), ("x",)),
+        (["t", "Vin", "Vout"], ("Vin",), ("Vout",)),
+        (["time (min)", "pump speed (%)", "pressure (bar)"], ("pump_speed",), ("pressure",)),
+    ],
+)
+def test_roles_of_names_on_a_bench(tmp_path, names, inputs, outputs):
+    path = tmp_path / "bench.csv"
+    rows = [",".join(str(v) for v in (0.1 * k, k % 7, k % 5)[: len(names)]) for k in range(60)]
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")
+    run = ftlm.load(path)
+    assert (run.inputs, run.outputs) == (inputs, outputs)

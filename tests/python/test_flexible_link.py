@@ -387,3 +387,16 @@ def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or
     )
     assert b"hints" not in RECORD_ENCODER.encode(job.request("theta11"))
     assert set(structure.equation("theta11").order_names) == {"alpha1", "beta1", "gamma1", "mu1"}
+
+
+def test_a_bound_of_a_coefficient_that_a_law_sets_is_refused_by_the_law():
+    structure = ftlm.flexible_link(stage=1, laws=("orders", "coefficients"))
+    run = ftlm.Run.from_arrays(
+        step=0.01,
+        inputs={"I1": np.ones(50)},
+        outputs={"theta11": np.linspace(0, 1, 50) ** 2, "theta12": np.linspace(0, 1, 50) ** 3},
+    )
+    with pytest.raises(
+        ftlm.ModelError, match=r"a2, which follows from the coefficient law a2 = - a1 j1; bound 'a1', or"
+    ):
+        ftlm.identify(run, structure, bounds={"a2": (0.0, 1.0)})

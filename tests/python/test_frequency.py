@@ -338,3 +338,46 @@ def test_coefficients_that_ran_away_have_a_stability_that_cannot_be_told_not_an_
     count, on_axis = right_zeros({0.0: 1e200, 0.5: 1.0})
     assert np.isnan(count)
     assert on_axis
+
+
+def test_information_criteria_of_spectra_are_those_of_normal_residuals():
+    rng = np.random.default_rng(7)
+    f = np.geomspace(0.1, 1e3, 40)
+    s = 2j * np.pi * f
+    z = 0.01 + 0.05 / (1 + (s * 0.01) ** 0.8)
+    noise = 1e-4 * (rng.standard_normal(40) + 1j * rng.standard_normal(40))
+    cell = ftlm.FrequencyData.from_arrays(f, z + noise, frequency_unit="Hz", unit="Ω")
+    found = ftlm.identify_frequency(cell, "R0-p(R1,CPE1)", weights="uniform")
+    left = cell.response - found.circuit.impedance(cell.frequency)
+    parts = np.concatenate([left.real, left.imag])
+    level = np.sqrt(np.mean(parts**2))
+    likelihood = np.sum(-0.5 * np.log(2 * np.pi * level**2) - 0.5 * (parts / level) ** 2)
+    known = found.information
+    # R0, R1, Q, alpha and the level of the noise.
+    assert (known.parameters, known.samples) == (5, 80)
+    assert known.log_likelihood == pytest.approx(likelihood, rel=1e-9)
+    assert known.aic == pytest.approx(10 - 2 * likelihood, rel=1e-9)
+    assert known.bic == pytest.approx(5 * np.log(80) - 2 * likelihood, rel=1e-9)
+    stated = ftlm.FrequencyData.from_arrays(f, z + noise, frequency_unit="Hz", unit="Ω", deviation=np.full(40, 1e-4))
+    given = ftlm.identify_frequency(stated, "R0-p(R1,CPE1)")
+    left = stated.response - given.circuit.impedance(stated.frequency)
+    squares = np.sum(np.abs(left / 1e-4) ** 2)
+    assert given.information.parameters == 4
+    assert given.information.log_likelihood == pytest.approx(-40 * np.log(2 * np.pi * 1e-8) - 0.5 * squares, rel=1e-9)
+    poorer = ftlm.identify_frequency(cell, "R0-p(R1,C1)", weights="uniform")
+    assert poorer.information.aicc > known.aicc + 10
+    assert found.to_dict()["information"]["bic"] == pytest.approx(known.bic)
+
+
+def test_an_impedance_is_drawn_as_size_over_hertz():
+    f = np.geomspace(0.1, 1e3, 40)
+    z = 10.0 + 100.0 / (1 + 2j * np.pi * f * 0.01)
+    rng = np.random.default_rng(9)
+    z = z * (1 + 0.01 * (rng.standard_normal(40) + 1j * rng.standard_normal(40)))
+    for unit, wanted in (("Ω", ("|Z| [Ω]", "frequency [Hz]")), ("", ("gain [dB]", "frequency [rad/s]"))):
+        record = ftlm.FrequencyData.from_arrays(f, z, frequency_unit="Hz", unit=unit, output="U", input="I")
+        found = ftlm.identify_frequency(record, "D U = a U + r D I + b I")
+        drawn = " ".join(figure._repr_html_() for figure in found.figures())
+        assert all(label in drawn for label in wanted)
+        # The model has a covariance, so both kinds of chart have its band.
+        assert drawn.count("95 % band, from the covariance") == 2

@@ -387,3 +387,13 @@ def test_a_free_order_stays_where_friction_has_a_velocity() -> None:
     assert found.orders["alpha"] == pytest.approx(2.0, abs=0.05)
     assert found.coefficients["fc"] == pytest.approx(0.8, abs=0.08)
     assert found.model.structure.equations[0].friction.strength == found.coefficients["fc"]
+
+
+def test_the_initial_values_of_a_long_ring_down_are_found() -> None:
+    # Far from its rest the squared error over the whole run has a second minimum, another half swing before it sticks.
+    truth = ftlm.Model(ftlm.equation("D^2 x = -0.1 D x - 100 x - 0.5*sign(D x)"))
+    rest = ftlm.Run.from_arrays(step=0.01, inputs={}, outputs={"x": np.zeros(1000)})
+    x = truth.simulate(rest, initial={"x": {0.0: 0.1}})["x"] + 2e-5 * np.random.default_rng(1).standard_normal(1000)
+    found = truth.compare(rest.with_outputs({"x": x}))
+    assert found.initial[0]["x"][0.0] == pytest.approx(0.1, rel=1e-3)
+    assert found.output_error["x"].rmse == pytest.approx(2e-5, rel=0.1)

@@ -385,7 +385,19 @@ def test_commands_speak_of_their_options(saved, tmp_path):
 
 #: Flags that belong to the command line alone: where results go, how they are shown, what is done around a call.
 COMMAND_LINE_FLAGS = {
-    *("json", "verbose", "force", "out", "report", "help", "validation", "min-fit", "only", "detrend"),
+    *(
+        "json",
+        "verbose",
+        "force",
+        "out",
+        "report",
+        "help",
+        "validation",
+        "validation-window",
+        "min-fit",
+        "only",
+        "detrend",
+    ),
     *(
         "plot",
         "trajectory",
@@ -497,3 +509,19 @@ def test_help_texts_are_short():
             text = (getattr(option, "help", None) or "").rstrip(".")
             text = re.sub(r"; default .*| \[[^\]]*\]$", "", text)
             assert len(text) <= 60, (name, option.name, len(text), text)
+
+
+def test_a_validation_run_has_its_own_window(tmp_path, small_run, saved):
+    words = ["identify", saved, "--structure", FREE, "--method", "least-squares", "--order-grid", "alpha=1.6:1.6:0.1"]
+    half = small_run.duration / 2
+    shown = run_command(*words, "--validation", saved, "--validation-window", f"0:{half}", "--json")
+    assert shown.exit_code == 0, shown.output
+    (checked,) = json.loads(shown.stdout)["validation"]["runs"]
+    assert checked["output_error"]["y"]["fit"] is not None
+    alone = run_command(*words, "--validation-window", "0:1")
+    assert alone.exit_code == 2
+    assert "--validation-window is a part of the run that --validation names" in alone.stderr
+    assert (
+        "--validation-window '3' is not FROM:TO"
+        in run_command(*words, "--validation", saved, "--validation-window", 3).stderr
+    )

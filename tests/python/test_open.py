@@ -34,7 +34,8 @@ from test_unknown_files import command
         (["u", "a", "b"], ([], [])),
         # A motor's current follows its voltage, a cell's voltage its current.
         (["Current [A]", "Voltage [V]"], ([], [])),
-        (["y"], ([], [])),
+        (["y"], ([], ["y"])),
+        (["u"], ([], [])),
         ([], ([], [])),
     ],
 )

@@ -12,6 +12,7 @@ from ftlm.reproduction.cross_validation import (
     cross_validate_orders,
     cross_validation_page,
     cross_validation_text,
+    dead_channel_notes,
     link_structure,
     rate_effect_table,
     stages_in,
@@ -279,3 +280,21 @@ def test_what_cannot_be_done_is_said_before_any_work(fractional, tmp_path, words
     assert message in ran.stderr
     assert ran.stdout == ""
     assert not (tmp_path / "orders.html").exists()
+
+
+def test_angles_that_were_zeroed_at_first_are_noted():
+    rng = np.random.default_rng(8)
+    moving = rng.standard_normal((2, 600)).cumsum(axis=1) * 1e-3
+    zeroed = np.where(np.arange(600) < 100, 0.0, moving[1])
+    runs = [
+        ftlm.Run.from_arrays(
+            step=0.01,
+            inputs={"I1": np.diff(moving[0], prepend=1.0)},
+            outputs={"theta11": moving[0], "theta12": y},
+            name=name,
+        )
+        for name, y in (("whole", moving[1]), ("zeroed", zeroed))
+    ]
+    (note,) = dead_channel_notes(runs, (1,))
+    assert note.startswith("run zeroed: output theta12 is exactly 0")
+    assert "--window" in note or "window=" in note

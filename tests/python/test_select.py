@@ -597,3 +597,46 @@ def test_a_fit_below_all_measure_keeps_its_column():
         "< -1000",
         "nan",
     ]
+
+
+def heated_plate(seed: int) -> ftlm.Run:
+    """A plate at 21.4 °C that is heated from row 24 on; it is warm after half of the run."""
+    t = np.arange(480) * 5.0
+    truth = ftlm.Model(ftlm.equation("D y = -0.004 y + 0.0024 u"))
+    power = np.where(t >= 120.0, 50.0, 0.0)
+    still = ftlm.Run.from_arrays(step=5.0, inputs={"u": power}, outputs={"y": 0 * t})
+    y = 21.4 + truth.simulate(still)["y"] + 0.05 * np.random.default_rng(seed).standard_normal(t.size)
+    return still.with_outputs({"y": y})
+
+
+def test_blocks_that_tell_nothing_are_no_folds():
+    # The first quarter has the only step, and nothing moves in the last.
+    folds = Folds.of(heated_plate(1), "blocks")
+    assert [f.rows for f in folds.parts] == [(120, 240), (240, 360)]
+    # Every quarter of a plant that is excited throughout is a fold.
+    assert len(Folds.of(motor(2), "blocks").parts) == 4
+
+
+def test_one_step_from_a_level_selects_the_plant():
+    found = ftlm.select(heated_plate(2), "auto", threads=2)
+    assert not {"none_is_the_machine", "worse_than_mean"} & {f.code for f in found.findings}
+    assert found.best.model.dcgain() == pytest.approx(0.6, rel=0.01)
+
+
+def test_a_masked_beginning_leaves_the_level_of_a_run_at_rest():
+    # In motion about (40, 3.2) with time constant 45 rows: the first block is predicted from the other three.
+    rng = np.random.default_rng(3)
+    u = 40.0 + np.repeat(rng.choice([-10.0, 0.0, 10.0, 20.0], 20), 40)
+    u[:40] = 40.0
+    truth = ftlm.Model(ftlm.equation("D y = -0.5 y + 0.04 u"))
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u - 40.0}, outputs={"y": 0 * u})
+    y = 3.2 + truth.simulate(run)["y"] + 0.005 * rng.standard_normal(u.size)
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y})
+    structure = ftlm.equation("D y = a y + b u", offset="level")
+    fold = Folds.of(run, "blocks").parts[0]
+    masked = fold.estimation_runs(["y"])[0]
+    assert fold.rows == (0, 200)
+    assert np.isnan(masked["y"][:200]).all()
+    found = ftlm.identify(masked, structure)
+    assert found.coefficients == pytest.approx({"a": -0.5, "b": 0.04}, rel=0.02)
+    assert fold.fit(found.model)["y"] > 97.0

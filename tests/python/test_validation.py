@@ -11,7 +11,7 @@ import oracles
 from ftlm import _core
 from ftlm.simulation import output_samples as past
 from ftlm.simulation.output_samples import simulate_samples
-from ftlm.validation.comparison import compare_means, near_identity_findings
+from ftlm.validation.comparison import common_rows, compare_means, near_identity_findings
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The four figures
@@ -305,3 +305,34 @@ def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monk
         assert past.runs_in_motion(model, [from_rest, cut]) == ["cut"]
     asked = ftlm.Model(replace(model.structure, initial="history"))
     assert ftlm.compare(asked, cut).fit["y"] > ftlm.compare(model, cut).fit["y"] + 1.0
+
+
+def test_rows_that_two_parts_of_a_recording_share():
+    y = np.random.default_rng(5).standard_normal((1, 200)).cumsum(axis=1)
+    y[:, :20] = 0.0
+    assert common_rows(y, y) == 200
+    assert common_rows(y[:, :100], y) == common_rows(y, y[:, :100]) == 100
+    assert common_rows(y[:, :100], y[:, 60:]) == common_rows(y[:, 60:], y[:, :100]) == 40
+    # Rows one after the other, another recording, and rests of different recordings share nothing.
+    assert common_rows(y[:, :100], y[:, 100:]) == 0
+    assert common_rows(y, y + 0.1) == 0
+    assert common_rows(np.zeros((1, 100)), y) == 0
+
+
+def test_a_validation_on_fitted_rows_is_with_care():
+    rng = np.random.default_rng(6)
+    u = np.repeat(rng.choice([-1.0, 1.0], 40), 25)
+    plant = ftlm.Model(ftlm.equation("D y = -2 y + 2 u"))
+    run = plant.simulate(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u}))
+    run = run.with_outputs({"y": run["y"] + 0.01 * rng.standard_normal(u.size)})
+    found = ftlm.identify(run.window(0, 10), ftlm.equation("D y = a y + b u"))
+    clean, partly = found.validate(run.window(10, 20)), found.validate(run.window(5, 15))
+    assert clean.verdict.trusted
+    assert not partly.verdict.trusted
+    (shared,) = (f for f in partly.findings if f.code == "validates_partly_itself")
+    assert (shared.numbers["count"], shared.numbers["rows"]) == (250, 500)
+    # The state at the start of a run in motion is estimated on it, and the summary says so.
+    terms = sum(map(len, clean.initial[0].values()))
+    assert terms
+    assert f"estimated on them (their number): {clean.per_run[0][0]} ({terms})" in found.summary(clean)
+    assert "initial terms estimated on each run (their number)" in str(found.model.compare(run.window(10, 20)))

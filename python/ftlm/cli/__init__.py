@@ -54,6 +54,8 @@ force
     Overwrite existing files.
 as_json
     Print the result as JSON.
+validation_window : FROM:TO
+    Part of the validation run, in seconds [s]; default all of it.
 out : FILE
     Write the model to this .json file.
 report : HTML

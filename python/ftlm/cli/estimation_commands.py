@@ -16,6 +16,7 @@ from ftlm.cli.framework import (
     OptionalOutputFile,
     OptionDetails,
     command,
+    interval,
     numbers,
     pairs,
     print_text,
@@ -126,6 +127,19 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
     return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
 
 
+def validation_runs(
+    reading: ReadingOptions, file: str | None, window: str | None, equation: Structure | None
+) -> list[Run]:
+    """Load the validation run, if there is one, from its own window: --window is that of the runs that are fitted."""
+    if file is None:
+        if window is not None:
+            raise ModelError("--validation-window is a part of the run that --validation names; name its file, too")
+        return []
+    if window is not None:
+        interval(window, "--validation-window", "1.1:19.5")
+    return replace(reading, window=window).runs([file], equation)
+
+
 @command
 def identify(
     files: list[str],
@@ -145,6 +159,7 @@ def identify(
     out: OptionalOutputFile = None,
     report: OptionalOutputFile = None,
     validation: str | None = None,
+    validation_window: str | None = None,
     force: bool = False,
     verbose: bool = False,
     as_json: bool = False,
@@ -175,8 +190,7 @@ def identify(
     given |= {} if fit.bounds is None else {"bounds": ranges("--bounds", fit.bounds)}
     chosen = method_with_options(method, given)
     runs = reading.runs(files, equation)
-    # The window is of the runs that are identified from.
-    others = replace(reading, window=None).runs([validation], equation) if validation is not None else []
+    others = validation_runs(reading, validation, validation_window, equation)
     selection = None
     if structure == "auto":
         selection = select_structure(runs, "auto", shape, driven_by=driven_by, threads=threads, quiet=as_json)
@@ -538,6 +552,7 @@ def select(
     shape: StructureOptions,
     driven_by: list[str] | None = None,
     validation: str | None = None,
+    validation_window: str | None = None,
     threads: int | None = None,
     store: str | None = None,
     out: OptionalOutputFile = None,
@@ -566,9 +581,10 @@ def select(
     runs = reading.runs(files, equation)
     made = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
     candidates = "auto" if not made else made[0] if len(made) == 1 else made
-    # The window is of the runs that are fitted to.
-    of_its_own = validation not in (None, "runs", "blocks")
-    judges = replace(reading, window=None).runs([str(validation)], equation) if of_its_own else validation
+    of_its_own = validation if validation not in ("runs", "blocks") else None
+    if of_its_own is not None and not Path(of_its_own).exists():
+        raise ModelError(f"--validation {of_its_own!r} is neither runs nor blocks nor a file; check the path")
+    judges = validation_runs(reading, of_its_own, validation_window, equation) or validation
     with resumable(store, "the same command"):
         found = select_structure(
             runs,

@@ -101,6 +101,12 @@ class StructureOptions:
             built = self._flexible_link(text)
         elif re.fullmatch(r"arm(:\w*)?", text):
             built = self._arm(text, alone)
+        elif "=" not in text:
+            raise ModelError(
+                f"--structure {text!r} is no equation and has no name of a structure; use auto, flexible-link:1, :2 or "
+                ":both, arm:1, :2 or :both, or an equation such as 'D y = a y + b u' (ftlm identify-frequency takes "
+                "circuits)"
+            )
         else:
             built = equation(text, sensor_filter=self._sensor())
             self._check_equation(len(built.equations))

@@ -893,7 +893,9 @@ class Runs(tuple[Run, ...]):
         try:
             every = [runs] if isinstance(runs, Run) else list(runs)
         except TypeError:
-            raise DataError(f"runs is {type(runs).__name__}; give a Run or a list of them") from None
+            raise DataError(
+                f"runs is {type(runs).__name__}; give a Run or a list of them (identify_frequency takes frequency data)"
+            ) from None
         if not every:
             raise DataError("no run is given; give at least one")
         for i, run in enumerate(every):

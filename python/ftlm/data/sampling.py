@@ -319,7 +319,7 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
         steps = steps[np.isfinite(steps) & (steps > 0)]
         step = float(np.median(steps)) if steps.size else 0.0
         whole = float(since[-1]) + step
-    way_out = f"the record has times from 0 to {whole:.12g} s since its first row"
+    way_out = f"{thing} has times from 0 to {whole:.12g} s since its first row"
     for limit in (start, stop):
         if limit is not None and not -_EDGE_TOLERANCE_STEPS * step <= limit <= whole + _EDGE_TOLERANCE_STEPS * step:
             raise DataError(f"{parameter(argument)}: limit {limit!r} s is out of range; {way_out}")

@@ -11,7 +11,7 @@ from ftlm.errors import ConvergenceError, ModelError
 from ftlm.findings import Finding, make_finding
 from ftlm.structure.structure import Structure
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import check_known, real_number
+from ftlm.utils.validation import check_known, join_names, real_number
 
 Bounds = Mapping[str, tuple[float, float]]
 
@@ -40,7 +40,17 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
     out, given = {}, bounds or {}
     inputs = {item.name: item for item in structure.free_inputs}
     # A coefficient that follows from a law is not a free parameter.
-    free = [n for n in structure.coefficient_names if n not in {law[0] for law in structure.coefficient_law}]
+    laws = {name: (factor, factors) for name, factor, factors in structure.coefficient_law}
+    for name in given:
+        if name in laws:
+            factor, factors = laws[name]
+            product = " ".join([*([] if factor == 1.0 else ["-" if factor == -1.0 else f"{factor:g}"]), *factors])
+            allowed = join_names([n for n in factors if n in structure.coefficient_names])
+            raise ModelError(
+                f"{parameter('bounds')} has {name}, which follows from the coefficient law {name} = {product}; "
+                f"{f'bound {allowed}, or ' if allowed else ''}identify without the law"
+            )
+    free = [n for n in structure.coefficient_names if n not in laws]
     check_known("bound of", given, [*free, *structure.order_names, *inputs])
     for name, pair in given.items():
         if name in inputs:

@@ -39,6 +39,7 @@ from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared_99, is_white
 from ftlm.utils.validation import Floats, as_floats, check_known, real_number
+from ftlm.validation.information_criteria import InformationCriteria, criteria_of_likelihood
 
 Weights = Literal["auto", "relative", "uniform", "deviation"]
 #: Largest relative difference of the sums of squares of one and the same optimum.
@@ -519,7 +520,20 @@ def _result(
         reached,
         white,
         tuple(findings),
+        information=_information(problem, best.cost, kind),
     )
+
+
+def _information(problem: ResponseProblem, cost: float, kind: str) -> InformationCriteria:
+    """Return information criteria of normal residuals, whose level is a parameter unless deviations are stated."""
+    sizes = [math.log(w) for record in problem.records for w in record.weight.tolist()]
+    count = 2 * len(sizes)
+    if kind == "deviation":
+        spread, parameters = cost, len(problem.names)
+    else:
+        spread, parameters = count * (math.log(max(cost, 1e-300) / count) + 1.0), len(problem.names) + 1
+    likelihood = 2.0 * sum(sizes) - 0.5 * (count * math.log(2.0 * math.pi) + spread)
+    return criteria_of_likelihood(likelihood, parameters, count)
 
 
 def _frequency_order(records: Sequence[FrequencyData]) -> NDArray[np.intp]:

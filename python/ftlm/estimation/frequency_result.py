@@ -34,6 +34,7 @@ from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
+from ftlm.validation.information_criteria import InformationCriteria, information_table
 
 DECIBELS_PER_NEPER = 20.0 / np.log(10.0)
 #: Points of a smooth curve over the measured band.
@@ -125,22 +126,60 @@ def curve_chart(
 
 
 def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
-    """Return gain and phase charts of a record and the model with its 95 % band."""
+    """Return gain and phase charts of a record and the model with its 95 % band; of an impedance |Z| over Hz."""
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
     figures = []
     for curve in bode_curves(model, record):
         dots = np.full(curve.omega.size, np.nan)
         dots[np.searchsorted(curve.omega, curve.measured_omega)] = curve.measured
         lines = [("model", curve.values), ("measured", dots)]
-        figures.append(curve_chart(f"{title}: {curve.kind}", curve.label, curve.omega, lines, curve.half_width))
+        if not is_impedance(record):
+            figures.append(curve_chart(f"{title}: {curve.kind}", curve.label, curve.omega, lines, curve.half_width))
+        else:
+            wide = curve.half_width
+            bands = [] if wide is None else [(curve.values - wide, curve.values + wide)]
+            figures.append(_impedance_chart(title, record.unit, curve, lines, bands))
     return figures
+
+
+def _impedance_chart(
+    title: str,
+    unit: str,
+    curve: ResponseCurve,
+    lines: Sequence[tuple[str, Floats]],
+    bands: Sequence[tuple[Floats, Floats]],
+) -> Figure:
+    """Return a chart of the size or the phase of an impedance over frequency in Hz."""
+    is_size = curve.kind == "gain"
+    if is_size:
+        lines = [(name, np.exp(values / DECIBELS_PER_NEPER)) for name, values in lines]
+        bands = [(np.exp(low / DECIBELS_PER_NEPER), np.exp(high / DECIBELS_PER_NEPER)) for low, high in bands]
+    return line_chart(
+        curve.omega / (2.0 * math.pi),
+        lines,
+        log_x=True,
+        log_y=is_size,
+        bands=bands,
+        title=f"{title}: {'|Z|' if is_size else curve.kind}",
+        dots=("measured",),
+        width=SMALL_WIDTH_PX,
+        height=220,
+        x_label="frequency [Hz]",
+        y_label=f"|Z| [{unit}]" if is_size else curve.label,
+        caption="Shade: 95 % band, from the covariance of the fit." if bands else "",
+    )
+
+
+def is_impedance(record: FrequencyData) -> bool:
+    """Whether a record is an impedance, by its unit."""
+    return record.unit.endswith("Ω")
 
 
 def nyquist_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Complex, Complex, str, str]:
     """Return the responses of the model and a record and both axis labels; impedances have -Im upwards."""
     response = model_response(model, record, curve_frequencies(record))
     unit = f" [{record.unit}]" if record.unit else ""
-    if record.unit.endswith("Ω"):
+    if is_impedance(record):
         return response.conj(), record.response.conj(), f"Re Z{unit}", f"−Im Z{unit}"
     return response, record.response, f"real part{unit}", f"imaginary part{unit}"
 
@@ -155,7 +194,7 @@ def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
 def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
     bode, nyquist = bode_figures(model, record), nyquist_figure(model, record)
-    return [nyquist, *bode] if record.unit.endswith("Ω") else [*bode, nyquist]
+    return [nyquist, *bode] if is_impedance(record) else [*bode, nyquist]
 
 
 def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
@@ -165,14 +204,15 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> F
     response = model_response(model, record, omega)
     size = np.abs(record.response[order])
     missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
+    hertz = is_impedance(record)
     return line_chart(
-        omega,
+        omega / (2.0 * math.pi) if hertz else omega,
         [("real part", missed.real), ("imaginary part", missed.imag)],
         log_x=True,
         width=SMALL_WIDTH_PX,
         height=220,
         title=f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: residuals",
-        x_label="frequency [rad/s]",
+        x_label="frequency [Hz]" if hertz else "frequency [rad/s]",
         y_label="model − measured [% of size]",
     )
 
@@ -259,6 +299,9 @@ class FrequencyIdentification:
         Whether the residuals are white over frequency (99 %).
     findings
         Findings about the model.
+    information
+        AIC, AICc and BIC, which compare circuits or equations that were fitted to the same records with the same
+        weights; None if unknown. Real and imaginary parts are samples.
     """
 
     system: Model | Circuit
@@ -274,6 +317,7 @@ class FrequencyIdentification:
     start_counts: tuple[int, int]
     white: bool
     findings: tuple[Finding, ...] = field(default=())
+    information: InformationCriteria | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -435,6 +479,8 @@ class FrequencyIdentification:
             f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {tried} "
             "initial guesses ended here"
         )
+        if self.information is not None:
+            lines.append(str(self.information))
         return "\n".join(
             [
                 *lines,
@@ -509,7 +555,10 @@ class FrequencyIdentification:
         residuals = Section(
             "Residuals" if not new else "Residuals, and the fit to the estimation data",
             [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
-            tables=[Table("Error over the size of the measured response", heads, rows)],
+            tables=[
+                Table("Error over the size of the measured response", heads, rows),
+                *([] if self.information is None else [information_table(self.information)]),
+            ],
             figures=self.figures() if new else figures,
             small=True,
         )
@@ -529,7 +578,9 @@ class FrequencyIdentification:
             what = {"equations": [str(e) for e in self.system.equations]}
         names = ("weights", "values", "standard_errors", "intervals", "chi_squared", "errors", "converged")
         starts = {"starts": list(self.start_counts)}
-        return what | attributes(self, names) | starts | attributes(self, ("white", "findings", "warnings"))
+        return (
+            what | attributes(self, names) | starts | attributes(self, ("white", "information", "findings", "warnings"))
+        )
 
     def __str__(self) -> str:
         return self.summary()

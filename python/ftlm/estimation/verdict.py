@@ -37,6 +37,8 @@ MAX_BURIED_RESIDUAL = 0.99
 #: Findings that explain a poor fit by the data.
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
 NOT_SEPARABLE_TOPIC = "not_separable"
+#: Findings on validation runs with rows to which the model was fitted.
+REPEATED_RUN_CODES = ("validates_itself", "validates_partly_itself")
 #: Findings on an unstable plant: simulations of whole runs do not judge its model.
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 
@@ -137,7 +139,8 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     whole = not any(f.code == "runs_split" for f in result.findings)
     unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
     runs = () if validation is None or unstable else (validation,)
-    tried = bool(runs) and validation is not None and not any(f.code == "validates_itself" for f in validation.findings)
+    repeated = validation is not None and any(f.code in REPEATED_RUN_CODES for f in validation.findings)
+    tried = bool(runs) and not repeated
     against = _combined_verdict([*result_findings(result)], result.fit, runs, tried)
     if against is not None:
         return against

@@ -34,10 +34,11 @@ _WORDS_BY_ROLE = {
     kind: frozenset(words.split())
     for kind, words in {
         "input": "u in inp input eingang cmd command current strom torque drehmoment pwm duty drive force kraft power "
-        "leistung heater heating excitation anregung actuator i im valve ventil throttle",
+        "leistung heater heating excitation anregung actuator i im valve ventil throttle pump pumpe fan opening "
+        "vin uin iin pin",
         "output": "y out output ausgang angle winkel position pos weg displacement deflection auslenkung theta th temp "
         "temperature temperatur speed velocity drehzahl geschwindigkeit acceleration accel beschleunigung level "
-        "pressure druck response antwort strain dehnung tip",
+        "pressure druck response antwort strain dehnung tip vout uout iout pout",
         "input or output": "voltage volt volts spannung v",
         "reference": "ref reference setpoint target desired soll sollwert referenz",
         "command": "cmd command commanded",
@@ -56,8 +57,11 @@ def words_of(column: str) -> set[str]:
 def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Guess inputs and outputs from column names; both are empty if the names are ambiguous.
 
-    References are left out, and a command beside its own measurement, if the other columns have both roles.
+    References are left out, and a command beside its own measurement, if the other columns have both roles. A single
+    column is an output, unless it has the name of an input.
     """
+    if len(columns) == 1 and not words_of(columns[0]) & _WORDS_BY_ROLE["input"]:
+        return [], list(columns)
     measured = {
         _tokens(c) - _WORDS_BY_ROLE["measurement"] for c in columns if _tokens(c) & _WORDS_BY_ROLE["measurement"]
     }
@@ -67,8 +71,9 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         if not words_of(c) & _WORDS_BY_ROLE["reference"]
         and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in measured)
     ]
-    found = _roles_by_words(plant)
-    return found if found[1] else _roles_by_words(columns)
+    found, every = _roles_by_words(plant), _roles_by_words(columns)
+    # A reference and an output are those of a closed loop.
+    return every if not found[1] or (every[0] and not found[0]) else found
 
 
 def _tokens(column: str) -> frozenset[str]:
@@ -170,7 +175,7 @@ def assume_roles(
     inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
     words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
     if not drives:
-        words = f"nothing drives {outputs}, by the names of the columns"
+        words = f"nothing drives {outputs}, {'by the names of the columns' if len(free) > 1 else 'the only signal'}"
     remedy = f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}"
     return (Assumption("inputs", inputs, words, remedy),)
 

@@ -16,7 +16,7 @@ from ftlm.data.units import is_time_name, split_time_header
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import Timestamps, is_time_unit, split_slash_unit, split_unit
 from ftlm.io.dialect import Assumption, Layout
-from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
+from ftlm.utils.parameters import Placeholder, choose_text, layout_parameter, parameter
 from ftlm.utils.validation import bad_rows, join_names, nearest
 
 _RELATIVE_TIME_TOLERANCE = 1e-9
@@ -234,7 +234,7 @@ class Pool:
             raise DataError(
                 "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
                 f"name it with {parameter('time')}, or give the time between rows with {parameter('step')}; "
-                f"{self.describe()}"
+                f"{choose_text('identify_frequency', 'ftlm identify-frequency')} takes spectra; {self.describe()}"
             )
         for other in clocks[1:]:
             _check_agreement(clocks[0], other)

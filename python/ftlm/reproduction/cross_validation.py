@@ -15,6 +15,7 @@ from ftlm.arm.flexible_link import flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
+from ftlm.estimation.model_checks import dead_channel_findings
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import MIN_FIT_GAIN, have_common_value, improves_prediction, is_degenerate
 from ftlm.plot.comparison_charts import pulse_times
@@ -294,6 +295,16 @@ def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool
     return replace(made, initial="caputo")
 
 
+def dead_channel_notes(runs: Sequence[Run], stages: Sequence[StageNumber]) -> list[str]:
+    """Return notes on angles that stay constant for a part of a run, which every fit takes as measured."""
+    notes = []
+    for stage in stages:
+        structure = link_structure(stage, both=len(stages) == 2, filtered=False)
+        for run in runs:
+            notes += [f"run {run.name}: {dead.sentence}" for dead in dead_channel_findings([run], structure)]
+    return list(dict.fromkeys(notes))
+
+
 def cross_validate_orders(
     runs: Sequence[Run],
     *,
@@ -349,6 +360,7 @@ def cross_validate_orders(
         used.append(decimate_run(run, every) if every > 1 else run)
     deflections = {}
     both = len(stages) == 2
+    notes += dead_channel_notes(runs, stages)
     if isinstance(progress, Progress):
         structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
         each = sum(

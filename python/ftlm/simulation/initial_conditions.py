@@ -127,8 +127,18 @@ _EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, 
 )
 
 
+#: The whole run of a run with masked outputs.
+_WHOLE_RUNS: WeakKeyDictionary[Run, Run] = WeakKeyDictionary()
+
+
+def share_start(masked: Run, whole: Run) -> None:
+    """Take the start of a run with masked outputs from the whole run: masking rows does not set a plant in motion."""
+    _WHOLE_RUNS[masked] = whole
+
+
 def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     """Return the evidence that the plant rested before the run, or None if it may have been in motion."""
+    run = _WHOLE_RUNS.get(run, run)
     found = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
     if key not in found:
@@ -264,7 +274,10 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
     samples = {n: run[n] - v for n, v in moved.items()}
     read = run.sample_times
     own = None if read is None else {n: read.data[n] - v for n, v in moved.items()}
-    return run.with_samples(samples, own), levels
+    shifted = run.with_samples(samples, own)
+    if run in _WHOLE_RUNS:
+        share_start(shifted, deviations(_WHOLE_RUNS[run], structure)[0])
+    return shifted, levels
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:

@@ -17,11 +17,12 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
+from ftlm.simulation.initial_conditions import share_start
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import vector_norm
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.statistics import variance_inflation
+from ftlm.utils.statistics import variance_inflation, white_noise
 from ftlm.validation.comparison import compare
 
 #: Number of blocks of a run, and minimum number of samples of a block.
@@ -48,6 +49,28 @@ class Fold:
             return self.validation_run.name
         step = self.validation_run.step
         return f"{self.validation_run.name} {self.rows[0] * step:g}-{self.rows[1] * step:g} s"
+
+    @property
+    def leaves_excitation(self) -> bool:
+        """Whether an input changes outside the validation rows, unless none ever changes."""
+        inside = 0
+        for run in self.runs:
+            masked = self.rows if run is self.validation_run and self.rows is not None else (0, 0)
+            for name in run.inputs:
+                rows = np.flatnonzero(np.diff(run[name])) + 1
+                within = int(np.count_nonzero((rows >= masked[0]) & (rows < masked[1])))
+                if within < rows.size:
+                    return True
+                inside += within
+        return inside == 0
+
+    @property
+    def has_motion(self) -> bool:
+        """Whether an output moves in the validation rows by more than its noise."""
+        if self.rows is None:
+            return True
+        pairs = [(self.validation_run[n], slice(*self.rows)) for n in self.validation_run.outputs]
+        return any(float(np.nanstd(y[rows])) > math.sqrt(2.0) * white_noise(y) for y, rows in pairs)
 
     def estimation_runs(self, outputs: Sequence[str]) -> Runs:
         """Runs for the fit, with the validation samples of the given outputs masked."""
@@ -89,7 +112,7 @@ def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run
     signals = {n: np.array(run[n]) for n in run.outputs}
     for name in outputs:
         signals[name][rows[0] : rows[1]] = np.nan
-    return Run.from_arrays(
+    masked = Run.from_arrays(
         step=run.step,
         inputs={n: run[n] for n in run.inputs},
         outputs=signals,
@@ -98,6 +121,8 @@ def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run
         name=run.name,
         missing="weight",
     )
+    share_start(masked, run)
+    return masked
 
 
 #: Most pieces of the runs of an unstable plant that are folds.
@@ -169,7 +194,10 @@ class Folds:
             return cls(every, tuple(parts), f"each of {len(every)} runs by the others")
         if validation != "blocks":
             raise ModelError(f"{setting('validation')} {validation!r} is not known; use 'runs', 'blocks', or a run")
-        parts = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
+        blocks = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
+        # Without the only rows in which an input changes, a fit has nothing to identify the plant from, and noise about
+        # a standstill shows no prediction.
+        parts = [fold for fold in blocks if fold.leaves_excitation and fold.has_motion] or blocks
         return cls(every, tuple(parts), f"each of {len(parts)} blocks by a fit without its outputs")
 
     @classmethod

@@ -231,6 +231,8 @@ class Comparison:
             lines.append(f"over {self.m} block pulses per run")
         lines += describe_missing_equation_errors(self.without_equation_error)
         lines += describe_offsets(self)
+        if not self.offsets and (terms := initial_term_counts(self)):
+            lines.append(f"initial terms estimated on each run (their number): {terms}")
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
 
@@ -405,6 +407,12 @@ def describe_offsets(comparison: Comparison) -> list[str]:
     return lines
 
 
+def initial_term_counts(comparison: Comparison) -> str:
+    """Return runs whose initial terms and levels were estimated on their own outputs, with their number."""
+    counts = [sum(map(len, terms.values())) for terms in comparison.initial]
+    return ", ".join(f"{run[0]} ({n})" for run, n in zip(comparison.per_run, counts, strict=True) if n)
+
+
 @dataclass(frozen=True)
 class _RunErrors:
     """Errors of a model on one run, by output: simulation, measurement, equation signal and equation error."""
@@ -531,9 +539,42 @@ def validation_findings(own: Comparison, validation: Comparison) -> list[Finding
     findings = []
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
-            if all(np.array_equal(own.measured[o][k], validation.measured[o][j], equal_nan=True) for o in own.measured):
+            fitted, tested = (
+                np.stack([c.measured[o][i] for o in own.measured]) for c, i in ((own, k), (validation, j))
+            )
+            shared = common_rows(fitted, tested)
+            if shared == tested.shape[1] == fitted.shape[1]:
                 findings.append(make_finding("validates_itself", run=other, other=name))
+            elif shared:
+                numbers = {"count": shared, "rows": tested.shape[1]}
+                findings.append(make_finding("validates_partly_itself", run=other, other=name, **numbers))
     return findings + validation_fit_findings({n: f.fit for n, f in own.output_error.items()}, validation)
+
+
+#: Rows that show where one record continues another, and fewest rows of which both have as many to be one recording.
+ALIGNMENT_ROWS, MIN_COMMON_ROWS = 8, 32
+
+
+def common_rows(one: Floats, other: Floats) -> int:
+    """Return the number of rows that two records, shape (outputs, rows), share as parts of one recording; 0 if none.
+
+    Parts of one recording coincide from the first row of the later one on.
+    """
+    if one.shape == other.shape and np.array_equal(one, other, equal_nan=True):
+        return int(one.shape[1])
+    for earlier, later in ((one, other), (other, one)):
+        first = next(iter(np.flatnonzero(np.any(np.diff(later) != 0.0, axis=0))), 0)
+        head = later[:, first : first + ALIGNMENT_ROWS]
+        if head.shape[1] < ALIGNMENT_ROWS or earlier.shape[1] < MIN_COMMON_ROWS:
+            continue
+        windows = np.lib.stride_tricks.sliding_window_view(earlier, ALIGNMENT_ROWS, axis=1)
+        for start in np.flatnonzero(np.all(windows == head[:, None, :], axis=(0, 2))) - first:
+            count = min(earlier.shape[1] - start, later.shape[1])
+            if start < 0 or count < MIN_COMMON_ROWS:
+                continue
+            if np.array_equal(earlier[:, start : start + count], later[:, :count], equal_nan=True):
+                return int(count)
+    return 0
 
 
 def validation_fit_findings(before: Mapping[str, float], validation: Comparison) -> list[Finding]:

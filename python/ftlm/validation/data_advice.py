@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
-from ftlm.findings import Finding, make_finding, unique
+from ftlm.findings import LEVEL_FACT, LEVEL_NOTE, Finding, make_finding, unique
 from ftlm.kernels import pulse_means
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
@@ -465,7 +465,8 @@ class SignalFigures:
     noise
         Standard deviation of the measurement noise, estimated from second differences.
     quantum
-        Smallest nonzero change between two samples (quantization step).
+        Smallest nonzero change between two samples (quantization step); 0 without one, and for an input under a
+        zero-order hold, whose values are commands and have no rounding error.
     at_extremes
         Share of samples at the lowest or highest value: saturation or a two-level signal.
     constant
@@ -530,9 +531,12 @@ class Inspection:
             f"{'signal':<{width}}{'role':<8}{'unit':<8}" + "".join(f"{h:>11}" for h in heads),
         ]
         for s in self.signals:
-            figures = (s.first, s.low, s.high, s.mean, s.deviation, s.noise, s.quantum)
-            lines.append(f"{s.name:<{width}}{s.role:<8}{s.unit or '1':<8}" + "".join(f"{v:>11.4g}" for v in figures))
-        return "\n".join(lines + [f"warning: {w}" for w in self.warnings])
+            figures = (s.first, s.low, s.high, s.mean, s.deviation, s.noise)
+            quantum = f"{s.quantum:.4g}" if s.quantum else "-"
+            cells = "".join(f"{v:>11.4g}" for v in figures) + f"{quantum:>11}"
+            lines.append(f"{s.name:<{width}}{s.role:<8}{s.unit or '1':<8}{cells}")
+        minor = (LEVEL_FACT, LEVEL_NOTE)
+        return "\n".join(lines + [f"{'note' if f.level in minor else 'warning'}: {f.sentence}" for f in self.findings])
 
 
 def inspect_run(run: Run) -> Inspection:
@@ -553,8 +557,6 @@ def inspect_run(run: Run) -> Inspection:
     for s in signals:
         if s.constant:
             findings.append(make_finding("signal_constant", run=run.name, **{s.role: s.name}, level=s.first))
-        elif s.role == "output" and not s.at_rest:
-            findings.append(make_finding("signal_in_motion", run=run.name, output=s.name, level=s.first))
     return Inspection(run.name, run.length, run.step, run.duration, signals, unique(findings))
 
 
@@ -584,7 +586,7 @@ def _figures(run: Run, name: str) -> SignalFigures:
         mean=float(x.mean()),
         deviation=deviation,
         noise=noise,
-        quantum=float(changes.min()) if changes.size else 0.0,
+        quantum=float(changes.min()) if changes.size and run.intersample.get(name) != "zoh" else 0.0,
         at_extremes=float(np.mean((x == low) | (x == high))),
         constant=low == high,
         at_rest=is_rest(x),

@@ -82,10 +82,16 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
         # A residual of exactly nothing has no finite likelihood.
         level = 2 * math.log(output.rms) if 0 < output.rms < math.inf else math.copysign(math.inf, output.rms - 1)
         likelihood -= 0.5 * counts[name] * (math.log(2 * math.pi) + 1 + level)
-    aic = 2 * k - 2 * likelihood
+    return criteria_of_likelihood(likelihood, k, samples)
+
+
+def criteria_of_likelihood(log_likelihood: float, parameters: int, samples: int) -> InformationCriteria:
+    """Return AIC, AICc and BIC from a log likelihood, and the numbers of all estimated parameters and samples."""
+    k = parameters
+    aic = 2 * k - 2 * log_likelihood
     left = samples - k - 1
     aicc = aic + 2 * k * (k + 1) / left if left > 0 else math.inf
-    return InformationCriteria(k, samples, likelihood, aic, aicc, k * math.log(samples) - 2 * likelihood)
+    return InformationCriteria(k, samples, log_likelihood, aic, aicc, k * math.log(samples) - 2 * log_likelihood)
 
 
 def information_table(information: InformationCriteria) -> Table:
