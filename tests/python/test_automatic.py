@@ -253,21 +253,23 @@ def test_free_decay_without_an_input(seed):
     assert "excitation_short" not in {f.code for f in found.best.findings}
 
 
-def rubbing_mass(seed: int, spring: float, friction: float, rows: int = 400, steps: int = 20) -> ftlm.Run:
-    """Position of a mass with drag and Coulomb friction that sticks, by Euler steps; noise of 2 % of the position."""
+def rubbing_mass(
+    seed: int, spring: float, friction: float, *, late: int = 0, speed: bool = False, rows: int = 400, steps: int = 20
+) -> ftlm.Run:
+    """Position or speed of a mass with drag and Coulomb friction that sticks, by Euler steps; noise of 2 %."""
     g = np.random.default_rng(seed)
     u = np.repeat(g.uniform(-1, 1, rows), g.integers(4, 60, rows))[:rows]
     step, v, x, y = 0.1, 0.0, 0.0, np.zeros(rows)
     h = step / steps
     for k in range(rows - 1):
         for _ in range(steps):
-            force = u[k] - 0.8 * v - spring * x
+            force = (u[k - late] if k >= late else 0.0) - 0.8 * v - spring * x
             moving = v != 0.0
             rub = friction * np.sign(v) if moving else np.clip(force, -friction, friction)
             later = v + h * (force - rub)
             v = 0.0 if moving and later * v < 0.0 else later
             x += h * v
-        y[k + 1] = x
+        y[k + 1] = v if speed else x
     return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y + 0.02 * y.std() * g.standard_normal(rows)})
 
 
@@ -281,3 +283,10 @@ def test_auto_finds_dry_friction_rather_than_higher_orders(spring: float, own: d
     assert found.coefficients["fc"] == pytest.approx(0.25, rel=0.1)
     values = {n: v for n, v in found.coefficients.items() if n.startswith("a")}
     assert values == pytest.approx(own, rel=0.1)
+
+
+def test_auto_finds_dry_friction_behind_a_dead_time() -> None:
+    run = rubbing_mass(2, 0.0, 0.25, late=6, speed=True)
+    found = ftlm.select(run, "auto", threads=1).best
+    values = {n: found.parameters[n].value for n in ("a0", "b0", "fc", "delay_u")}
+    assert values == pytest.approx({"a0": -0.8, "b0": 1.0, "fc": 0.25, "delay_u": 0.6}, rel=0.05)

@@ -139,6 +139,11 @@ class OutputProblem:
         return [(f"{k}_" if len(self.drivers) > 1 else "", name) for k, name in enumerate(self.drivers, 1)]
 
     @property
+    def has_free_delays(self) -> bool:
+        """Whether a delayed form differs from one that is not."""
+        return self.input_delays(delayed=False) != self.input_delays(delayed=True)
+
+    @property
     def sign_slope(self) -> float:
         """Slope of the tanh that replaces the sign of the output."""
         return sign_tanh_slope(self.runs, self.output)
@@ -283,12 +288,17 @@ class AutomaticSelection:
         expanded: set[IntegerOrderForm | None] = {None}
         while new:
             expanded.update(new)
-            near = [n for form in new if form for n in _neighbors(form) if not (self.feedback and n.has_feedthrough)]
+            near = [n for form in new if form for n in _neighbors(form) if self._is_open(n)]
             more = [n for n in dict.fromkeys(near) if n not in done]
             done.update(more)
             fits = _rank([*fits, *self._fit(more)])
             new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
         return fits
+
+    def _is_open(self, form: IntegerOrderForm) -> bool:
+        """Whether a form has neither feedthrough of an input in a loop, nor a free delay where all are given."""
+        free = not form.delayed or self.problem.has_free_delays
+        return free and not (self.feedback and form.has_feedthrough)
 
     def _fit_zeros(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
         """Add fits of forms with all zeros, and of forms with fewer zeros that can have the lowest BIC; best first.
@@ -313,7 +323,7 @@ class AutomaticSelection:
 
     def _fit_delayed(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
         """Add fits of delayed forms; those above order 2 only if a delay lowers BIC of order 1 or 2."""
-        if self.problem.input_delays(delayed=False) == self.problem.input_delays(delayed=True):
+        if not self.problem.has_free_delays:
             return fits
         delayed = [IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in range(1, MAX_ORDER)]
         fits = _rank([*fits, *self._fit(delayed[:2])])
@@ -328,7 +338,8 @@ class AutomaticSelection:
 
     def _fit_friction(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
         """Add a speed or position with dry friction if residuals are colored and friction clearly lowers BIC."""
-        speed = IntegerOrderForm(1, 0, offset=offset, friction="speed")
+        late = bool(fits and fits[0].form and fits[0].form.delayed)
+        speed = IntegerOrderForm(1, 0, delayed=late, offset=offset, friction="speed")
         changes_sign = math.isfinite(self.problem.sign_slope)
         for form in ([speed] if changes_sign else []) + [replace(speed, order=2, friction="position")]:
             if fits and not _has_white_residuals(fits[0].joint):
@@ -418,7 +429,7 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
     ]
     if form.friction != "none":
         # The simulation of friction needs inputs of lower order than the equation.
-        found[1] = replace(form, zeros=form.order - 1)
+        found[1:2] = [replace(form, zeros=form.order - 1), replace(form, delayed=not form.delayed)]
     elif form.zeros > 0:
         lower = replace(form, order=form.order - 1, zeros=form.zeros - 1, integrator=False)
         # A canceled pole and zero at s = 0 are equivalent to a level, or with the initial terms to a drift.

@@ -555,30 +555,22 @@ def _with_validated_initial_conditions(trial: Trial, folds: Folds) -> Structure:
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
     """Describe why the winner was chosen."""
-    lead = (
-        f"Chosen: {winner.name} ({winner.parameters} parameters, validation fit {format_fit(winner.validation_fit)} %)"
+    text = (
+        f"Chosen: {winner.name} ({winner.parameters} parameters, validation fit {format_fit(winner.validation_fit)} %)."
     )
-    peers = [ranked[k] for k in _peer_indices(ranked)]
     if winner is best:
-        lead += ", which predicts best"
+        text += " It predicts best."
     else:
-        more = best.parameters - winner.parameters
-        lead += (
-            f", whose residuals are {100 * (math.exp(winner.score - best.score) - 1):.2g} % larger than those "
-            f"of the best prediction"
-            + (f" with {more} parameter{'s' * (more > 1)} fewer" if more > 0 else "")
-            + " and which has the lowest Schwarz criterion of those that predict equally well"
-        )
-    for word, others in (
-        ("fewer", [t for t in peers if t.parameters < winner.parameters]),
-        ("more", [t for t in peers if t.parameters > winner.parameters]),
-    ):
-        if others:
-            near = min(others, key=lambda t: t.score)
-            share = 100 * (math.exp(near.score - winner.score) - 1)
-            side = "larger" if share >= 0 else "smaller"
-            lead += f"; the best with {word} ({near.parameters}) has {abs(share):.3g} % {side} ones"
-    return lead + "." + _failure_text(winner, ranked)
+        text += " Of the candidates that predict as well as the best, it has the lowest Schwarz criterion."
+    peers = [ranked[k] for k in _peer_indices(ranked)]
+    fewer = [t for t in peers if t.parameters < winner.parameters]
+    more = [t for t in peers if t.parameters > winner.parameters]
+    for others in filter(None, (fewer, more)):
+        near = min(others, key=lambda t: t.score)
+        change = 100 * (math.exp(near.score - winner.score) - 1)
+        side = "larger" if change >= 0 else "smaller"
+        text += f" With {near.parameters} parameters, validation residuals are {abs(change):.2g} % {side}."
+    return text + _failure_text(winner, ranked)
 
 
 def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
