@@ -154,7 +154,11 @@ fn what_is_no_limit_of_an_input_is_refused() -> Result<(), Error> {
         let model = FrictionModel { inputs, ..rubbing(InputLaw::Saturation) };
         assert!(matches!(model.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
     }
-    let late = FrictionModel { inputs: limited(InputLaw::Delay), ..rubbing(InputLaw::Saturation) };
-    assert!(matches!(late.check(&[experiment]), Err(Error::Structure { .. })));
+    let late = |bounds: (f64, f64)| FrictionModel {
+        inputs: vec![FreeInput { signal: 1, law: InputLaw::Delay, bounds }],
+        ..rubbing(InputLaw::Saturation)
+    };
+    late((0.0, 0.2)).check(std::slice::from_ref(&experiment))?;
+    assert!(matches!(late((0.0, f64::INFINITY)).check(&[experiment]), Err(Error::Structure { .. })));
     Ok(())
 }
