@@ -334,5 +334,6 @@ def test_a_validation_on_fitted_rows_is_with_care():
     # The state at the start of a run in motion is estimated on it, and the summary says so.
     terms = sum(map(len, clean.initial[0].values()))
     assert terms
-    assert f"estimated on them (their number): {clean.per_run[0][0]} ({terms})" in found.summary(clean)
+    said = " ".join(found.summary(clean).split())
+    assert f"estimated on them (their number): {clean.per_run[0][0]} ({terms})" in said
     assert "initial terms estimated on each run (their number)" in str(found.model.compare(run.window(10, 20)))

@@ -134,7 +134,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     colored = any(not o.whiteness.passed or o.follows_direction for o in tests.outputs.values())
-    if joint is None or not colored or structure.has_friction or structure.limits or structure.free_inputs:
+    given = structure.has_friction or structure.limits or structure.free_inputs
+    if joint is None or not joint.names or not colored or given:
         return ExtensionTests([])
     structure = replace(structure, initial=joint.initial)
     names = _inputs_of_single_equation(structure, runs)

@@ -167,6 +167,10 @@ def assume_roles(
             wanted.inputs = {name: known[name] for name in signals[0]}
             wanted.outputs = {name: known[name] for name in signals[1]}
             return ()
+    unread = [c.name for c in columns if c.name and not has_numbers(c)]
+    if len(own) == 1 and any(words_of(name) & _WORDS_BY_ROLE["input"] for name in unread):
+        # An input without numbers is an error in the file: the output is not a free response.
+        return ()
     drives, follows = guess_roles(list(own))
     names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
     wanted.inputs, wanted.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
