@@ -1,4 +1,4 @@
-"""Tests of extensions of an equation that would explain its colored residuals.
+"""Tests of other initial conditions, and of extensions of an equation that would explain its colored residuals.
 
 Extensions are a drift of the level, another hold of an input between samples, a lag, a delay or lead, a zero, a pole
 with a zero, dry friction, a saturation, a dead zone, a squared input, and a load step.
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ftlm import _core
+from ftlm.analysis.poles import steady_states
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import ZERO_ORDER_HOLD, Intersample, drop_missing, longest_delay
 from ftlm.errors import FtlmError
@@ -27,12 +28,13 @@ from ftlm.estimation.nuisance_parameters import output_sensitivities
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
+from ftlm.simulation.initial_conditions import rest_evidence
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Friction, Term
 from ftlm.structure.expression import apply, channel, constant, multiply, power
 from ftlm.structure.input_nonlinearity import InputEffect, input_name
 from ftlm.structure.order import Order
-from ftlm.structure.structure import History, Structure
+from ftlm.structure.structure import History, Initial, Offset, Structure
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.residual_tests import (
@@ -70,6 +72,17 @@ MIN_CHANGING_SHARE = 0.5
 HOLD_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 #: Smallest difference of an estimated delay from that of the structure that is reported, in standard errors.
 DELAY_SIGMAS = 3.0
+#: Initial conditions and offsets with which a fit is compared.
+OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
+    ("rest", "none"),
+    ("rest", "level"),
+    ("caputo", "none"),
+    ("caputo", "level"),
+)
+#: Maximum ratio of the sum of squares under other initial conditions to that of the fit at which both explain a run.
+MAX_SQUARES_RATIO = 1.05
+#: Difference of two gains, in joint standard errors and relative to the larger one, beyond which they contradict.
+GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 
 
 @dataclass(frozen=True)
@@ -527,3 +540,50 @@ def _passes_residual_tests(fitted: FittedExtension, given: Runs) -> bool:
     outputs = tests.outputs.values()
     failed = any(t.failed for o in outputs for t in o.inputs.values())
     return not failed and not any(o.follows_direction for o in outputs)
+
+
+def undetermined_start_findings(fit: Fit) -> list[Finding]:
+    """Return a finding if other initial conditions explain the runs as well and give another gain."""
+    joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
+    if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
+        return []
+    if all(rest_evidence(run, structure) is not None for run in runs):
+        # Another finding states the evidence of rest, or that rest is assumed.
+        return []
+    taken = joint.initial if joint.initial == "rest" else "caputo", structure.offset
+    own = _gains(joint, structure)
+    worst: tuple[float, Finding] | None = None
+    for initial, offset in OTHER_STARTS if own else ():
+        if (initial, offset) == taken:
+            continue
+        try:
+            other = fit_output_error(runs, replace(structure, initial=initial, offset=offset), near=joint, refine=False)
+        except FtlmError:
+            continue
+        ratio = max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
+        if not ratio <= MAX_SQUARES_RATIO or other.unstable_optimum is not None:
+            continue
+        for pair, (gain, error) in _gains(other, structure).items():
+            known, own_error = own.get(pair, (math.nan, math.nan))
+            distance = abs(gain - known) / max(math.hypot(error, own_error), 1e-300)
+            far = abs(gain - known) > MIN_GAIN_CHANGE * max(abs(gain), abs(known))
+            if far and distance > max(GAIN_SIGMAS, worst[0] if worst else 0.0):
+                numbers = {"gain": known, "error": own_error, "other_gain": gain, "other_error": error}
+                words = {"taken": _name_start(*taken), "other": _name_start(initial, offset), "ratio": ratio}
+                about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
+                worst = distance, make_finding("start_not_told", **about, **numbers, **words)
+    return [worst[1]] if worst else []
+
+
+def _name_start(initial: Initial, offset: Offset) -> str:
+    """Return initial conditions as text."""
+    return ("at rest" if initial == "rest" else "in motion") + (" with a nonzero level" if offset == "level" else "")
+
+
+def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return the finite steady-state gains of a fit by output and input, with their standard errors."""
+    try:
+        states = steady_states(fitted_model(joint, structure))
+    except FtlmError:
+        return {}
+    return {(s.output, s.input): (s.gain, s.error) for s in states if s.error is not None and math.isfinite(s.gain)}

@@ -21,7 +21,7 @@ from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, M
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
-from ftlm.estimation.extensions import run_extension_tests
+from ftlm.estimation.extensions import run_extension_tests, undetermined_start_findings
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.methods import EstimationMethod, OutputError, method_with_options, resolve_method
@@ -49,7 +49,6 @@ from ftlm.estimation.nuisance_parameters import (
 )
 from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
 from ftlm.estimation.result import Identification
-from ftlm.estimation.undetermined_start import undetermined_start_findings
 from ftlm.estimation.unstable_plants import SPLIT_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
 from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique

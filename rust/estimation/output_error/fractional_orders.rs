@@ -420,7 +420,7 @@ impl Run {
         self.columns(experiment, asked.len(), functions.iter().copied().zip(spectra))
     }
 
-    /// Compared samples of `count` columns, each the sum of the transforms of `functions` with its index.
+    /// Return the compared samples of `count` columns, each the sum of the transforms of `functions` with its index.
     ///
     /// A transform with an input is multiplied by the jumps of that input. One without is the response to initial terms.
     fn columns(
