@@ -298,11 +298,11 @@ impl<M: StateModel> LeastSquaresProblem for InitialStateProblem<'_, M> {
 /// Evaluations and tolerance of the estimate of an initial state.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 30, tolerance: 1e-6 };
 
-/// Parts of a run whose samples are fitted in turn, from its first sample on, before the whole run.
+/// Shares of a run that are fitted in turn, from its first sample on, before the whole run.
 ///
-/// Over a long motion an error of the initial state becomes an error of phase, or another number of swings before a body
-/// sticks, and the squared error of the whole run has minima far from the least. Over the beginning alone it has one.
-const FIRST_PARTS_OF_RUN: [f64; 3] = [0.125, 0.25, 0.5];
+/// Over a long run the cost has local minima in the initial state: errors of phase, and other numbers of oscillations
+/// before a body sticks. Over the beginning it has one minimum.
+const BEGINNING_SHARES: [f64; 3] = [0.125, 0.25, 0.5];
 
 /// Initial state of a run at fixed parameters: best result of local optimizations from its first samples, and from
 /// fits of ever longer beginnings of the run.
@@ -316,7 +316,7 @@ fn estimate_initial_state<M: StateModel>(
     let mut guesses = model.state_guesses(orders, coefficients, experiment);
     let Some(first) = guesses.first().cloned().filter(|guess| !guess.is_empty()) else { return Ok(Vec::new()) };
     let mut continued = first.clone();
-    for share in FIRST_PARTS_OF_RUN {
+    for share in BEGINNING_SHARES {
         let beginning =
             experiment.clone().with_weights(&experiment.weights, Some(&beginning_weights(experiment, share)))?;
         let part = InitialStateProblem { experiment: &beginning, ..problem };

@@ -150,6 +150,22 @@ def test_dry_friction_is_named_and_its_term_finds_it(kind, friction):
         assert not {f.code for f in better.findings} & CODES
 
 
+def test_a_drag_that_drives_near_standstill_is_no_friction():
+    for seed in range(3):
+        g = np.random.default_rng(seed)
+        u = np.repeat(g.uniform(-1, 1, 500), g.integers(4, 60, 500))[:500]
+        y = np.zeros(500)
+        for k in range(499):
+            y[k + 1] = y[k]
+            for _ in range(40):
+                y[k + 1] += STEP / 40 * RATE * (u[k] - y[k + 1] + 0.25 * np.tanh(50 * y[k + 1]))
+        y += 0.02 * y.std() * g.standard_normal(500)
+        run = ftlm.Run.from_arrays(step=STEP, inputs={"u": u}, outputs={"y": y})
+        assert "friction_fits" not in codes_of(run)
+        (item,) = ftlm.select(run, "auto").best.model.structure.equations
+        assert not any("tanh" in str(term) for term in item.terms)
+
+
 @pytest.mark.parametrize("equation", ["D y = a y + b u", "D^2 y = d D y + a y + b u"])
 def test_resonant_noise_is_no_friction(equation):
     noise = [1.0, -1.96 * np.cos(0.05), 0.9604]

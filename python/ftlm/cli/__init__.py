@@ -58,6 +58,8 @@ validation_window : FROM:TO
     Part of the validation run, in seconds [s]; default all of it.
 out : FILE
     Write the model to this .json file.
+page : HTML
+    Write the page to this file.
 report : HTML
     Write an HTML report to this file.
 verbose

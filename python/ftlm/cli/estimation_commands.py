@@ -570,7 +570,7 @@ def select(
     Method
     ------
     validation : runs|blocks|FILE
-        Cross-validate over runs or quarters, or on another run.
+        Cross-validate over runs or quarters (blocks), or on a run.
 
     Output
     ------

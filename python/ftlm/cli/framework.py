@@ -189,14 +189,18 @@ class OptionDetails:
         Least integer.
     is_output
         Whether it is a file to write; a command refuses a path that it cannot write before it computes.
+    help_entry
+        Name of its entry in the shared help; by default its own name.
     """
 
     flags: tuple[str, ...] = ()
     min: int | None = None
     is_output: bool = False
+    help_entry: str | None = None
 
 
 OutputFile = Annotated[str, OptionDetails(is_output=True)]
+OutputPage = Annotated[str, OptionDetails(is_output=True, help_entry="page")]
 OptionalOutputFile = Annotated[str | None, OptionDetails(is_output=True)]
 NonNegative = Annotated[int, OptionDetails(min=0)]
 Positive = Annotated[int, OptionDetails(min=1)]
@@ -280,14 +284,14 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             print("ftlm: interrupted; nothing was written", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except BrokenPipeError:
-            # The reader of a pipe has gone; what it did not read is nobody's loss.
+            # The reader of a pipe closed it, such as head: that is no error.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
         except FtlmError as error:
             print(f"ftlm: {error}", file=sys.stderr)
             raise typer.Exit(exit_code(error)) from None
         except OSError as error:
-            # Of what is printed, or of a working folder that is gone; files have sentences of their own.
+            # An error of standard output or of the working folder; errors of files were turned into messages before.
             what = "" if error.filename is None else f" {error.filename!r}"
             print(
                 f"ftlm: the system refuses{what}: {error.strerror or error}; what was written to files is there, check "
@@ -298,7 +302,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(EXIT_DATA) from None
 
-    # What typer reads.
+    # typer reads these attributes.
     run.__doc__ = summary
     run.__annotations__ = {option.name: option.annotation for option in options}
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
@@ -311,7 +315,7 @@ def _option(
 ) -> inspect.Parameter:
     """Return a parameter as typer reads it, from its name, type, default and help."""
     kind, details = get_args(hint) if get_origin(hint) is Annotated else (hint, OptionDetails())
-    text = texts.get(name) or SHARED_TEXTS.get(name) or OptionText(None, None, "")
+    text = texts.get(name) or SHARED_TEXTS.get(details.help_entry or name) or OptionText(None, None, "")
     metavar = text.metavar or ("FILE" if details.is_output else _type_label(kind))
     described: Any
     if positional:
@@ -330,7 +334,7 @@ def _type_label(kind: Any) -> str | None:
     """Return the type of an option's value in plain words; None for a switch."""
     if get_origin(kind) is Literal:
         return f"<{'|'.join(get_args(kind))}>"
-    # Of an optional value or a list, the type of the value.
+    # An optional value or a list has the label of its value.
     parts = get_args(kind)
     return _type_label(parts[0]) if parts else TYPE_LABELS.get(kind)
 
@@ -433,7 +437,7 @@ def announce_reading(files: Sequence[str]) -> None:
         try:
             size += os.stat(file).st_size
         except (OSError, ValueError):
-            # Who reads it says so in words.
+            # The reader of the file reports it.
             return
     if READ_TIME_PER_BYTE_S * size > 0.2:
         Progress("").expect(

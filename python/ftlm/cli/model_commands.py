@@ -13,6 +13,7 @@ from ftlm.cli.framework import (
     EXIT_VALIDATION,
     OptionalOutputFile,
     OutputFile,
+    OutputPage,
     Positive,
     announce_simulation,
     command,
@@ -130,18 +131,13 @@ def simulate(
 def report(
     model: str,
     *,
-    out: OutputFile,
+    out: OutputPage,
     validation: list[str] | None = None,
     reading: ReadingOptions,
     force: bool = False,
     as_json: bool = False,
 ) -> None:
     """Write the HTML report of a saved model, with validation runs.
-
-    Output
-    ------
-    out : HTML
-        Write the page to this file.
 
     Options
     -------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ftlm.app.server import serve
-from ftlm.cli.framework import NonNegative, OutputFile, Positive, command, print_text, show_json
+from ftlm.cli.framework import NonNegative, OutputPage, Positive, command, print_text, show_json
 from ftlm.cli.options import GeneticOptions
 from ftlm.cli.reading_options import ReadingOptions, given_fields
 from ftlm.errors import ModelError
@@ -75,7 +75,7 @@ def demo(
 @command
 def reproduce(
     *,
-    out: OutputFile = "paper.html",
+    out: OutputPage = "paper.html",
     save: str | None = None,
     square: str | None = None,
     sine: str | None = None,
@@ -92,11 +92,6 @@ def reproduce(
     as_json: bool = False,
 ) -> None:
     """Recompute the tables and figures of the paper on simulated or measured runs, as one HTML page.
-
-    Output
-    ------
-    out : HTML
-        Write the page to this file.
 
     Options
     -------
@@ -149,7 +144,7 @@ def reproduce(
 def orders(
     files: list[str],
     *,
-    out: OutputFile = "orders.html",
+    out: OutputPage = "orders.html",
     reading: ReadingOptions,
     filtered: bool = True,
     threads: int | None = None,
@@ -157,11 +152,6 @@ def orders(
     as_json: bool = False,
 ) -> None:
     """Compare integer and fractional orders of the arm's links by cross-validation over runs, as an HTML page.
-
-    Output
-    ------
-    out : HTML
-        Write the page to this file.
 
     Options
     -------

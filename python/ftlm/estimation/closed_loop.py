@@ -133,14 +133,14 @@ def _criterion(missed: Floats, coefficients: int) -> float:
     return missed.size * math.log(max(power, 1e-300)) + coefficients * math.log(missed.size)
 
 
-def run_with_inputs(run: Run, answers: Mapping[str, Floats]) -> Run:
-    """Return a run with other values of some inputs."""
+def run_with_inputs(run: Run, values: Mapping[str, Floats]) -> Run:
+    """Return a run with other values of some inputs, and with additional inputs, which are held."""
     return Run.from_arrays(
         step=run.step,
-        inputs={n: answers[n] if n in answers else run[n] for n in run.inputs},
+        inputs={**{n: run[n] for n in run.inputs}, **values},
         outputs={n: run[n] for n in run.outputs},
         units={n: u for n, u in run.units.items() if u},
-        intersample=run.intersample,
+        intersample={**dict.fromkeys(values, "zoh"), **run.intersample},
         name=run.name,
         missing="weight",
     )

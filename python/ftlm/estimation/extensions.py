@@ -1,7 +1,7 @@
-"""Tests of other initial conditions, and of extensions of an equation that would explain its colored residuals.
+"""Tests of extensions of an equation that would explain its colored residuals, and of other initial conditions.
 
-Extensions are a drift of the level, another hold of an input between samples, a lag, a delay or lead, a zero, a pole
-with a zero, dry friction, a saturation, a dead zone, a squared input, and a load step.
+Extensions are a drift of the level, another intersample behavior of an input (``"zoh"`` or ``"foh"``), a lag, a delay
+or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared input, and a load step.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ftlm.analysis.poles import steady_states
 from ftlm.data.run import Run, Runs, as_runs
 from ftlm.data.sampling import ZERO_ORDER_HOLD, Intersample, drop_missing, longest_delay
 from ftlm.errors import FtlmError
+from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.model_checks import join_names
@@ -39,41 +40,41 @@ from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.residual_tests import (
     DEFAULT_LAGS,
-    MAX_REST_VELOCITY_RATIO,
-    SIGN_TANH_SLOPE,
     NoiseModel,
     Residuals,
+    friction_term,
     run_residual_tests,
+    sign_tanh_slope,
 )
 
-#: Smallest decrease of the Schwarz criterion that is reported: three times the 10 of very strong evidence, because the
-#: best of several extensions is chosen.
+#: Smallest decrease of the Schwarz criterion that is reported. A decrease of 10 is very strong evidence (Kass and
+#: Raftery, doi:10.1080/01621459.1995.10476572). Three times that is asked, because the best of several is chosen.
 MIN_CRITERION_DECREASE = 30.0
 #: Decrease of the criterion that an extension further down the list needs to replace one above it. An input that was
 #: logged one row late and feedthrough of a first-order plant, for example, give the same samples.
-STRONG_EVIDENCE = 10.0
-#: Samples of the first parts of all runs, to which extensions are fitted.
+MIN_CRITERION_GAP = 10.0
+#: Total number of samples to which extensions are fitted, from the start of each run.
 MAX_EXTENSION_SAMPLES = 6000
 #: Smallest share of a run before and after a load step.
 MIN_LOAD_SHARE = 0.05
-#: Number of rows at which a load step is fitted first.
-FIRST_LOAD_ROWS = 7
+#: Number of initial guesses of the row of a load step.
+LOAD_ROW_GUESSES = 7
 #: Maximum number of searches of the row of a load step from one fit.
 MAX_LOAD_SEARCHES = 4
 #: Smallest saturation limit that is tried, as a share of the largest value of an input.
 MIN_SATURATION_SHARE = 0.05
 #: Largest dead zone that is tried, as a share of the largest value of an input.
-MAX_DEAD_SHARE = 0.9
+MAX_DEAD_ZONE_SHARE = 0.9
 #: Initial guesses of a saturation or dead zone, as shares of the largest value of an input.
-LIMIT_STARTS = (0.25, 0.6)
-#: Least share of rows in which an input changes, so that its behavior between samples is in doubt.
+LIMIT_GUESS_SHARES = (0.25, 0.6)
+#: Least share of rows in which an input changes, so that its intersample behavior is in doubt.
 MIN_CHANGING_SHARE = 0.5
-#: Behavior of an input between samples, as text.
-HOLD_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
+#: Intersample behavior as text.
+INTERSAMPLE_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 #: Smallest difference of an estimated delay from that of the structure that is reported, in standard errors.
-DELAY_SIGMAS = 3.0
-#: Initial conditions and offsets with which a fit is compared.
-OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
+MIN_DELAY_CHANGE_SIGMAS = 3.0
+#: Initial conditions and offsets of the fits with which a fit is compared.
+ALTERNATIVE_INITIAL_CONDITIONS: tuple[tuple[Initial, Offset], ...] = (
     ("rest", "none"),
     ("rest", "level"),
     ("caputo", "none"),
@@ -82,7 +83,7 @@ OTHER_STARTS: tuple[tuple[Initial, Offset], ...] = (
 #: Maximum ratio of the sum of squares under other initial conditions to that of the fit at which both explain a run.
 MAX_SQUARES_RATIO = 1.05
 #: Difference of two gains, in joint standard errors and relative to the larger one, beyond which they contradict.
-GAIN_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
+MIN_GAIN_CHANGE_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 
 
 @dataclass(frozen=True)
@@ -104,9 +105,11 @@ class Extension:
     term_text
         Additional terms as text, for the remedy.
     runs
-        Runs with a load as an additional input, or another hold; None for the given ones.
+        Runs with a load as an additional input, or with another intersample behavior; None for the given ones.
     load_time
         Time of the load step [s].
+    positive
+        Name of a coefficient that must be positive, if there is one: negative friction would drive the motion.
     """
 
     code: str
@@ -117,6 +120,7 @@ class Extension:
     term_text: str = ""
     runs: Runs | None = None
     load_time: float = 0.0
+    positive: str = ""
 
 
 @dataclass(frozen=True)
@@ -130,20 +134,21 @@ class FittedExtension:
 
 @dataclass(frozen=True)
 class ExtensionTests:
-    """Findings on what a structure lacks, and whether friction was among the extensions that were fitted."""
+    """Findings on what a structure lacks, and whether a fit with dry friction was compared."""
 
     findings: list[Finding]
-    has_friction: bool = False
+    friction_tested: bool = False
 
 
 def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     """Fit extensions if residuals are colored, and name one that clearly lowers their one-step prediction error.
 
     Colored noise and a response that the structure lacks both color residuals. Noise has the same one-step prediction
-    error, the variance of the innovations of an autoregression, whichever structure is fitted; a response has not. The
-    extension is named if its residuals depend neither on an input nor on the direction of motion. Structures without
-    friction, limits and free delays are tested; those with non-linear terms, several equations or a coefficient law for
-    a drift and another hold alone.
+    error, the variance of the innovations of an autoregression, whichever structure is fitted. A missing response
+    raises it. The extension is named if its residuals depend neither on an input nor on the direction of motion.
+
+    Structures with friction, limits or free delays are not tested. Those of several equations or with a coefficient law
+    are tested for drift and intersample behavior alone, those with non-linear terms for intersample behavior alone.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     colored = any(not o.whiteness.passed or o.follows_direction for o in tests.outputs.values())
@@ -153,23 +158,24 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     structure = replace(structure, initial=joint.initial)
     names = _inputs_of_single_equation(structure, runs)
     about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
-    friction = _friction(structure, runs) if names else []
     try:
         joint, runs = _first_samples(joint, structure, runs)
         own = _prediction_criterion(joint, structure, runs, 0)
-        found = [*_drift(structure), *_other_holds(structure, joint, runs)]
+        extensions = [*_drift(structure, runs), *_other_intersample(structure, joint, runs)]
         if names:
-            found += [*_extensions(structure, joint, runs, names), *friction, *_load_step(structure, joint, runs)]
-        best = _best_extension(found, joint, runs, own)
+            extensions += _extensions(structure, joint, runs, names)
+            extensions += [*_friction(structure, runs), *_load_step(structure, joint, runs)]
+        fitted = [f for e in extensions if (f := _fit_extension(e, runs)) is not None]
+        best = _best_extension(fitted, own)
         clear = best is not None and best.criterion <= own - MIN_CRITERION_DECREASE
-        findings = _findings_of(best, structure, joint, runs, names, about) if best is not None and clear else []
+        findings = _extension_findings(best, structure, joint, runs, names, about) if best and clear else []
     except FtlmError:
-        # An extension that cannot be fitted is not reported.
+        # The fit to the first samples failed, with which extensions are compared.
         return ExtensionTests([])
-    return ExtensionTests(findings, bool(friction))
+    return ExtensionTests(findings, any(f.extension.code == "friction_fits" for f in fitted))
 
 
-def _findings_of(
+def _extension_findings(
     best: FittedExtension,
     structure: Structure,
     joint: JointFit,
@@ -177,7 +183,10 @@ def _findings_of(
     names: Sequence[str],
     about: Mapping[str, str],
 ) -> list[Finding]:
-    """Return the findings on the best extension: its own if its residuals are independent of inputs and direction."""
+    """Return the finding of the best extension, or ``dynamics_missing`` if its residuals still fail a test.
+
+    Another intersample behavior that changes no parameter is not reported.
+    """
     missing = [make_finding("dynamics_missing", input=join_names(names), **about)] if names else []
     extension, refit = best.extension, best.fit
     if not _passes_residual_tests(best, runs):
@@ -185,7 +194,7 @@ def _findings_of(
     if extension.code == "drift_fits":
         return [make_finding("drift_fits", **about, **_largest_change(joint, refit))]
     if extension.code == "other_intersample_fits":
-        return _hold_findings(extension, joint, refit, runs, about)
+        return _intersample_findings(extension, joint, refit, runs, about)
     if extension.code == "delay_fits":
         return _delay_findings(extension, refit, structure, min(r.step for r in runs), about) or missing
     about, numbers = dict(about), {}
@@ -197,7 +206,7 @@ def _findings_of(
             "error": refit.standard_errors[load_name],
         }
     if extension.code == "friction_fits":
-        (name,) = (n for n in refit.coefficients if n not in joint.coefficients)
+        name = extension.positive
         numbers = {"value": refit.coefficients[name], "error": refit.standard_errors[name]}
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
@@ -216,18 +225,18 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
     return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
 
 
-def _drift(structure: Structure) -> list[Extension]:
+def _drift(structure: Structure, runs: Runs) -> list[Extension]:
     """Return the linear structure with levels of the outputs that change linearly; none if its offsets were given."""
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
-    count = 2 * len(structure.equations)
+    count = (2 if structure.offset == "none" else 1) * len(structure.equations) * len(runs)
     return [Extension("drift_fits", replace(structure, offset="ramp"), count, [])]
 
 
-def _other_holds(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the structure with the other hold of each input that changes in most rows.
+def _other_intersample(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+    """Return the structure with the other intersample behavior of each input that changes in most rows.
 
-    Samples alone do not distinguish a staircase from a smooth signal. The wrong hold acts like a delay of half a
+    Samples alone do not distinguish a staircase from a smooth signal. The wrong assumption acts like a delay of half a
     sample, which biases the parameters.
     """
     found = []
@@ -241,20 +250,23 @@ def _other_holds(structure: Structure, joint: JointFit, runs: Runs) -> list[Exte
     return found
 
 
-def _hold_findings(
+def _intersample_findings(
     extension: Extension, joint: JointFit, refit: JointFit, runs: Runs, about: Mapping[str, str]
 ) -> list[Finding]:
-    """Return a finding on another hold, if a parameter then differs by more than one standard error."""
+    """Return a finding on another intersample behavior if a parameter then differs by over one standard error."""
     change = _largest_change(joint, refit)
     if not abs(change["other_value"] - change["value"]) > change["error"]:
         return []
     (name,), other = extension.inputs, as_runs(extension.runs or runs)[0].intersample
-    words = {"taken": HOLD_NAMES[runs[0].intersample[name]], "other": HOLD_NAMES[other[name]]}
+    words = {"taken": INTERSAMPLE_NAMES[runs[0].intersample[name]], "other": INTERSAMPLE_NAMES[other[name]]}
     return [make_finding(extension.code, input=name, kind=other[name], **about, **change, **words)]
 
 
 def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
-    """Return the ratio of the sums of squares of two fits, and the parameter that differs most in standard errors."""
+    """Return the smallest ratio over outputs of the sums of squares, and the parameter that differs most.
+
+    The difference is measured in standard errors of the first fit.
+    """
     ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
     values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
     moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
@@ -280,28 +292,30 @@ def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list
     return list(itertools.islice((n for n in names if n not in taken), count))
 
 
-def _best_extension(
-    extensions: Sequence[Extension],
-    joint: JointFit,
-    runs: Runs,
-    own_criterion: float,
-    best: FittedExtension | None = None,
-) -> FittedExtension | None:
-    """Return the fitted extension of least criterion, or `best` if none is clearly better.
+def _fit_extension(extension: Extension, runs: Runs) -> FittedExtension | None:
+    """Return the best fit of an extension; None if a fit fails."""
+    there = extension.runs or runs
+    try:
+        fits = [fit_output_error(there, extension.structure, start=s, refine=False) for s in extension.starts]
+    except FtlmError:
+        return None
+    refit = min(fits, key=lambda f: max(f.noise.values()))
+    criterion = _prediction_criterion(refit, extension.structure, there, extension.parameter_count)
+    return FittedExtension(extension, refit, criterion)
 
-    `own_criterion` is the criterion of the structure without an extension.
+
+def _best_extension(fitted: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
+    """Return the extension of least criterion, or None if none is below that of the structure itself.
+
+    An extension further down the list must be better by `MIN_CRITERION_GAP`.
     """
-    for extension in extensions:
-        there = extension.runs or runs
-        try:
-            fits = [fit_output_error(there, extension.structure, start=s, refine=False) for s in extension.starts]
-        except FtlmError:
+    best: FittedExtension | None = None
+    for item in fitted:
+        positive = item.extension.positive
+        if item.fit.unstable_optimum is not None or (positive and not item.fit.coefficients[positive] > 0.0):
             continue
-        refit = min(fits, key=lambda f: max(f.noise.values()))
-        criterion = _prediction_criterion(refit, extension.structure, there, extension.parameter_count)
-        limit = own_criterion if best is None else best.criterion - STRONG_EVIDENCE
-        if refit.unstable_optimum is None and criterion < limit:
-            best = FittedExtension(extension, refit, criterion)
+        if item.criterion < (own_criterion if best is None else best.criterion - MIN_CRITERION_GAP):
+            best = item
     return best
 
 
@@ -313,7 +327,7 @@ def _delay_findings(
     for name in extension.inputs:
         key = input_name("delay", name)
         value, error = refit.values_by_name[key], refit.standard_errors[key]
-        if abs(value - structure.delay.get(name, 0.0)) > DELAY_SIGMAS * error:
+        if abs(value - structure.delay.get(name, 0.0)) > MIN_DELAY_CHANGE_SIGMAS * error:
             numbers = {"value": abs(value), "error": error, "rows": abs(value) / step, "longest": 2.0 * abs(value)}
             code = "delay_fits" if value > 0.0 else "lead_fits"
             findings.append(make_finding(code, input=name, **about, **numbers))
@@ -356,10 +370,13 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     known, (coefficient,) = joint.values_by_name, _unused_names("k", 1, structure, runs[0])
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
-        ends = {"saturation": (MIN_SATURATION_SHARE * largest, largest), "dead_zone": (0.0, MAX_DEAD_SHARE * largest)}
+        ends = {
+            "saturation": (MIN_SATURATION_SHARE * largest, largest),
+            "dead_zone": (0.0, MAX_DEAD_ZONE_SHARE * largest),
+        }
         effects: tuple[InputEffect, InputEffect] = ("saturation", "dead_zone")
         for effect in effects:
-            starts = [{**known, input_name(effect, name): share * largest} for share in LIMIT_STARTS]
+            starts = [{**known, input_name(effect, name): share * largest} for share in LIMIT_GUESS_SHARES]
             limits = {effect: {name: ends[effect]}}
             add(f"{effect}_fits", partial(structure.with_limits, **limits), 1, [name], starts=starts)
         square = Term(name, Order(0.0), coefficient, expression=power(channel(name), 2.0))
@@ -369,9 +386,9 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
 
 
 def _friction(structure: Structure, runs: Runs) -> list[Extension]:
-    """Return the structure with dry friction that opposes the derivative of the output, and the output itself.
+    """Return the structure with Coulomb friction −fc sign(D y), and with −fc tanh(s y), of an output that is a speed.
 
-    An output that never changes its sign has friction that is a constant.
+    The second needs an output of both signs: it is a constant otherwise.
     """
     (item,) = structure.equations
     (name,) = _unused_names("fc", 1, structure, runs[0])
@@ -383,22 +400,15 @@ def _friction(structure: Structure, runs: Runs) -> list[Extension]:
         # Not simulated are, for example, friction of an output of order 1 and friction behind a sensor filter.
         with contextlib.suppress(FtlmError):
             wider = replace(structure, equations=(replace(item, **changes),), initial=initial)
-            found.append(Extension("friction_fits", wider, 1, [], term_text=shown))
+            found.append(Extension("friction_fits", wider, 1, [], term_text=shown, positive=name))
 
-    add(f"- {name}*sign(D {item.output})", coulomb=Friction(name))
-    slope = sign_tanh_slope(runs, item.output)
+    add(friction_term(item.output, name), coulomb=Friction(name))
+    slope = sign_tanh_slope([run[item.output] for run in runs])
     if math.isfinite(slope):
         smooth = apply("tanh", multiply(constant(slope), channel(item.output)))
         term = Term(item.output, Order(0.0), name, factor=-1.0, expression=smooth)
-        add(f"- {name}*tanh({slope:.2g} {item.output})", terms=(*item.terms, term))
+        add(friction_term(item.output, name, slope), terms=(*item.terms, term))
     return found
-
-
-def sign_tanh_slope(runs: Sequence[Run], output: str) -> float:
-    """Return the slope of a tanh that replaces the sign of an output; infinite if the output has one sign."""
-    low, high = (float(f([f(run[output]) for run in runs])) for f in (np.nanmin, np.nanmax))
-    largest = max(-low, high)
-    return SIGN_TANH_SLOPE / largest if min(-low, high) > MAX_REST_VELOCITY_RATIO * largest else math.inf
 
 
 def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
@@ -416,7 +426,7 @@ def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extens
     size = run.length
 
     def fit_at(row: int, near: JointFit) -> JointFit:
-        loaded = _with_input(run, name, np.where(np.arange(size) >= row, 1.0, 0.0))
+        loaded = run_with_inputs(run, {name: np.where(np.arange(size) >= row, 1.0, 0.0)})
         start = {name: 0.0, **near.values_by_name}
         return fit_output_error([loaded], wider, start=start, refine=False)
 
@@ -433,29 +443,17 @@ def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extens
         return (fitted.noise[item.output] if row else math.inf), row
 
     try:
-        rows = np.linspace(0, size, FIRST_LOAD_ROWS + 2).astype(int)[1:-1]
+        rows = np.linspace(0, size, LOAD_ROW_GUESSES + 2).astype(int)[1:-1]
         best = min(((fit_at(int(k), joint), int(k)) for k in rows), key=lambda pair: pair[0].noise[item.output])
         noise, row = min(search(joint, 0), search(*best))
     except FtlmError:
         return []
     if not math.isfinite(noise):
         return []
-    loaded = _with_input(run, name, np.where(np.arange(size) >= row, 1.0, 0.0))
+    loaded = run_with_inputs(run, {name: np.where(np.arange(size) >= row, 1.0, 0.0)})
     starts = [None, {name: 0.0, **joint.values_by_name}]
     time = run.start + row * run.step
     return [Extension("load_step_fits", wider, 2, [name], starts, runs=as_runs(loaded), load_time=time)]
-
-
-def _with_input(run: Run, name: str, values: Floats) -> Run:
-    """Return a run with an additional held input."""
-    return Run.from_arrays(
-        step=run.step,
-        inputs={**{n: run[n] for n in run.inputs}, name: values},
-        outputs={n: run[n] for n in run.outputs},
-        intersample={**run.intersample, name: "zoh"},
-        name=run.name,
-        missing="weight",
-    )
 
 
 def _load_response(item: Equation, structure: Structure, joint: JointFit, run: Run) -> Floats:
@@ -505,22 +503,24 @@ def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
 def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, added_parameters: int) -> float:
     """Return the Schwarz criterion of one-step predictions of the residuals by autoregressions of up to 25 lags.
 
-    Least squares ignores the color of the noise. One generalized least-squares step subtracts what errors of the
-    parameters leave in the residuals.
+    Least squares ignores the color of the noise. One generalized least-squares step first removes the part of the
+    residuals that errors of the parameters explain. Of the parameters, those of the autoregressions and
+    ``added_parameters`` are counted.
     """
-    total = 0.0
-    sensitivities = output_sensitivities(runs, structure, joint.values_by_name, max(joint.refinement, 1))
+    total, samples = 0.0, 0
+    sensitivities = output_sensitivities(joint, structure, runs)
     for name in joint.noise:
         series = [joint.noise[name] * part[name] for part in joint.residuals]
         series = NoiseModel.fit(series, [], DEFAULT_LAGS).subtract(series, sensitivities.get(name, []))
         _, _, innovations, parameters = _core.arx_model(series, [], DEFAULT_LAGS)
-        left = np.concatenate(innovations)
-        rows = int(np.isfinite(left).sum())
-        power = float(np.nanmean(left**2)) if rows else math.nan
+        innovation = np.concatenate(innovations)
+        rows = int(np.isfinite(innovation).sum())
+        power = float(np.nanmean(innovation**2)) if rows else math.nan
         if not power > 0.0:
             return math.inf
-        total += rows * math.log(power) + (parameters + added_parameters) * math.log(rows)
-    return total
+        total += rows * math.log(power) + parameters * math.log(rows)
+        samples += rows
+    return total + added_parameters * math.log(samples)
 
 
 def _passes_residual_tests(fitted: FittedExtension, given: Runs) -> bool:
@@ -533,7 +533,7 @@ def _passes_residual_tests(fitted: FittedExtension, given: Runs) -> bool:
             runs,
             simulate_runs(model, runs),
             lags=DEFAULT_LAGS,
-            sensitivities=lambda: output_sensitivities(runs, structure, joint.values_by_name, max(joint.refinement, 1)),
+            sensitivities=lambda: output_sensitivities(joint, structure, runs),
         )
     except FtlmError:
         return False
@@ -553,7 +553,7 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
     taken = joint.initial if joint.initial == "rest" else "caputo", structure.offset
     own = _gains(joint, structure)
     worst: tuple[float, Finding] | None = None
-    for initial, offset in OTHER_STARTS if own else ():
+    for initial, offset in ALTERNATIVE_INITIAL_CONDITIONS if own else ():
         if (initial, offset) == taken:
             continue
         try:
@@ -567,7 +567,7 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
             known, own_error = own.get(pair, (math.nan, math.nan))
             distance = abs(gain - known) / max(math.hypot(error, own_error), 1e-300)
             far = abs(gain - known) > MIN_GAIN_CHANGE * max(abs(gain), abs(known))
-            if far and distance > max(GAIN_SIGMAS, worst[0] if worst else 0.0):
+            if far and distance > max(MIN_GAIN_CHANGE_SIGMAS, worst[0] if worst else 0.0):
                 numbers = {"gain": known, "error": own_error, "other_gain": gain, "other_error": error}
                 words = {"taken": _name_start(*taken), "other": _name_start(initial, offset), "ratio": ratio}
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}

@@ -19,6 +19,7 @@ from ftlm.analysis.model_algebra import Ratio
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.model_checks import has_growing_mode, unstable_poles_text
+from ftlm.estimation.response_problem import is_impedance
 from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_from, verdict_html
 from ftlm.findings import Finding, group_findings, make_finding, texts
 from ftlm.model.model import Model
@@ -168,11 +169,6 @@ def _impedance_chart(
         y_label=f"|Z| [{unit}]" if is_size else curve.label,
         caption="Shade: 95 % band, from the covariance of the fit." if bands else "",
     )
-
-
-def is_impedance(record: FrequencyData) -> bool:
-    """Whether a record is an impedance, by its unit."""
-    return record.unit.endswith("Ω")
 
 
 def nyquist_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Complex, Complex, str, str]:

@@ -525,7 +525,7 @@ def assess_fit(fit: Fit) -> Identification:
     if tests is not None:
         extensions = run_extension_tests(fit, tests)
         missing = extensions.findings
-        if extensions.has_friction:
+        if extensions.friction_tested:
             # The fit with friction decides about friction.
             outputs = {n: replace(o, direction=None) for n, o in tests.outputs.items()}
             tests = replace(tests, outputs=outputs)
@@ -574,7 +574,7 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
     if joint is None or not joint.names or structure.has_friction:
         return None
     asked = replace(structure, initial=joint.initial)
-    return lambda: output_sensitivities(fit.task.runs, asked, joint.values_by_name, max(joint.refinement, 1))
+    return lambda: output_sensitivities(joint, asked, fit.task.runs)
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:

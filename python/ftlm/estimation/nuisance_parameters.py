@@ -183,15 +183,13 @@ def offset_test(
     return OffsetTest(statistic, count, float(along @ along) / total, size)
 
 
-def output_sensitivities(
-    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
-) -> dict[str, list[Floats]]:
+def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[Run]) -> dict[str, list[Floats]]:
     """Return d(residuals)/d(parameters) of each output, per run, with shape (parameters, samples); {} if not finite.
 
     Their projection on the initial terms is subtracted.
     """
     try:
-        grid, here = evaluate_at_point(runs, structure, values, every)
+        grid, here = evaluate_at_point(runs, structure, joint.values_by_name, max(joint.refinement, 1))
     except FtlmError:
         return {}
     rows, blocks = np.asarray(here.outcome["jacobian"]), _residual_blocks(grid)

@@ -29,8 +29,9 @@ def exponent_bound(name: str) -> str:
     return f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
 
 
-def _is_impedance(records: Sequence[FrequencyData]) -> bool:
-    return all(record.unit.endswith("Ω") for record in records)
+def is_impedance(record: FrequencyData) -> bool:
+    """Whether a record is an impedance, by its unit."""
+    return record.unit.endswith("Ω")
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,9 @@ class ResponseProblem:
         #: Free orders of an impedance that the user gives no values. As exponents of constant-phase elements they are
         #: at most 1; an order such as alpha + 0.5 may exceed it.
         self.exponents = tuple(
-            n for n in self.orders if bound_exponents and n not in structure.order_values and _is_impedance(records)
+            n
+            for n in self.orders
+            if bound_exponents and n not in structure.order_values and all(map(is_impedance, records))
         )
         every = np.concatenate([r.frequency for r in records])
         self.unit = float(np.exp(np.mean(np.log(every))))

@@ -22,7 +22,7 @@ from ftlm.structure.order import Order
 from ftlm.utils.formatting import Cell, Exact, format_bound, symbol, with_error, wrap_text
 from ftlm.utils.parameters import choose_text
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.validation.comparison import Comparison, describe_offsets, initial_term_counts
+from ftlm.validation.comparison import Comparison, describe_initial_terms, describe_offsets
 
 #: Most modes that are listed.
 MOST_MODES = 6
@@ -35,7 +35,7 @@ def summary(result: Identification, validation: Comparison | None = None) -> str
     lines += equation_lines(result.model, result.comparison)
     lines += ["", *parameter_lines(result), *behavior_lines(result.model), ""]
     lines += [*fit_lines(result, validation), *_residuals(result), *_starts(result)]
-    if validation is not None and (terms := initial_term_counts(validation)):
+    if validation is not None and (terms := describe_initial_terms(validation)):
         lines += wrap_text(f"initial terms and levels of validation runs, estimated on them (their number): {terms}")
     lines += finding_lines(result.findings)
     return "\n".join(lines)
@@ -170,7 +170,7 @@ def _starts(result: Identification) -> list[str]:
     shown = {o for o in result.output_error if _offset(o, comparison) is not None}
     hidden = any(o not in shown or "level" in run[o] for run in comparison.offsets for o in run)
     lines = describe_offsets(comparison) if hidden else []
-    moving = "" if comparison.offsets else initial_term_counts(comparison)
+    moving = "" if comparison.offsets else describe_initial_terms(comparison)
     if moving and not any(f.code == "runs_split" for f in result.findings):
         lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {moving}")
     return lines

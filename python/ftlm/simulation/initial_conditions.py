@@ -127,18 +127,19 @@ _EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, 
 )
 
 
-#: The whole run of a run with masked outputs.
-_WHOLE_RUNS: WeakKeyDictionary[Run, Run] = WeakKeyDictionary()
+#: Original run of each run with masked outputs.
+_UNMASKED_RUNS: WeakKeyDictionary[Run, Run] = WeakKeyDictionary()
 
 
-def share_start(masked: Run, whole: Run) -> None:
-    """Take the start of a run with masked outputs from the whole run: masking rows does not set a plant in motion."""
-    _WHOLE_RUNS[masked] = whole
+def use_rest_evidence_of(masked: Run, original: Run) -> None:
+    """Use the evidence of rest, and the levels, of the original run for a run with masked outputs."""
+    # A mask does not change the initial state.
+    _UNMASKED_RUNS[masked] = original
 
 
 def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     """Return the evidence that the plant rested before the run, or None if it may have been in motion."""
-    run = _WHOLE_RUNS.get(run, run)
+    run = _UNMASKED_RUNS.get(run, run)
     found = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
     if key not in found:
@@ -275,8 +276,8 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
     read = run.sample_times
     own = None if read is None else {n: read.data[n] - v for n, v in moved.items()}
     shifted = run.with_samples(samples, own)
-    if run in _WHOLE_RUNS:
-        share_start(shifted, deviations(_WHOLE_RUNS[run], structure)[0])
+    if run in _UNMASKED_RUNS:
+        use_rest_evidence_of(shifted, deviations(_UNMASKED_RUNS[run], structure)[0])
     return shifted, levels
 
 

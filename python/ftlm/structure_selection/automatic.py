@@ -9,7 +9,6 @@ from typing import Literal, TypeAlias
 
 from ftlm.data.run import Run
 from ftlm.data.sampling import longest_delay
-from ftlm.estimation.extensions import sign_tanh_slope
 from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.parser import equation
@@ -21,10 +20,10 @@ from ftlm.structure_selection.cross_validation import (
     residual_variance_inflation,
     schwarz_criterion,
 )
-from ftlm.structure_selection.stepwise import CandidateEvaluator, values_of
-from ftlm.utils.statistics import chi_squared_99, portmanteau
+from ftlm.structure_selection.stepwise import CandidateEvaluator
+from ftlm.utils.statistics import is_white
 from ftlm.validation.feedback import feedback_test
-from ftlm.validation.residual_tests import DEFAULT_LAGS
+from ftlm.validation.residual_tests import friction_term, sign_tanh_slope
 
 #: Highest integer order.
 MAX_ORDER = 4
@@ -63,11 +62,11 @@ class IntegerOrderForm:
     integrator
         Whether the equation has no term in the output itself: a pole at s = 0.
     offset
-        Kind of offset of each run: ``"none"``; ``"level"``, the value at which the output rests; or ``"ramp"``, a load
-        that drifts.
+        Kind of offset of each run: ``"none"``; ``"level"``, the value at which the output rests; or ``"ramp"``, a
+        linear trend.
     friction
-        Dry friction: ``"none"``; ``"position"``, which opposes the derivative of the output; or ``"speed"``, which
-        opposes the output.
+        Coulomb friction: ``"none"``; ``"derivative"``, which opposes the derivative of the output, a position; or
+        ``"output"``, which opposes the output itself, a speed.
     """
 
     order: int
@@ -75,7 +74,7 @@ class IntegerOrderForm:
     delayed: bool = False
     integrator: bool = False
     offset: str = "none"
-    friction: Literal["none", "position", "speed"] = "none"
+    friction: Literal["none", "derivative", "output"] = "none"
 
     @property
     def has_feedthrough(self) -> bool:
@@ -94,10 +93,8 @@ class IntegerOrderForm:
         ]
         text = f"{_derivative(self.order, output)} = {' + '.join([*own, *driving])}"
         if self.friction != "none":
-            velocity = (
-                f"sign(D {output})" if self.friction == "position" else f"tanh({problem.sign_slope:.3g} {output})"
-            )
-            text += f" - fc{end}*{velocity}"
+            slope = problem.tanh_slope if self.friction == "output" else math.inf
+            text += " " + friction_term(output, f"fc{end}", slope)
         delay = problem.input_delays(delayed=self.delayed)
         return equation(text, delay=delay, offset=self.offset, initial=problem.initial)
 
@@ -140,13 +137,13 @@ class OutputProblem:
 
     @property
     def has_free_delays(self) -> bool:
-        """Whether a delayed form differs from one that is not."""
+        """Whether the delay of an input is not given as a number."""
         return self.input_delays(delayed=False) != self.input_delays(delayed=True)
 
     @property
-    def sign_slope(self) -> float:
-        """Slope of the tanh that replaces the sign of the output."""
-        return sign_tanh_slope(self.runs, self.output)
+    def tanh_slope(self) -> float:
+        """Slope of the tanh that replaces the sign of the output; infinite if the output has one sign."""
+        return sign_tanh_slope([run[self.output] for run in self.runs])
 
     def input_delays(self, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
         """Return the delays [s] of the driving inputs: a number, or an interval of one to estimate.
@@ -288,15 +285,15 @@ class AutomaticSelection:
         expanded: set[IntegerOrderForm | None] = {None}
         while new:
             expanded.update(new)
-            near = [n for form in new if form for n in _neighbors(form) if self._is_open(n)]
+            near = [n for form in new if form for n in _neighbors(form) if self._is_admissible(n)]
             more = [n for n in dict.fromkeys(near) if n not in done]
             done.update(more)
             fits = _rank([*fits, *self._fit(more)])
             new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
         return fits
 
-    def _is_open(self, form: IntegerOrderForm) -> bool:
-        """Whether a form has neither feedthrough of an input in a loop, nor a free delay where all are given."""
+    def _is_admissible(self, form: IntegerOrderForm) -> bool:
+        """Whether feedback and the given delays allow a form."""
         free = not form.delayed or self.problem.has_free_delays
         return free and not (self.feedback and form.has_feedthrough)
 
@@ -337,13 +334,15 @@ class AutomaticSelection:
         return self._fit_zeros(delayed, fits)
 
     def _fit_friction(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
-        """Add a speed or position with dry friction if residuals are colored and friction clearly lowers BIC."""
-        late = bool(fits and fits[0].form and fits[0].form.delayed)
-        speed = IntegerOrderForm(1, 0, delayed=late, offset=offset, friction="speed")
-        changes_sign = math.isfinite(self.problem.sign_slope)
-        for form in ([speed] if changes_sign else []) + [replace(speed, order=2, friction="position")]:
-            if fits and not _has_white_residuals(fits[0].joint):
-                ranked = _rank([*fits, *self._fit([form])])
+        """Add forms of order 1 and 2 with friction if residuals are colored and friction clearly lowers BIC."""
+        delayed = bool(fits and fits[0].form and fits[0].form.delayed)
+        speed = IntegerOrderForm(1, 0, delayed=delayed, offset=offset, friction="output")
+        changes_sign = math.isfinite(self.problem.tanh_slope)
+        for form in ([speed] if changes_sign else []) + [replace(speed, order=2, friction="derivative")]:
+            if fits and not all(is_white(e) for part in fits[0].joint.residuals for e in part.values()):
+                # Negative friction would drive the motion.
+                fitted = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
+                ranked = _rank([*fits, *fitted])
                 least = min(f.bic for f in ranked if f.form != form)
                 fits = ranked if ranked[0].bic < least - MIN_BIC_DECREASE else fits
         return fits
@@ -386,7 +385,7 @@ class AutomaticSelection:
             delay = self.problem.input_delays(delayed=delayed)
             return equation(text, delay=delay, offset=form.offset, initial=self.problem.initial)
 
-        late = {} if best is None else {n: v for n, v in values_of(best.joint).items() if n.startswith("delay_")}
+        late = {} if best is None else {n: v for n, v in best.joint.values_by_name.items() if n.startswith("delay_")}
 
         def start(of: Structure, alpha: float) -> dict[str, float]:
             known = {"a0": -(frequency**alpha), "a1": -0.3 * frequency ** (alpha - 0.5), "alpha": alpha, "mu": 0.5}
@@ -402,15 +401,9 @@ class AutomaticSelection:
         if form.delayed and found:
             text = next(t for t in texts if structure(t) == found[0].structure)
             delayed = structure(text, delayed=True)
-            begin = [{**late, **values_of(found[0].joint)}, *(start(delayed, a) for a in texts[text])]
+            begin = [{**late, **found[0].joint.values_by_name}, *(start(delayed, a) for a in texts[text])]
             found += self._fit_structures([(delayed, None, begin)])
         return _rank(found)
-
-
-def _has_white_residuals(joint: JointFit) -> bool:
-    """Whether the residuals of every output pass the test of whiteness."""
-    series = ([part[name] for part in joint.residuals] for name in joint.noise)
-    return all(portmanteau(parts, DEFAULT_LAGS) <= chi_squared_99(DEFAULT_LAGS) for parts in series)
 
 
 def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
@@ -461,9 +454,3 @@ def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
                 if size > 0.0 and damping < 2.0 * math.sqrt(size):
                     return math.sqrt(size)
     return 1.0
-
-
-def is_fractional(structure: Structure) -> bool:
-    """Whether an order of a structure is free or fractional."""
-    orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
-    return any(o.names or not float(o.constant).is_integer() for o in orders)

@@ -17,7 +17,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
-from ftlm.simulation.initial_conditions import share_start
+from ftlm.simulation.initial_conditions import use_rest_evidence_of
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import vector_norm
@@ -51,8 +51,8 @@ class Fold:
         return f"{self.validation_run.name} {self.rows[0] * step:g}-{self.rows[1] * step:g} s"
 
     @property
-    def leaves_excitation(self) -> bool:
-        """Whether an input changes outside the validation rows, unless none ever changes."""
+    def has_estimation_excitation(self) -> bool:
+        """Whether an input changes in the estimation rows, or no input changes at all."""
         inside = 0
         for run in self.runs:
             masked = self.rows if run is self.validation_run and self.rows is not None else (0, 0)
@@ -66,7 +66,10 @@ class Fold:
 
     @property
     def has_motion(self) -> bool:
-        """Whether an output moves in the validation rows by more than its noise."""
+        """Whether the standard deviation of an output in the validation rows exceeds √2 times its noise.
+
+        True for whole runs.
+        """
         if self.rows is None:
             return True
         pairs = [(self.validation_run[n], slice(*self.rows)) for n in self.validation_run.outputs]
@@ -121,7 +124,7 @@ def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run
         name=run.name,
         missing="weight",
     )
-    share_start(masked, run)
+    use_rest_evidence_of(masked, run)
     return masked
 
 
@@ -197,7 +200,7 @@ class Folds:
         blocks = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
         # Without the only rows in which an input changes, a fit has nothing to identify the plant from, and noise about
         # a standstill shows no prediction.
-        parts = [fold for fold in blocks if fold.leaves_excitation and fold.has_motion] or blocks
+        parts = [fold for fold in blocks if fold.has_estimation_excitation and fold.has_motion] or blocks
         return cls(every, tuple(parts), f"each of {len(parts)} blocks by a fit without its outputs")
 
     @classmethod
@@ -379,7 +382,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         runs = fold.estimation_runs(structure.outputs)
         try:
             if runs is not folds.runs and fold.rows is not None and _has_measured_drivers(structure):
-                validation[fold.name] = _validate_equations(structure, fold, joint, refine=fine)
+                validation[fold.name] = _validate_separately(structure, fold, joint, refine=fine)
                 continue
             own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
             validation[fold.name] = fold.fit(fitted_model(replace(own, initial=joint.initial), structure))
@@ -414,8 +417,12 @@ def _has_measured_drivers(structure: Structure) -> bool:
     return structure.coupling == "measured" and any(name in structure.outputs for names in others for name in names)
 
 
-def _validate_equations(structure: Structure, fold: Fold, joint: JointFit, *, refine: bool) -> dict[str, float]:
-    """Return the fits on a block, each equation refitted alone: its driving outputs are known where its own is not."""
+def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, refine: bool) -> dict[str, float]:
+    """Refit each equation alone on a fold, and return the fits of the outputs on the validation data.
+
+    Only the output of the equation is masked; other outputs are measured inputs. A parameter that equations share has
+    an estimate in each.
+    """
     fits: dict[str, float] = {}
     for output in structure.outputs:
         alone = replace(structure.equation(output), initial=joint.initial)

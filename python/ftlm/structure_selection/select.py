@@ -19,6 +19,7 @@ from ftlm.estimation.unstable_plants import least_squares_piece_test
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degenerate
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
+from ftlm.simulation.initial_conditions import has_memory
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.automatic import (
     MAX_ORDER,
@@ -26,7 +27,6 @@ from ftlm.structure_selection.automatic import (
     Delays,
     IntegerOrderForm,
     OutputProblem,
-    is_fractional,
 )
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
@@ -422,7 +422,7 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Id
     if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
         return []
     named = ", ".join(f"{n} = {found.orders[n]:.3g}" for n in orders)
-    rival = next((t for t in ranked if t.failed is None and not is_fractional(t.structure)), None)
+    rival = next((t for t in ranked if t.failed is None and not has_memory(t.structure)), None)
     if rival is None or set(rival.parts) != set(winner.parts):
         reason = "no candidate with integer orders was fitted"
         return [make_finding("fractional_orders_not_told", parameter=named, reason=reason)]
@@ -499,8 +499,8 @@ def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[lis
     Fractional orders predict better only if their residuals are 1 % smaller than those of the best integer orders, and
     significantly over the folds. They are also eligible if they predict as well and their criterion is much lower.
     """
-    whole = [k for k in _peer_indices(ranked) if not is_fractional(ranked[k].structure)]
-    other = [k for k in near if is_fractional(ranked[k].structure)]
+    whole = [k for k in _peer_indices(ranked) if not has_memory(ranked[k].structure)]
+    other = [k for k in near if has_memory(ranked[k].structure)]
     if not whole or not other:
         return list(near), ""
     least = ranked[min(whole, key=lambda k: ranked[k].score)]

@@ -273,7 +273,7 @@ def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[
     if not ends:
         return work.trials
     first = min(ends, key=lambda end: _ranking_key(end[0]))
-    joined = [values_of(j) for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
+    joined = [j.values_by_name for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
     from_above = _eliminate_from_full(inside, work, first[1], joined, tried)
     ends += [] if from_above is None else [from_above]
     return _eliminate_from_ends(inside, work, ends, tried)
@@ -348,11 +348,6 @@ def _ranking_key(trial: Trial) -> tuple[bool, float]:
     return trial.unstable, trial.score
 
 
-def values_of(joint: JointFit) -> dict[str, float]:
-    """Return the estimates of all free parameters by name."""
-    return joint.values_by_name
-
-
 def _select_forward(
     inside: NestedStructures,
     work: CandidateEvaluator,
@@ -402,9 +397,8 @@ def _eliminate_from_full(
     if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
         return None
     structure = inside.build(full)
-    starts = [
-        initial_guesses(structure, known, full.integer_order_values())[0] for known in (values_of(low.joint), *others)
-    ]
+    known_values = (low.joint.values_by_name, *others)
+    starts = [initial_guesses(structure, known, full.integer_order_values())[0] for known in known_values]
     (joint,) = work.map_candidates(lambda item: work.fit_candidate(item, starts, refine=False), [structure])
     if isinstance(joint, FtlmError):
         return None
@@ -460,7 +454,7 @@ def _fit_changes(
     inside: NestedStructures, work: CandidateEvaluator, at: FittedVariant, changes: Sequence[Change]
 ) -> list[FittedVariant]:
     """Fit changes from the current optimum, best first; for long records only survivors of the prescreening."""
-    values = values_of(at.joint)
+    values = at.joint.values_by_name
     starts: list[Start] = []
     for change in changes:
         structure = inside.build(change.variant)
@@ -507,7 +501,7 @@ def _eliminate_backward(
 
 def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
     """Whether each order that becomes an integer moves by less than 1 from its estimate."""
-    values = values_of(at.joint)
+    values = at.joint.values_by_name
     return all(abs(v - values[n]) < 1.0 for n, v in change.variant.integer_orders if n in values)
 
 

@@ -231,7 +231,7 @@ class Comparison:
             lines.append(f"over {self.m} block pulses per run")
         lines += describe_missing_equation_errors(self.without_equation_error)
         lines += describe_offsets(self)
-        if not self.offsets and (terms := initial_term_counts(self)):
+        if not self.offsets and (terms := describe_initial_terms(self)):
             lines.append(f"initial terms estimated on each run (their number): {terms}")
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
@@ -407,7 +407,7 @@ def describe_offsets(comparison: Comparison) -> list[str]:
     return lines
 
 
-def initial_term_counts(comparison: Comparison) -> str:
+def describe_initial_terms(comparison: Comparison) -> str:
     """Return runs whose initial terms and levels were estimated on their own outputs, with their number."""
     counts = [sum(map(len, terms.values())) for terms in comparison.initial]
     return ", ".join(f"{run[0]} ({n})" for run, n in zip(comparison.per_run, counts, strict=True) if n)
@@ -551,7 +551,7 @@ def validation_findings(own: Comparison, validation: Comparison) -> list[Finding
     return findings + validation_fit_findings({n: f.fit for n, f in own.output_error.items()}, validation)
 
 
-#: Rows that show where one record continues another, and fewest rows of which both have as many to be one recording.
+#: Rows compared to align two recordings. Fewer common rows than the second number count as chance.
 ALIGNMENT_ROWS, MIN_COMMON_ROWS = 8, 32
 
 

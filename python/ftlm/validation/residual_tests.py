@@ -45,6 +45,8 @@ NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
 MAX_REST_VELOCITY_RATIO = 0.01
 #: Slope at 0 of the tanh that replaces the sign of a measured velocity, times the largest velocity.
 SIGN_TANH_SLOPE = 100.0
+#: Smallest value of the other sign, relative to the largest value, of a velocity that changes its direction.
+MIN_REVERSAL_RATIO = 0.01
 #: Singular values of sensitivities, relative to the largest one, below which they count as rounding errors.
 SENSITIVITY_RANK_TOLERANCE = 1e-10
 
@@ -551,6 +553,19 @@ def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> f
     return float(np.mean(each)) / total if total > 0 else 0.0
 
 
+def sign_tanh_slope(velocities: Sequence[Floats]) -> float:
+    """Return the slope of a tanh that replaces the sign of a measured velocity; infinite if it has one sign."""
+    low, high = (float(f([f(v) for v in velocities])) for f in (np.nanmin, np.nanmax))
+    largest = max(-low, high)
+    return SIGN_TANH_SLOPE / largest if min(-low, high) > MIN_REVERSAL_RATIO * largest else math.inf
+
+
+def friction_term(output: str, coefficient: str, tanh_slope: float = math.inf) -> str:
+    """Return the text of Coulomb friction that opposes D y, or y itself by a tanh if its slope is finite."""
+    velocity = f"sign(D {output})" if math.isinf(tanh_slope) else f"tanh({tanh_slope:.3g} {output})"
+    return f"- {coefficient}*{velocity}"
+
+
 def failed_tests(tests: Residuals) -> list[Finding]:
     """Return findings on failed and undecided tests, and on detected feedback."""
     found = []
@@ -576,8 +591,7 @@ def failed_tests(tests: Residuals) -> list[Finding]:
                 found.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
         if output.follows_direction and output.direction is not None:
             numbers = {"value": output.direction.largest[1], "limit": output.direction.limit}
-            slope = output.sign_slope
-            term = f"- fc*sign(D {name})" if math.isinf(slope) else f"- fc*tanh({slope:.2g} {name})"
+            term = friction_term(name, "fc", output.sign_slope)
             found.append(make_finding("residuals_follow_direction", output=name, term=term, **numbers))
         found += [feedback_finding(name, signal, output) for signal in output.feedback]
     return found
