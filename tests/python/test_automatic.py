@@ -278,7 +278,7 @@ def test_auto_finds_dry_friction_rather_than_higher_orders(spring: float, own: d
     run = rubbing_mass(1, spring, 0.25)
     found = ftlm.select(run, "auto", threads=1).best
     (item,) = found.model.structure.equations
-    assert item.friction is not None
+    assert item.friction.name == "fc"
     assert item.order.constant == 2.0
     assert found.coefficients["fc"] == pytest.approx(0.25, rel=0.1)
     values = {n: v for n, v in found.coefficients.items() if n.startswith("a")}

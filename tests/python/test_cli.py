@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm import progress
+from ftlm.app.server import DEFAULT_PORT
 from ftlm.cli import framework
 from ftlm.cli.framework import broken_line, print_text
 from ftlm.cli.main import COMMAND_HELP, CommandTable, app
@@ -626,6 +627,9 @@ def test_every_option_has_a_help_text():
     table = CommandTable(COMMAND_HELP)
     bare = [(name, p.name) for name in COMMAND_HELP for p in table[name].params if not getattr(p, "help", None)]
     assert bare == []
+    # Docstrings are not computed.
+    (port,) = (p for p in table["app"].params if p.name == "port")
+    assert f"default {DEFAULT_PORT}," in port.help
 
 
 def test_a_file_to_write_is_checked_before_the_work(tmp_path):
