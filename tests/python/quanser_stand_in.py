@@ -355,7 +355,8 @@ class HIL:
             board.note(f"watchdog_start({seconds!r})")
         board.timeout, board.last_reload = seconds, board.time
         if board.page is not None:
-            board.process = virtual_board.start_watchdog(board.page, keep=True)
+            board.process = virtual_board.spawn_watchdog(board.page, keep=True)
+            virtual_board.wait_for_watchdog(board.process, board.page)
             board.page.set("timeout", seconds)
 
     def watchdog_reload(self):

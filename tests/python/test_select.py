@@ -502,7 +502,7 @@ def test_none_wins_that_fails_where_another_does_not():
     assert _rank_trials([failing, steady]) == [steady, failing]
     assert failing.worst_fold == -3e7
     said = _reason(steady, steady, [steady, failing])
-    assert "steady (5 parameters, validation fit 75.00 %), which predicts best" in said
+    assert "steady (5 parameters, validation fit 75.00 %). It predicts best." in said
     assert said.endswith(
         "failing has 25 % smaller residuals on average and is not chosen: it fails on y of run 3, with a fit of < "
         "-1000 % where the chosen one has 60.00 %."

@@ -128,7 +128,9 @@ class VirtualBoard:
         if self.real_time:
             check_watchdog(self._rate, seconds)
         try:
-            self._process = start_watchdog(page, keep=self.page is not None)
+            # The process is kept before it is ready: an interruption in between leaves none behind.
+            self._process = spawn_watchdog(page, keep=self.page is not None)
+            wait_for_watchdog(self._process, page)
         except OSError as error:
             raise RigFault(f"virtual rig: {error}; check the Python installation") from None
         self._seconds = seconds
@@ -246,8 +248,8 @@ class VirtualBoard:
             return (volts1, volts2), bool(page.get("enabled"))
 
 
-def start_watchdog(page: watchdog.RegisterPage, *, keep: bool, patience: float = 10.0) -> subprocess.Popen[bytes]:
-    """Start the watchdog process and wait until it is ready.
+def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Popen[bytes]:
+    """Start the watchdog process, which is not ready yet.
 
     Parameters
     ----------
@@ -255,8 +257,6 @@ def start_watchdog(page: watchdog.RegisterPage, *, keep: bool, patience: float =
         Registers of the output stage.
     keep
         Whether to keep the file when the process ends.
-    patience
-        Longest wait for the process [s].
 
     Raises
     ------
@@ -264,7 +264,7 @@ def start_watchdog(page: watchdog.RegisterPage, *, keep: bool, patience: float =
         The process could not be started.
     """
     # A separate session, and on Windows a console, so that Ctrl-C and Ctrl-Break do not reach the watchdog.
-    process = subprocess.Popen(
+    return subprocess.Popen(
         **python_child(Path(watchdog.__file__), str(page.path.resolve()), "keep" if keep else "remove", site=False),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
@@ -272,6 +272,25 @@ def start_watchdog(page: watchdog.RegisterPage, *, keep: bool, patience: float =
         start_new_session=True,
         creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )
+
+
+def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterPage, *, patience: float = 10.0) -> None:
+    """Wait until the watchdog process is ready; end the process if it does not become ready.
+
+    Parameters
+    ----------
+    process
+        Process from `spawn_watchdog`.
+    page
+        Registers of the output stage.
+    patience
+        Longest wait [s].
+
+    Raises
+    ------
+    OSError
+        The process ended, or was not ready in time.
+    """
     until = time.monotonic() + patience
     try:
         while not page.get("ready"):
@@ -284,7 +303,6 @@ def start_watchdog(page: watchdog.RegisterPage, *, keep: bool, patience: float =
         process.kill()
         process.wait()
         raise
-    return process
 
 
 def _checked_injection(fault: object) -> tuple[str, int, float, float]:
