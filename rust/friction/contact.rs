@@ -202,7 +202,7 @@ pub struct ContactSolution {
 }
 
 /// Rounding error relative to the largest velocity without friction. A force that equals friction moves nothing.
-const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
+pub(crate) const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
 
 impl ContactSolution {
     /// Solve pulse by pulse from initial velocities.

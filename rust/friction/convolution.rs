@@ -88,7 +88,7 @@ impl<'a> OnlineConvolution<'a> {
 
 /// Response at the ends of pulses to the pulses of a signal integrated by η > 0, and its derivative in η.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
+pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
     let turn = libm::log(step) - digamma(eta + 1.0);
     (0..m)
@@ -108,7 +108,7 @@ pub(super) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
 
 /// Integration order below which a signal has direct feedthrough to the velocity at an edge, as the mean of the
 /// neighboring pulses.
-const SEEN_AT_ONCE: f64 = 1e-6;
+pub(crate) const SEEN_AT_ONCE: f64 = 1e-6;
 
 /// Signal integrated by the order of its term, or the derivative of that in the order.
 #[derive(Debug, Clone)]
@@ -151,7 +151,7 @@ pub(crate) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
 }
 
 /// Values at pulse ends from means: averages of neighboring pulses, the last value extrapolated.
-fn average_neighbors(means: &[f64]) -> Vec<f64> {
+pub(crate) fn average_neighbors(means: &[f64]) -> Vec<f64> {
     let m = means.len();
     let mut out: Vec<f64> = means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
     let last = means.last().copied().unwrap_or(0.0);

@@ -20,15 +20,15 @@ pub(crate) struct Link {
 
 /// Initial states and constant forces as inputs at the levels of outputs and velocities, by equation.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct InitialForcing {
+pub(crate) struct InitialForcing {
     /// Pulse means at the level of the output.
     pub(super) output: Vec<Vec<f64>>,
     /// Contribution to the velocity at pulse ends, relative to the initial velocity.
-    pub(super) edges: Vec<Vec<f64>>,
+    pub(crate) edges: Vec<Vec<f64>>,
     /// Initial velocities.
-    pub(super) start: Vec<f64>,
+    pub(crate) start: Vec<f64>,
     /// Initial outputs.
-    pub(super) levels: Vec<f64>,
+    pub(crate) levels: Vec<f64>,
     m: usize,
 }
 
@@ -69,7 +69,7 @@ impl InitialForcing {
     /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] if the
     /// initial levels or velocities are not determined by the equations.
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn of(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
+    pub(crate) fn of(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
         let n = powers.len();
         let mut out = Self::zeros(m, n);
         let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();

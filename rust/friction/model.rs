@@ -36,13 +36,18 @@ impl FreeFrictionLaw {
     }
 
     /// Law at these coefficients.
-    pub(super) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
+    pub(crate) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
         let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
         FrictionLaw { coulomb, stribeck, speed }
     }
 
+    /// Derivatives of fc, fs and vs with respect to a coefficient.
+    pub(crate) fn slope(&self, coefficients: &[f64], coefficient: usize) -> [f64; 3] {
+        self.numbers().map(|number| number.slope(coefficients, coefficient))
+    }
+
     /// Whether a coefficient is a force of this law, which must not be negative.
-    pub(super) fn is_force(&self, coefficient: usize) -> bool {
+    pub(crate) fn is_force(&self, coefficient: usize) -> bool {
         [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
     }
 }
@@ -177,23 +182,6 @@ impl FrictionModel {
         };
         let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
         (State::all(&body.equations, &self.initial, &self.filtered, moves), body.equations)
-    }
-
-    /// Initial states from the first samples of a run: positions and velocities of the bodies, given constants for the
-    /// frictions, all other states 0.
-    fn first_states(&self, orders: &[f64], experiment: &Experiment, constants: &[f64]) -> Vec<f64> {
-        let (states, equations) = self.states(orders);
-        let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
-        let value = |state: &State| match *state {
-            State::Level(i) => begun[i].0,
-            State::Rate(i) => begun[i].1,
-            State::Offset(i, 0) => {
-                let own = self.frictions.iter().zip(constants).find(|((place, _), _)| *place == i);
-                own.map_or(0.0, |(_, constant)| constant / libm::tgamma(equations[i].structure.order + 1.0))
-            }
-            _ => 0.0,
-        };
-        states.iter().map(value).collect()
     }
 
     /// Initial terms of a run's states by equation: (exponent, coefficient).
@@ -390,7 +378,7 @@ impl FrictionModel {
                     *terms = equation.terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect();
                 }
                 for (moves, (_, law)) in out.frictions.iter_mut().zip(&self.frictions) {
-                    *moves = law.numbers().map(|number| number.slope(&point.coefficients, j));
+                    *moves = law.slope(&point.coefficients, j);
                 }
             }
             Parameter::State(..) | Parameter::Input(_) => {}
@@ -479,20 +467,7 @@ impl StateModel for FrictionModel {
     }
 
     fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
-        let held: Vec<f64> = self.frictions.iter().map(|(_, law)| law.at(coefficients).breakaway()).collect();
-        let plain = self.first_states(orders, experiment, &vec![0.0; held.len()]);
-        let mut guesses = vec![plain];
-        for share in INITIAL_FORCE_RATIOS {
-            for which in 0..held.len() {
-                let of = |(a, most): (usize, &f64)| if a == which { share * most } else { 0.0 };
-                let constants: Vec<f64> = held.iter().enumerate().map(of).collect();
-                let guess = self.first_states(orders, experiment, &constants);
-                if guess != guesses[0] {
-                    guesses.push(guess);
-                }
-            }
-        }
-        guesses
+        state_guesses(&self.states(orders), &self.body(orders, coefficients).frictions, experiment)
     }
 
     fn state_count(&self, orders: &[f64]) -> usize {
@@ -526,8 +501,37 @@ struct BodyDerivatives {
     frictions: Vec<[f64; 3]>,
 }
 
+/// Guesses of the initial states from the first samples of a run: positions and velocities of the outputs, with several
+/// constant forces within the frictions, all other states 0.
+pub(crate) fn state_guesses(
+    (states, equations): &(Vec<State>, Vec<Equation>),
+    frictions: &[(usize, FrictionLaw)],
+    experiment: &Experiment,
+) -> Vec<Vec<f64>> {
+    let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
+    let with_force = |body: usize, force: f64| -> Vec<f64> {
+        let value = |state: &State| match *state {
+            State::Level(i) => begun[i].0,
+            State::Rate(i) => begun[i].1,
+            State::Offset(i, 0) if i == body => force / libm::tgamma(equations[i].structure.order + 1.0),
+            _ => 0.0,
+        };
+        states.iter().map(value).collect()
+    };
+    let mut guesses = vec![with_force(0, 0.0)];
+    for ratio in INITIAL_FORCE_RATIOS {
+        for &(body, law) in frictions {
+            let guess = with_force(body, ratio * law.breakaway());
+            if guess != guesses[0] {
+                guesses.push(guess);
+            }
+        }
+    }
+    guesses
+}
+
 /// Initial position and velocity of an output from its first samples.
-pub(crate) fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
+fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     let near = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]
     let (count, step) = (near.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);

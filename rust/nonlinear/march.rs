@@ -6,13 +6,16 @@
 //! an unstable linear part loses no digits. The mean of a pulse enters its own equation; Newton iterations that start
 //! at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
 
+use super::channels::{ForcingTerms, IntegralKernel, StateChannel};
+use super::contact::{BodyMoves, Contact, PulseContact};
 use super::forcing::{channel_powers, Link};
-use crate::equation::{Equation, ORDER_GRAIN};
+use crate::equation::{Equation, Term, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::expression::{DerivedSignal, Values};
-use crate::fractional::kernels::{kernel, kernel_and_slope, MAX_EXCESS};
-use crate::friction::convolution::{product, Heads, OnlineConvolution};
-use crate::friction::initial_state::means_of;
+use crate::fractional::kernels::{kernel, MAX_EXCESS};
+use crate::friction::convolution::{average_neighbors, product, Heads, OnlineConvolution, SEEN_AT_ONCE};
+use crate::friction::initial_state::{means_of, InitialForcing};
+use crate::friction::{Body, FrictionLaw};
 use crate::linalg::small;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
@@ -40,6 +43,8 @@ pub struct NonlinearSystem {
     pub recorded: usize,
     /// Whether outputs enter other equations as simulated, not as measured.
     pub coupled: bool,
+    /// Equations with dry friction, and F of − F(Dy) sgn(Dy).
+    pub frictions: Vec<(usize, FrictionLaw)>,
 }
 
 /// Channel of an expression: a state channel, or a known signal or derivative.
@@ -82,10 +87,12 @@ struct InputLane {
 
 /// Derivatives of a system with respect to one parameter.
 pub(super) struct Moves {
-    /// Derivatives of coefficient and integration order of each term of each equation.
+    /// Derivatives of coefficient and integration order of each term of each equation, and of its friction.
     pub(super) terms: Vec<Vec<(f64, f64)>>,
-    /// Derivatives of the state channels' forcing by initial terms; empty if zero.
-    pub(super) forcing: Vec<Vec<f64>>,
+    /// Derivatives of the forcing by initial terms.
+    pub(super) forcing: ForcingTerms,
+    /// Derivatives of fc, fs and vs of each friction.
+    pub(super) laws: Vec<[f64; 3]>,
     /// Derivatives of recorded signals that are inputs.
     pub(super) inputs: Vec<(usize, Vec<f64>)>,
 }
@@ -95,13 +102,12 @@ pub(super) struct Operators {
     m: usize,
     step: f64,
     outputs: usize,
-    /// Equation and order of each state channel.
-    states: Vec<(usize, f64)>,
+    states: Vec<StateChannel>,
     /// Signal and order of each known channel, and its means.
     known: Vec<((usize, f64), Vec<f64>)>,
     terms: Vec<NonlinearTerm>,
-    /// Integration order, kernel and heads of each kernel.
-    orders: Vec<f64>,
+    integrals: Vec<IntegralKernel>,
+    /// Values and heads of each integral kernel.
     kernels: Vec<Heads>,
     lanes: Vec<Lane>,
     inputs: Vec<InputLane>,
@@ -109,16 +115,20 @@ pub(super) struct Operators {
     gains: Vec<f64>,
     /// Whether an expression acts on its own channel without integration.
     algebraic: bool,
+    /// Dry friction; None without.
+    contact: Option<Contact>,
 }
 
 /// Free run with the linearization of every pulse.
 pub(super) struct FreeRun {
-    /// Means of the state channels, then those of the non-linear terms.
+    /// State channels, then means of the non-linear terms, then of the frictions.
     pub(super) sources: Vec<Vec<f64>>,
     /// Derivatives of the non-linear terms with respect to state channels, then to known channels, pulse after pulse.
     slopes: Vec<f64>,
     /// Inverse of the linearized equations of each pulse.
     inverses: Vec<f64>,
+    /// Motion and friction of each body, pulse after pulse.
+    contacts: Vec<PulseContact>,
 }
 
 /// Pulse at which a free run ends, and why.
@@ -166,7 +176,25 @@ impl NonlinearSystem {
         match self.derived.iter().flat_map(|d| &d.channels).find(|(signal, _)| *signal >= self.recorded) {
             None => Ok(()),
             Some((signal, _)) => refuse(format!("signal {signal} of {} in an expression", self.recorded), "record it"),
+        }?;
+        if self.frictions.is_empty() {
+            return Ok(());
         }
+        Body { equations: self.equations.clone(), frictions: self.frictions.clone() }.check(signals)?;
+        for &(place, _) in &self.frictions {
+            let structure = &self.equations[place].structure;
+            let limit = structure.order - 1.0;
+            let above = |term: &&Term| term.signal >= self.recorded && term.order > limit - MIN_INTEGRATION_ORDER;
+            if let Some(term) = structure.terms.iter().find(above) {
+                return Err(Error::OutOfRange {
+                    name: "order of a non-linear term beside friction".into(),
+                    value: term.order,
+                    range: format!("below {limit}, the order of the equation minus 1"),
+                    remedy: "lower it, or leave the friction out".into(),
+                });
+            }
+        }
+        Ok(())
     }
 
     /// Terms of each equation with a simulated output as signal.
@@ -182,30 +210,32 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(of).collect()
     }
 
-    /// State channels: the outputs, then the derivatives that expressions and coupled terms need.
-    fn state_channels(&self) -> Vec<(usize, f64)> {
-        let mut states: Vec<(usize, f64)> = (0..self.equations.len()).map(|i| (i, 0.0)).collect();
-        let add = |states: &mut Vec<(usize, f64)>, equation: usize, order: f64| {
-            if !states.iter().any(|s| s.0 == equation && (s.1 - order).abs() < ORDER_GRAIN) {
-                states.push((equation, order));
+    /// State channels: the outputs, then the derivatives that expressions, friction and coupled terms need.
+    fn state_channels(&self) -> Vec<StateChannel> {
+        let mut states: Vec<StateChannel> =
+            (0..self.equations.len()).map(|equation| StateChannel::Mean { equation, order: 0.0 }).collect();
+        let add = |states: &mut Vec<StateChannel>, channel: StateChannel| {
+            if !states.iter().any(|state| state.is_same(channel)) {
+                states.push(channel);
             }
         };
         for (i, equation) in self.equations.iter().enumerate() {
             for term in equation.structure.terms.iter().filter(|term| term.signal >= self.recorded) {
                 for &(signal, order) in &self.derived[term.signal - self.recorded].channels {
-                    if let Some(j) = self.output_index(i, signal) {
-                        add(&mut states, j, order);
+                    if let Some(equation) = self.output_index(i, signal) {
+                        add(&mut states, StateChannel::Mean { equation, order });
                     }
                 }
             }
         }
+        self.frictions.iter().for_each(|&(equation, _)| add(&mut states, StateChannel::EndVelocity { equation }));
         // A derivative of an output has terms with the same derivative of the outputs coupled to it.
         let mut done = 0;
         while done < states.len() {
-            let (j, order) = states[done];
-            for term in &self.equations[j].structure.terms {
-                if let Some(l) = self.output_index(j, term.signal) {
-                    add(&mut states, l, order);
+            let channel = states[done];
+            for term in &self.equations[channel.equation()].structure.terms {
+                if let Some(l) = self.output_index(channel.equation(), term.signal) {
+                    add(&mut states, channel.with_equation(l));
                 }
             }
             done += 1;
@@ -219,20 +249,19 @@ pub(crate) fn refuse_beside(what: &str, remedy: &str) -> Error {
     Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
 }
 
-/// Index of an order in a list, which it joins if it is new.
-fn kernel_index(orders: &mut Vec<f64>, eta: f64) -> usize {
-    orders.iter().position(|known| (known - eta).abs() < ORDER_GRAIN).unwrap_or_else(|| {
-        orders.push(eta);
-        orders.len() - 1
+/// Index of a kernel in a list, which it joins if it is new.
+fn kernel_index(kernels: &mut Vec<IntegralKernel>, order: f64, at_ends: bool) -> usize {
+    let is_same = |known: &IntegralKernel| known.at_ends == at_ends && (known.order - order).abs() < ORDER_GRAIN;
+    kernels.iter().position(is_same).unwrap_or_else(|| {
+        kernels.push(IntegralKernel { order, at_ends });
+        kernels.len() - 1
     })
 }
 
 impl Operators {
     pub(super) fn new(system: &NonlinearSystem, record: &Record) -> Result<Self> {
         let (m, step, states) = (record.m(), record.step(), system.state_channels());
-        let find = |equation: usize, order: f64| {
-            states.iter().position(|s| s.0 == equation && (s.1 - order).abs() < ORDER_GRAIN)
-        };
+        let find = |channel: StateChannel| states.iter().position(|state| state.is_same(channel));
         let mut known: Vec<((usize, f64), Vec<f64>)> = Vec::new();
         let mut terms: Vec<NonlinearTerm> = Vec::new();
         for (i, equation) in system.equations.iter().enumerate() {
@@ -240,7 +269,8 @@ impl Operators {
                 let signal = term.signal - system.recorded;
                 let mut places = Vec::new();
                 for &(signal, order) in &system.derived[signal].channels {
-                    let state = system.output_index(i, signal).and_then(|j| find(j, order));
+                    let output = system.output_index(i, signal);
+                    let state = output.and_then(|equation| find(StateChannel::Mean { equation, order }));
                     places.push(match state {
                         Some(state) => Place::State(state),
                         None => Place::Known(known_index(&mut known, (signal, order), record)?),
@@ -251,46 +281,58 @@ impl Operators {
         }
         // Same error as for a step that is too long, so that an optimizer shortens it.
         let beyond = || Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 };
-        let (mut orders, mut lanes, mut inputs) = (Vec::new(), Vec::<Lane>::new(), Vec::new());
+        let (mut integrals, mut lanes, mut inputs) = (Vec::new(), Vec::<Lane>::new(), Vec::new());
         let mut algebraic = false;
-        for (state, &(j, rho)) in states.iter().enumerate() {
+        for (state, &channel) in states.iter().enumerate() {
+            let (j, rho, at_ends) = (channel.equation(), channel.order(), channel.is_at_ends());
+            let add = |lanes: &mut Vec<Lane>, kernel: usize, contribution: Contribution| match lanes
+                .iter_mut()
+                .find(|lane| lane.state == state && lane.kernel == kernel)
+            {
+                Some(lane) => lane.contributions.push(contribution),
+                None => lanes.push(Lane { state, kernel, contributions: vec![contribution] }),
+            };
             let Equation { structure, coefficients } = &system.equations[j];
             for (k, (term, &weight)) in structure.terms.iter().zip(coefficients).enumerate() {
                 let eta = structure.order - term.order;
-                let (source, eta) = if let Some(l) = system.output_index(j, term.signal) {
+                let (source, kernel) = if let Some(l) = system.output_index(j, term.signal) {
                     if eta < if l == j { MIN_INTEGRATION_ORDER } else { MIN_INTEGRATION_ORDER - MAX_EXCESS } {
                         return Err(beyond());
                     }
-                    (find(l, rho), eta)
+                    (find(channel.with_equation(l)), kernel_index(&mut integrals, eta, false))
                 } else if let Some(q) = terms.iter().position(|t| (t.equation, t.term) == (j, k)) {
                     let driven = terms[q].places.iter().any(|place| matches!(place, Place::Known(_)));
                     let left = eta - rho;
-                    if left < -ORDER_GRAIN || (driven && eta < MIN_INTEGRATION_ORDER) {
+                    let least = if at_ends { SEEN_AT_ONCE } else { -ORDER_GRAIN };
+                    if left < least || (driven && eta < MIN_INTEGRATION_ORDER) {
                         return Err(beyond());
                     }
                     algebraic |=
                         left < MIN_INTEGRATION_ORDER && !terms[q].places.iter().all(|p| matches!(p, Place::Known(_)));
-                    (Some(states.len() + q), left.max(0.0))
+                    (Some(states.len() + q), kernel_index(&mut integrals, left.max(0.0), at_ends))
                 } else {
                     let left = eta - rho;
-                    if left < -ORDER_GRAIN || eta < MIN_INTEGRATION_ORDER {
+                    if (left < -ORDER_GRAIN && !at_ends) || eta < MIN_INTEGRATION_ORDER {
                         return Err(beyond());
                     }
-                    let kernel = kernel_index(&mut orders, left.max(0.0));
+                    let left = if at_ends { left } else { left.max(0.0) };
+                    let kernel = kernel_index(&mut integrals, left, at_ends);
                     inputs.push(InputLane { state, kernel, at: (j, k), signal: term.signal });
                     continue;
                 };
-                let Some(source) = source else { continue };
-                let kernel = kernel_index(&mut orders, eta);
-                let contribution = Contribution { source, at: (j, k), weight };
-                match lanes.iter_mut().find(|lane| lane.state == state && lane.kernel == kernel) {
-                    Some(lane) => lane.contributions.push(contribution),
-                    None => lanes.push(Lane { state, kernel, contributions: vec![contribution] }),
+                if let Some(source) = source {
+                    add(&mut lanes, kernel, Contribution { source, at: (j, k), weight });
                 }
             }
+            if let Some(friction) = system.frictions.iter().position(|friction| friction.0 == j) {
+                let kernel = kernel_index(&mut integrals, structure.order - rho, at_ends);
+                let source = states.len() + terms.len() + friction;
+                add(&mut lanes, kernel, Contribution { source, at: (j, structure.terms.len()), weight: -1.0 });
+            }
         }
-        let kernels: Vec<Heads> = orders.iter().map(|&eta| Heads::new(&kernel(eta, m, step))).collect();
-        let count = states.len() + terms.len();
+        let kernels: Vec<Heads> =
+            integrals.iter().map(|integral| Heads::new(&integral.values_and_slopes(m, step).0)).collect();
+        let count = states.len() + terms.len() + system.frictions.len();
         let mut gains = vec![0.0; states.len() * count];
         for lane in &lanes {
             let first = kernels[lane.kernel].kernel().first().copied().unwrap_or(0.0);
@@ -298,35 +340,82 @@ impl Operators {
                 gains[lane.state * count + part.source] += first * part.weight;
             }
         }
+        let bodies = system.frictions.iter().filter_map(|&(equation, law)| {
+            find(StateChannel::EndVelocity { equation }).map(|velocity| (law, (equation, velocity)))
+        });
+        let (laws, channels): (Vec<FrictionLaw>, Vec<(usize, usize)>) = bodies.unzip();
+        let contact = if laws.is_empty() { None } else { Some(Contact::new(laws, &channels, &gains, states.len())?) };
         let outputs = system.equations.len();
-        Ok(Self { m, step, outputs, states, known, terms, orders, kernels, lanes, inputs, gains, algebraic })
+        Ok(Self {
+            m,
+            step,
+            outputs,
+            states,
+            known,
+            terms,
+            integrals,
+            kernels,
+            lanes,
+            inputs,
+            gains,
+            algebraic,
+            contact,
+        })
     }
 
     fn sources(&self) -> usize {
-        self.states.len() + self.terms.len()
+        self.states.len() + self.values()
     }
 
-    /// Forcing of the state channels by initial terms, (exponent, coefficient) by equation.
-    pub(super) fn initial_forcing(&self, links: &[Vec<Link>], powers: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-        let mut out = vec![vec![0.0; self.m]; self.states.len()];
-        for (row, &(equation, order)) in out.iter_mut().zip(&self.states) {
-            for (exponent, value) in channel_powers(equation, order, links, powers)? {
-                let means = means_of(exponent, self.m, self.step);
-                row.iter_mut().zip(means).for_each(|(sum, v)| *sum += value * v);
+    /// Number of non-linear terms and frictions.
+    fn values(&self) -> usize {
+        self.terms.len() + self.contact.as_ref().map_or(0, Contact::count)
+    }
+
+    /// ForcingTerms by initial terms, (exponent, coefficient) by equation.
+    pub(super) fn initial_forcing(&self, links: &[Vec<Link>], powers: &[Vec<(f64, f64)>]) -> Result<ForcingTerms> {
+        let mut out = ForcingTerms { channels: vec![vec![0.0; self.m]; self.states.len()], starts: Vec::new() };
+        let at_ends = match &self.contact {
+            Some(_) => Some(InitialForcing::of(powers, links, self.m, self.step)?),
+            None => None,
+        };
+        for (row, channel) in out.channels.iter_mut().zip(&self.states) {
+            match (*channel, &at_ends) {
+                (StateChannel::EndVelocity { equation }, Some(at_ends)) => row.clone_from(&at_ends.edges[equation]),
+                _ => {
+                    for (exponent, value) in channel_powers(channel.equation(), channel.order(), links, powers)? {
+                        let means = means_of(exponent, self.m, self.step);
+                        row.iter_mut().zip(means).for_each(|(sum, v)| *sum += value * v);
+                    }
+                }
             }
+        }
+        if let (Some(at_ends), Some(contact)) = (&at_ends, &self.contact) {
+            let of = |&equation: &usize| (at_ends.levels[equation], at_ends.start[equation]);
+            out.starts = contact.outputs().iter().map(of).collect();
         }
         Ok(out)
     }
 
     /// Add the inputs to the forcing of the state channels.
-    pub(super) fn add_inputs(&self, system: &NonlinearSystem, record: &Record, forcing: &mut [Vec<f64>]) {
+    pub(super) fn add_inputs(&self, system: &NonlinearSystem, record: &Record, forcing: &mut ForcingTerms) {
         for (signal, lanes) in self.inputs_by_signal() {
             let spectrum = Kernel::new(record.signal(signal));
             for lane in lanes {
                 let weight = system.equations[lane.at.0].coefficients[lane.at.1];
-                let part = product(&spectrum, self.kernels[lane.kernel].kernel());
-                forcing[lane.state].iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
+                let part = self.integrate(&spectrum, lane.kernel, self.kernels[lane.kernel].kernel());
+                forcing.channels[lane.state].iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
             }
+        }
+    }
+
+    /// Signal through an integral kernel or its derivative.
+    fn integrate(&self, signal: &Kernel, kernel: usize, series: &[f64]) -> Vec<f64> {
+        let out = product(signal, series);
+        if self.integrals[kernel].is_averaged() {
+            average_neighbors(&out)
+        } else {
+            out
         }
     }
 
@@ -344,26 +433,32 @@ impl Operators {
     /// Free run under a forcing of the state channels, or where and why it ends.
     ///
     /// Of a run that ends, the outputs so far are returned, too.
-    pub(super) fn run(&self, system: &NonlinearSystem, forcing: &[Vec<f64>]) -> (FreeRun, Option<End>) {
+    pub(super) fn run(&self, system: &NonlinearSystem, forcing: &ForcingTerms) -> (FreeRun, Option<End>) {
         let (states, count) = (self.states.len(), self.sources());
         let width = states + self.known.len();
         let mut run = FreeRun {
             sources: vec![Vec::with_capacity(self.m); count],
-            slopes: Vec::with_capacity(self.m * self.terms.len() * width),
+            slopes: Vec::with_capacity(self.m * self.values() * width),
             inverses: Vec::with_capacity(self.m * states * states),
+            contacts: Vec::new(),
         };
         let mut lanes: Vec<OnlineConvolution<'_>> =
             self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
         let mut pulse = Pulse::new(self, system);
         let mut sign = None;
+        let mut motion = self.contact.as_ref().map(|contact| contact.start(forcing));
         for k in 0..self.m {
-            pulse.free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
+            pulse.free.iter_mut().zip(&forcing.channels).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
                 pulse.free[lane.state] += convolution.past();
             }
             pulse.predict(&run.sources);
             pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
-            if let Err(failure) = pulse.solve() {
+            let solved = match &mut motion {
+                Some(motion) => motion.solve(&mut pulse),
+                None => pulse.solve(),
+            };
+            if let Err(failure) = solved {
                 let (why, is_overflow) = match failure {
                     Failure::Overflow => (String::new(), true),
                     Failure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
@@ -381,6 +476,9 @@ impl Operators {
             run.sources.iter_mut().zip(values).for_each(|(row, v)| row.push(*v));
             run.slopes.extend_from_slice(&pulse.slopes);
             run.inverses.extend_from_slice(&pulse.inverse);
+            if let Some(motion) = &mut motion {
+                run.contacts.extend_from_slice(motion.advance(&pulse.z));
+            }
             for (lane, convolution) in self.lanes.iter().zip(&mut lanes) {
                 let of = |part: &Contribution| part.weight * pulse.source(part.source);
                 convolution.push(lane.contributions.iter().map(of).sum());
@@ -416,13 +514,15 @@ fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
 }
 
 /// Newton iterations of one pulse.
-struct Pulse<'a> {
+pub(super) struct Pulse<'a> {
     operators: &'a Operators,
     system: &'a NonlinearSystem,
     free: Vec<f64>,
+    /// Values of state channels that are given.
+    pub(super) fixed: Vec<Option<f64>>,
     known: Vec<f64>,
-    z: Vec<f64>,
-    /// Non-linear terms at z and their derivatives with respect to state channels, then to known channels.
+    pub(super) z: Vec<f64>,
+    /// Non-linear terms at z, then frictions; derivatives with respect to state channels, then to known channels.
     values: Vec<f64>,
     slopes: Vec<f64>,
     inverse: Vec<f64>,
@@ -438,15 +538,16 @@ struct Pulse<'a> {
 
 impl<'a> Pulse<'a> {
     fn new(operators: &'a Operators, system: &'a NonlinearSystem) -> Self {
-        let (states, terms, known) = (operators.states.len(), operators.terms.len(), operators.known.len());
+        let (states, values, known) = (operators.states.len(), operators.values(), operators.known.len());
         Self {
             operators,
             system,
             free: vec![0.0; states],
+            fixed: vec![None; states],
             known: vec![0.0; known],
             z: vec![0.0; states],
-            values: vec![0.0; terms],
-            slopes: vec![0.0; terms * (states + known)],
+            values: vec![0.0; values],
+            slopes: vec![0.0; values * (states + known)],
             inverse: vec![0.0; states * states],
             determinant: 1.0,
             residual: vec![0.0; states],
@@ -457,6 +558,12 @@ impl<'a> Pulse<'a> {
             arguments: Vec::new(),
             work: Values::default(),
         }
+    }
+
+    /// Set the frictions of the pulse.
+    pub(super) fn set_frictions(&mut self, forces: &[f64]) {
+        let terms = self.operators.terms.len();
+        self.values[terms..].copy_from_slice(forces);
     }
 
     fn source(&self, index: usize) -> f64 {
@@ -490,7 +597,7 @@ impl<'a> Pulse<'a> {
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
             let own: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
-            self.residual[a] = self.z[a] - self.free[a] - own;
+            self.residual[a] = self.z[a] - self.fixed[a].unwrap_or(self.free[a] + own);
             norm = norm.hypot(self.residual[a]);
         }
         norm
@@ -513,6 +620,10 @@ impl<'a> Pulse<'a> {
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
             for b in 0..states {
+                if self.fixed[a].is_some() {
+                    self.matrix[a * states + b] = f64::from(u8::from(a == b));
+                    continue;
+                }
                 let through: f64 =
                     gains[states..].iter().enumerate().map(|(q, g)| g * self.slopes[q * width + b]).sum();
                 self.matrix[a * states + b] = f64::from(u8::from(a == b)) - gains[b] - through;
@@ -527,8 +638,8 @@ impl<'a> Pulse<'a> {
         true
     }
 
-    /// Solve the pulse from the current z.
-    fn solve(&mut self) -> std::result::Result<(), Failure> {
+    /// Solve the pulse from the current z, with the present frictions.
+    pub(super) fn solve(&mut self) -> std::result::Result<(), Failure> {
         let states = self.z.len();
         let mut norm = self.evaluate();
         if !norm.is_finite() && self.free.iter().all(|v| v.is_finite()) {
@@ -580,7 +691,7 @@ impl<'a> Pulse<'a> {
 }
 
 /// Why a pulse has no solution.
-enum Failure {
+pub(super) enum Failure {
     /// A value left the range of numbers.
     Overflow,
     /// A function has no value for this argument.
@@ -605,14 +716,14 @@ pub(super) struct FrozenProducts<'a> {
 impl<'a> FrozenProducts<'a> {
     pub(super) fn new(operators: &'a Operators, run: &'a FreeRun) -> Self {
         let spectra = (0..operators.sources()).map(|_| None).collect();
-        let slopes = vec![None; operators.orders.len()];
+        let slopes = vec![None; operators.integrals.len()];
         Self { operators, run, spectra, slopes, found: std::collections::BTreeMap::new() }
     }
 
     /// Derivative of a kernel with respect to its order.
     fn kernel_slope(&mut self, kernel: usize) -> &[f64] {
-        let Operators { m, step, ref orders, .. } = *self.operators;
-        self.slopes[kernel].get_or_insert_with(|| kernel_and_slope(orders[kernel], m, step).1)
+        let Operators { m, step, ref integrals, .. } = *self.operators;
+        self.slopes[kernel].get_or_insert_with(|| integrals[kernel].values_and_slopes(m, step).1)
     }
 
     fn of(&mut self, kernel: usize, source: usize, is_slope: bool) -> &[f64] {
@@ -649,7 +760,7 @@ impl Operators {
         moves: &Moves,
     ) -> Result<Vec<Vec<f64>>> {
         let states = self.states.len();
-        let mut forcing = moves.forcing.clone();
+        let mut forcing = moves.forcing.channels.clone();
         forcing.resize(states, vec![0.0; self.m]);
         let add = |row: &mut Vec<f64>, weight: f64, part: &[f64]| {
             row.iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
@@ -674,16 +785,17 @@ impl Operators {
                 if coefficient != 0.0 || order != 0.0 {
                     let spectrum = spectrum.get_or_insert_with(|| Kernel::new(record.signal(signal)));
                     if coefficient != 0.0 {
-                        let part = product(spectrum, self.kernels[lane.kernel].kernel());
+                        let part = self.integrate(spectrum, lane.kernel, self.kernels[lane.kernel].kernel());
                         add(&mut forcing[lane.state], coefficient, &part);
                     }
                     if order != 0.0 {
-                        let part = product(spectrum, frozen.kernel_slope(lane.kernel));
+                        let part = self.integrate(spectrum, lane.kernel, frozen.kernel_slope(lane.kernel));
                         add(&mut forcing[lane.state], order * weight, &part);
                     }
                 }
                 if let Some(moved) = &moved {
-                    add(&mut forcing[lane.state], weight, &product(moved, self.kernels[lane.kernel].kernel()));
+                    let part = self.integrate(moved, lane.kernel, self.kernels[lane.kernel].kernel());
+                    add(&mut forcing[lane.state], weight, &part);
                 }
             }
         }
@@ -693,24 +805,54 @@ impl Operators {
                 known.push((at, derivative(slope, *order, self.step)?));
             }
         }
-        Ok(self.linear_run(run, &forcing, &known))
+        let bodies = match &self.contact {
+            Some(contact) => {
+                let gain_moves = self.gain_moves(moves, frozen);
+                Some((contact, contact.moves(&self.gains, &gain_moves, moves)?))
+            }
+            None => None,
+        };
+        self.linear_run(run, &forcing, &known, bodies)
     }
 
-    /// Run of the linearized equations under a forcing, with these changes of known channels.
-    fn linear_run(&self, run: &FreeRun, forcing: &[Vec<f64>], known: &[(usize, Vec<f64>)]) -> Vec<Vec<f64>> {
-        let (states, terms, count) = (self.states.len(), self.terms.len(), self.sources());
+    /// Derivatives of the weights of sources within a pulse, row by row.
+    fn gain_moves(&self, moves: &Moves, frozen: &mut FrozenProducts<'_>) -> Vec<f64> {
+        let count = self.sources();
+        let mut out = vec![0.0; self.gains.len()];
+        for lane in &self.lanes {
+            let first = self.kernels[lane.kernel].kernel().first().copied().unwrap_or(0.0);
+            for part in &lane.contributions {
+                let (coefficient, order) = moves.terms[part.at.0][part.at.1];
+                let slope = if order == 0.0 { 0.0 } else { frozen.kernel_slope(lane.kernel)[0] };
+                out[lane.state * count + part.source] += coefficient * first + part.weight * order * slope;
+            }
+        }
+        out
+    }
+
+    /// Run of the linearized equations under a forcing, with these changes of known channels and of the bodies.
+    fn linear_run(
+        &self,
+        run: &FreeRun,
+        forcing: &[Vec<f64>],
+        known: &[(usize, Vec<f64>)],
+        bodies: Option<(&Contact, BodyMoves)>,
+    ) -> Result<Vec<Vec<f64>>> {
+        let (states, terms, values, count) = (self.states.len(), self.terms.len(), self.values(), self.sources());
         let width = states + self.known.len();
         let mut out = vec![Vec::with_capacity(self.m); self.outputs];
         let mut lanes: Vec<OnlineConvolution<'_>> =
             self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
         let (mut free, mut x) = (vec![0.0; states], vec![0.0; count]);
+        let mut bodies = bodies.map(|(contact, moves)| (contact, moves.starts.clone(), moves));
         for k in 0..self.m {
             free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
                 free[lane.state] += convolution.past();
             }
-            let slopes = &run.slopes[k * terms * width..(k + 1) * terms * width];
+            let slopes = &run.slopes[k * values * width..(k + 1) * values * width];
             let inverse = &run.inverses[k * states * states..(k + 1) * states * states];
+            x[states..].fill(0.0);
             for q in 0..terms {
                 x[states + q] = known.iter().map(|(at, means)| slopes[q * width + states + at] * means[k]).sum();
             }
@@ -719,8 +861,15 @@ impl Operators {
                     *free += gains[states..].iter().zip(&x[states..]).map(|(g, v)| g * v).sum::<f64>();
                 }
             }
+            if let Some((contact, motion, _)) = &bodies {
+                contact.keep_outputs(&run.contacts[k * contact.count()..(k + 1) * contact.count()], motion, &mut free);
+            }
             for a in 0..states {
                 x[a] = (0..states).map(|b| inverse[a * states + b] * free[b]).sum();
+            }
+            if let Some((contact, motion, moves)) = &mut bodies {
+                let at = &run.contacts[k * contact.count()..(k + 1) * contact.count()];
+                contact.linear_pulse(at, moves, motion, (&self.gains, inverse), &mut x)?;
             }
             for q in 0..terms {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();
@@ -730,6 +879,6 @@ impl Operators {
                 convolution.push(lane.contributions.iter().map(|part| part.weight * x[part.source]).sum());
             }
         }
-        out
+        Ok(out)
     }
 }

@@ -2,9 +2,11 @@
 //!
 //! D^α y = Σ c D^ν s + Σ k D^μ n, where n is an expression over signals and derivatives of them
 //! ([`DerivedSignal`](crate::expression::DerivedSignal)). Orders of the derivatives of outputs are at most α − μ. The
-//! scheme is of second order in the step, and implicit. Memory is a blocked online convolution with the
+//! scheme is of second order in the step, and implicit. Dry friction may act beside the expressions. Memory is a blocked online convolution with the
 //! kernels of fractional integrals alone.
 
+mod channels;
+mod contact;
 mod forcing;
 mod march;
 mod model;
@@ -38,7 +40,8 @@ impl NonlinearSystem {
     /// let terms = vec![Term { signal: 1, order: 0.0 }, Term { signal: 2, order: 0.0 }];
     /// let equation = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![1.0, -1.0])?;
     /// let derived = vec![DerivedSignal::new(square, vec![(0, 0.0)])?];
-    /// let system = NonlinearSystem { equations: vec![equation], derived, recorded: 2, coupled: true };
+    /// let frictions = Vec::new();
+    /// let system = NonlinearSystem { equations: vec![equation], derived, recorded: 2, coupled: true, frictions };
     /// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 200], vec![1.0; 200]]), None)?;
     /// let y = &system.run(&run, &[vec![]])?[0];
     /// assert!((0.5 * (y[99] + y[100]) - 1.0_f64.tanh()).abs() < 1e-4);

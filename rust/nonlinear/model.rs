@@ -1,5 +1,6 @@
 //! Parameters of equations with non-linear terms: residuals of all experiments and their derivatives.
 
+use super::channels::ForcingTerms;
 use super::march::{refuse_beside, FreeRun, FrozenProducts, Moves, NonlinearSystem, Operators};
 use crate::equation::{Equation, Structure, Term};
 use crate::error::{check_length, Error, Result};
@@ -8,7 +9,8 @@ use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, Free
 use crate::estimation::state_fit::{self, Evaluation, Parameter, Point, Start, StateFit, StateModel};
 use crate::expression::DerivedSignal;
 use crate::friction::initial_state::{merge_powers, State};
-use crate::friction::model::first_of;
+use crate::friction::model::state_guesses;
+use crate::friction::FreeFrictionLaw;
 use crate::parallel::Stop;
 use crate::regressors::{add_impulses, split_impulses, Record};
 
@@ -19,6 +21,8 @@ pub struct NonlinearModel {
     pub model: FreeModel,
     /// Expressions of the derived signals, which follow the recorded ones.
     pub derived: Vec<DerivedSignal>,
+    /// Equations with dry friction, and F of − F(Dy) sgn(Dy).
+    pub frictions: Vec<(usize, FreeFrictionLaw)>,
     /// Outputs that pass the filter of every experiment before the comparison. Empty if none does.
     pub filtered: Vec<bool>,
 }
@@ -68,7 +72,8 @@ impl NonlinearModel {
             equations: self.model.equations.iter().map(of).collect(),
             derived: self.derived.clone(),
             recorded,
-            coupled: self.model.coupled,
+            coupled: self.model.coupled || !self.frictions.is_empty(),
+            frictions: self.frictions.iter().map(|(place, law)| (*place, law.at(coefficients))).collect(),
         }
     }
 
@@ -82,12 +87,12 @@ impl NonlinearModel {
         (State::all(&equations, &self.model.initial, &self.filtered, moves), equations)
     }
 
-    /// Forcing of the state channels by the initial states of a run.
+    /// ForcingTerms by the initial states of a run.
     fn initial_forcing(
         &self,
         operators: &Operators,
         (orders, coefficients, values): (&[f64], &[f64], &[f64]),
-    ) -> Result<Vec<Vec<f64>>> {
+    ) -> Result<ForcingTerms> {
         let (powers, _) = split_impulses(&self.powers(orders, coefficients, values));
         operators.initial_forcing(&self.system(orders, coefficients, usize::MAX).links(), &powers)
     }
@@ -96,18 +101,24 @@ impl NonlinearModel {
     fn moves(&self, point: &Point, run: usize, part: &Part, moved: &Parameter) -> Result<Moves> {
         let (values, equations) = (&point.states[run], &self.model.equations);
         let mut moves = Moves {
-            terms: equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len()]).collect(),
-            forcing: Vec::new(),
+            terms: equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len() + 1]).collect(),
+            forcing: ForcingTerms::default(),
+            laws: Vec::new(),
             inputs: Vec::new(),
         };
-        let difference = |at: &dyn Fn(f64) -> (Vec<f64>, Vec<f64>), by: f64| -> Result<Vec<Vec<f64>>> {
+        let difference = |at: &dyn Fn(f64) -> (Vec<f64>, Vec<f64>), by: f64| -> Result<ForcingTerms> {
             let side = |by: f64| {
                 let (orders, coefficients) = at(by);
                 self.initial_forcing(&part.operators, (&orders, &coefficients, values))
             };
             let (mut up, down) = (side(by)?, side(-by)?);
-            for (up, down) in up.iter_mut().zip(down) {
-                up.iter_mut().zip(down).for_each(|(u, d)| *u = (*u - d) / (2.0 * by));
+            let slope = |up: &mut f64, down: f64| *up = (*up - down) / (2.0 * by);
+            for (up, down) in up.channels.iter_mut().zip(down.channels) {
+                up.iter_mut().zip(down).for_each(|(up, down)| slope(up, down));
+            }
+            for (up, down) in up.starts.iter_mut().zip(down.starts) {
+                slope(&mut up.0, down.0);
+                slope(&mut up.1, down.1);
             }
             Ok(up)
         };
@@ -117,7 +128,8 @@ impl NonlinearModel {
                 let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
                 for (terms, equation) in moves.terms.iter_mut().zip(equations) {
                     let alpha = of(&equation.order.weights);
-                    *terms = equation.terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect();
+                    let orders = equation.terms.iter().map(|t| alpha - of(&t.1.weights)).chain([alpha]);
+                    *terms = orders.map(|order| (0.0, order)).collect();
                 }
                 if !idle {
                     let shifted = |by: f64| {
@@ -130,8 +142,10 @@ impl NonlinearModel {
             }
             Parameter::Coefficient(j) => {
                 for (terms, equation) in moves.terms.iter_mut().zip(equations) {
-                    *terms = equation.terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect();
+                    let coefficients = equation.terms.iter().map(|t| t.2.slope(&point.coefficients, j)).chain([0.0]);
+                    *terms = coefficients.map(|coefficient| (coefficient, 0.0)).collect();
                 }
+                moves.laws = self.frictions.iter().map(|(_, law)| law.slope(&point.coefficients, j)).collect();
                 if !idle {
                     let by = DIFFERENCE_STEP * point.coefficients[j].abs().max(1.0);
                     let shifted = |by: f64| {
@@ -183,6 +197,16 @@ impl StateModel for NonlinearModel {
         &self.model.inputs
     }
 
+    /// Friction forces are not negative.
+    fn is_nonnegative(&self, coefficient: usize) -> bool {
+        self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
+    }
+
+    /// Times at which a body stops or reverses move from pulse to pulse with any parameter.
+    fn has_kinks(&self) -> bool {
+        !self.frictions.is_empty()
+    }
+
     fn check(&self, experiments: &[Experiment]) -> Result<()> {
         let Some(recorded) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
@@ -213,14 +237,9 @@ impl StateModel for NonlinearModel {
         system.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
     }
 
-    fn state_guesses(&self, orders: &[f64], _coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
-        let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
-        let value = |state: &State| match *state {
-            State::Level(i) => begun[i].0,
-            State::Rate(i) => begun[i].1,
-            _ => 0.0,
-        };
-        vec![self.states(orders).0.iter().map(value).collect()]
+    fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
+        let frictions = self.system(orders, coefficients, usize::MAX).frictions;
+        state_guesses(&self.states(orders), &frictions, experiment)
     }
 
     fn state_count(&self, orders: &[f64]) -> usize {

@@ -97,7 +97,7 @@ impl OutputSimulation {
         Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
 
-    /// Simulation of equations with non-linear terms, which are terms of derived signals. These are numbered after the
+    /// Simulation of equations with non-linear terms, which are terms of derived signals, and the friction of some. These are numbered after the
     /// signals of the recording.
     ///
     /// # Errors
@@ -117,7 +117,7 @@ impl OutputSimulation {
     /// let u = Channel::new("u", vec![1.0; 21], Role::Input(Intersample::Hold));
     /// let run = Recording::new("run", 0.05, None, vec![Channel::new("y", vec![0.0; 21], Role::Output), u], vec![0])?;
     /// let derived = vec![DerivedSignal::new(square, vec![(0, 0.0)])?];
-    /// let simulation = OutputSimulation::with_derived(run.into(), vec![plant], derived, None)?;
+    /// let simulation = OutputSimulation::with_derived(run.into(), vec![plant], Vec::new(), derived, None)?;
     /// let rest = InitialTerms::Given(vec![Vec::new()]);
     /// assert!((simulation.samples(8, &rest)?.outputs[0][20] - 1.0_f64.tanh()).abs() < 1e-4);
     /// # Ok::<(), ftlm::error::Error>(())
@@ -125,6 +125,7 @@ impl OutputSimulation {
     pub fn with_derived(
         recording: Arc<Recording>,
         equations: Vec<Equation>,
+        frictions: Vec<(usize, FrictionLaw)>,
         derived: Vec<DerivedSignal>,
         times: Option<Vec<f64>>,
     ) -> Result<Self> {
@@ -138,7 +139,7 @@ impl OutputSimulation {
             let remedy = "the sensor filter does not commute with them: use coupling='simulated' and inputs before it";
             return Err(nonlinear::refuse_beside("inputs behind the sensor filter", remedy));
         }
-        let found = Self { recording, equations, frictions: Vec::new(), times, derived };
+        let found = Self { recording, equations, frictions, times, derived };
         found.system().check()?;
         for (i, Equation { structure, .. }) in found.equations.iter().enumerate() {
             let driven = |signal: usize| match signal.checked_sub(recorded) {
@@ -167,7 +168,8 @@ impl OutputSimulation {
             equations: self.equations.clone(),
             derived: self.derived.clone(),
             recorded: self.recording.channels().len(),
-            coupled: self.recording.is_coupled,
+            coupled: self.recording.is_coupled || !self.frictions.is_empty(),
+            frictions: self.frictions.clone(),
         }
     }
 
@@ -225,14 +227,14 @@ impl OutputSimulation {
         let (equations, filtered) =
             (self.equations.iter().map(fixed).collect(), friction::filtered_outputs(&experiments));
         let (order_bounds, coordinates, inputs) = (Vec::new(), Vec::new(), Vec::new());
+        let frictions = self.frictions.iter().map(|(place, friction)| (*place, law(*friction))).collect();
         let found = if self.derived.is_empty() {
-            let frictions = self.frictions.iter().map(|(place, friction)| (*place, law(*friction))).collect();
             let model = FrictionModel { equations, frictions, inputs, order_bounds, coordinates, initial, filtered };
             friction::fit_until(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?
         } else {
             let coupled = self.recording.is_coupled;
             let model = FreeModel { equations, order_bounds, coordinates, inputs, coupled, initial };
-            let model = NonlinearModel { model, derived: self.derived.clone(), filtered };
+            let model = NonlinearModel { model, derived: self.derived.clone(), frictions, filtered };
             nonlinear::fit(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?
         };
         Ok(found.initial.into_iter().flatten().collect())
@@ -365,12 +367,18 @@ impl<'a> Grid<'a> {
     /// Pulse means of the outputs before the sensor filter.
     fn respond(&self, terms: &Terms) -> Result<Rows> {
         let OutputSimulation { recording, equations, frictions, .. } = self.simulation;
-        if !frictions.is_empty() {
-            let body = Body { equations: equations.clone(), frictions: frictions.clone() };
-            return Ok(body.run(&self.record, terms)?.outputs);
-        }
         if !self.simulation.derived.is_empty() {
             return self.simulation.system().run(&self.record, terms);
+        }
+        if !frictions.is_empty() {
+            let body = Body { equations: equations.clone(), frictions: frictions.clone() };
+            return match body.run(&self.record, terms) {
+                Ok(motion) => Ok(motion.outputs),
+                // The inverse of an unstable body grows until motion and friction cancel in its products. Steps without
+                // the inverse lose no digits there.
+                Err(Error::Diverged { .. }) => self.simulation.system().run(&self.record, terms),
+                Err(error) => Err(error),
+            };
         }
         if recording.is_coupled {
             return simulate::respond(equations, &self.record, terms);

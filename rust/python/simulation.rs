@@ -14,7 +14,6 @@ use super::estimation::jumps_near;
 use super::recording::Recording;
 use crate::error::check_length;
 use crate::friction::FrictionLaw;
-use crate::nonlinear::refuse_beside;
 use crate::output_samples::{self, InitialTerms, OutputSamples, Refinement};
 use crate::python::order_search::watch::{run_interruptible, Stop};
 use crate::signal::block_pulse::SampleInterpolation;
@@ -222,10 +221,8 @@ impl OutputSimulation {
         super::errors::run_attached(|| {
             let inner = if derived.is_empty() {
                 output_samples::OutputSimulation::new(run, equations, frictions, times)?
-            } else if frictions.is_empty() {
-                output_samples::OutputSimulation::with_derived(run, equations, derived, times)?
             } else {
-                return Err(refuse_beside("dry friction", "leave one of them out"));
+                output_samples::OutputSimulation::with_derived(run, equations, frictions, derived, times)?
             };
             Ok(Self { inner: Arc::new(inner), points })
         })

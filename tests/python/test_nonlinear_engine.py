@@ -198,6 +198,11 @@ JACOBIANS = {
         {"alpha": 1.2, "k": -2.0, "b": 3.0, "e": 0.3, "sat_u": 0.71},
         {"saturation": {"u": (0.1, 2.0)}},
     ),
+    "friction": (
+        "D^alpha y = a D^mu y + k y + k3 y^3 + b u - fc*sign(D y)",
+        {"alpha": 1.8, "mu": 0.7, "a": -0.7, "k": -2.0, "k3": -3.0, "b": 6.0, "fc": 0.8},
+        {},
+    ),
     "delay": (
         "D^alpha y = k y^3 + b u + e u*y",
         {"alpha": 1.2, "k": -2.0, "b": 3.0, "e": -0.3, "delay_u": 0.087},
@@ -261,6 +266,75 @@ def test_two_runs_with_a_delay_gaps_and_initial_values_are_fitted_together():
         y[300:340] = np.nan
         runs.append(ftlm.Run.from_arrays(step=0.01, inputs=inputs, outputs={"y": y}, missing="weight", name=f"{start}"))
     structure = ftlm.equation(text, delay={"u": (0.0, 0.2)}, initial="caputo")
+    joint = ftlm.identify(runs, structure, threads=1).joint
+    assert abs(joint.noise["y"] / 0.004 - 1) < 0.1
+    for name, value in joint.values_by_name.items():
+        assert abs(value - truth[name]) < 3.5 * joint.standard_errors[name], name
+
+
+def staircase(rows, hold, size, seed):
+    """A command of random levels."""
+    return np.repeat(np.random.default_rng(seed).uniform(-size, size, -(-rows // hold)), hold)[:rows]
+
+
+def euler_with_friction(u, step, fine):
+    """Positions of D^2 y = -0.3 D y - 2 y - 4 y^3 + 3 u - 0.5 sign(D y) by small steps that stop at rest."""
+    y = v = 0.0
+    out = []
+    for level in u:
+        out.append(y)
+        for _ in range(fine):
+            force = -0.3 * v - 2 * y - 4 * y**3 + 3 * level
+            if v == 0 and abs(force) <= 0.5:
+                continue
+            ahead = v + step / fine * (force - 0.5 * np.sign(v or force))
+            ahead = 0.0 if ahead * v < 0 else ahead
+            y, v = y + 0.5 * step / fine * (v + ahead), ahead
+    return np.array(out)
+
+
+def test_friction_beside_a_cubic_spring_is_that_of_small_steps():
+    u = staircase(1000, 50, 2.0, 1)
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * u})
+    model = ftlm.Model(ftlm.equation("D^2 y = -0.3 D y - 2 y - 4 y^3 + 3 u - 0.5*sign(D y)"))
+    y = model.simulate(run, tolerance=1e-5)["y"]
+    errors = [np.max(np.abs(y - euler_with_friction(u, 0.01, fine))) for fine in (20, 40)]
+    assert errors[0] < 5e-3 * np.max(np.abs(y))
+    assert errors[1] < 0.6 * errors[0]
+
+
+@pytest.mark.parametrize("alpha", [2.0, 1.6])
+def test_friction_beside_a_vanishing_term_is_that_of_the_linear_equation(alpha):
+    u = staircase(600, 50, 2.0, 2)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u})
+    text = f"D^{alpha} y = -0.3 D y - 2 y + 3 u - 0.5*sign(D y)"
+    linear, other = (
+        ftlm.Model(ftlm.equation(text + term)).simulate(run, tolerance=1e-4)["y"] for term in ("", " + 1e-300 y^3")
+    )
+    # A body at rest keeps its mean exactly here, and to second order in the step there.
+    assert np.max(np.abs(linear - other)) < 1e-5 * np.max(np.abs(linear))
+
+
+@pytest.mark.parametrize("term", ["", " - 0.1 y^3"])
+def test_friction_keeps_an_unstable_body_at_rest(term):
+    u = np.full(1500, 0.5)
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * u})
+    model = ftlm.Model(ftlm.equation("D^2 y = 9 y + 1 u - 1*sign(D y)" + term))
+    assert np.all(model.simulate(run)["y"] == 0.0)
+
+
+def test_two_runs_with_a_delay_gaps_and_friction_beside_a_cubic_spring_are_fitted_together():
+    truth = {"a": -0.8, "k": -9.0, "k3": -40.0, "b": 4.0, "fc": 0.9, "delay_u": 0.07}
+    text = "D^2 y = a D y + k y + k3 y^3 + b u - fc*sign(D y)"
+    model = ftlm.Model(ftlm.equation(text, fixed={n: v for n, v in truth.items() if n != "delay_u"}, delay={"u": 0.07}))
+    runs, rng = [], np.random.default_rng(6)
+    for seed in (3, 4):
+        inputs = {"u": staircase(800, 80, 3.0, seed)}
+        blank = ftlm.Run.from_arrays(step=0.01, inputs=inputs, outputs={"y": np.zeros(800)})
+        y = model.simulate(blank, tolerance=1e-5)["y"] + 0.004 * rng.standard_normal(800)
+        y[300:340] = np.nan
+        runs.append(ftlm.Run.from_arrays(step=0.01, inputs=inputs, outputs={"y": y}, missing="weight", name=f"{seed}"))
+    structure = ftlm.equation(text, delay={"u": (0.0, 0.2)}, initial="rest")
     joint = ftlm.identify(runs, structure, threads=1).joint
     assert abs(joint.noise["y"] / 0.004 - 1) < 0.1
     for name, value in joint.values_by_name.items():

@@ -96,7 +96,7 @@ impl ParameterSet {
             initial: structure.initial.clone(),
         };
         let outputs = structure.equations.iter().map(|e| structure.signals[e.output].clone()).collect();
-        let problem = Problem::new(outputs, model, frictions.collect())?.with_derived(structure.derived.clone())?;
+        let problem = Problem::new(outputs, model, frictions.collect())?.with_derived(structure.derived.clone());
         Ok(Self { orders, coefficients, products, problem, structure })
     }
 

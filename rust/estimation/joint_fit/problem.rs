@@ -62,14 +62,9 @@ impl Problem {
     }
 
     /// Problem with derived signals, numbered after the recorded ones.
-    ///
-    /// # Errors
-    /// [`Error::Structure`] beside friction.
-    pub fn with_derived(self, derived: Vec<DerivedSignal>) -> Result<Self> {
-        if !derived.is_empty() && !self.frictions.is_empty() {
-            return Err(nonlinear::refuse_beside("dry friction", "leave one of them out"));
-        }
-        Ok(Self { derived, ..self })
+    #[must_use]
+    pub fn with_derived(self, derived: Vec<DerivedSignal>) -> Self {
+        Self { derived, ..self }
     }
 
     /// True if the simulation is linear in coefficients of inputs and in initial terms.
@@ -156,7 +151,8 @@ impl Problem {
             };
             friction::fit_until(&model, experiments, &start, settings, stop)?
         } else {
-            let model = NonlinearModel { model: self.model.clone(), derived: self.derived.clone(), filtered };
+            let (model, derived, frictions) = (self.model.clone(), self.derived.clone(), self.frictions.clone());
+            let model = NonlinearModel { model, derived, frictions, filtered };
             nonlinear::fit(&model, experiments, &start, settings, stop)?
         };
         let point = ParameterPoint { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };

@@ -6,12 +6,12 @@
 //! the non-linear terms add guesses.
 
 use super::coarse_grid::coarse_sampling;
-use super::friction::{guess_at, values_of};
+use super::friction::{guess_at, run_friction_multistart, values_of};
 use super::halving::{
     is_same_iterate, is_same_optimum, merge_duplicates, sort_by_cost, RungExecutor, FIRST_BUDGET_EVALUATIONS,
     MAX_FINAL_SURVIVORS, MIN_SURVIVORS, SECOND_BUDGET_EVALUATIONS,
 };
-use super::search::{none_if_invalid_model, run_multistart, MultistartContext, NOISE_FLOOR_FACTOR};
+use super::search::{none_if_invalid_model, MultistartContext, NOISE_FLOOR_FACTOR};
 use crate::error::Result;
 use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
@@ -47,8 +47,14 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
     let sources = sources.collect::<Result<Vec<_>>>()?;
     let mut starts = Vec::new();
     for source in &sources {
-        let guesses = course.starts.for_recordings(source).initial_guesses(&linear);
-        starts.extend(none_if_invalid_model(guesses)?.unwrap_or_default());
+        let of_source = course.starts.for_recordings(source);
+        if structure.has_friction() {
+            let own = MultistartContext { source, starts: of_source.as_ref(), told: None, ..course };
+            let found = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
+            starts.extend(embed(free, &linear, &found)?);
+            continue;
+        }
+        starts.extend(none_if_invalid_model(of_source.initial_guesses(&linear))?.unwrap_or_default());
     }
     let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
     let mut ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
@@ -81,15 +87,12 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
         for source in &sources {
             let starts = course.starts.for_recordings(source);
             let own = MultistartContext { source, starts: starts.as_ref(), told: None, ..course };
-            more.extend(embed(
-                free,
-                &linear,
-                &none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default(),
-            )?);
+            let found = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
+            more.extend(embed(free, &linear, &found)?);
         }
         if let Some(less) = without_nonlinear_terms(structure) {
             let own = MultistartContext { told: None, ..course };
-            let found = none_if_invalid_model(run_multistart(&less, own))?.unwrap_or_default();
+            let found = none_if_invalid_model(run_friction_multistart(&less, own))?.unwrap_or_default();
             more.extend(embed(free, &less, &found)?);
         }
         reached.extend(laps.run(free, &grid, &more, FIRST_BUDGET_EVALUATIONS)?);

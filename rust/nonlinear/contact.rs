@@ -1,0 +1,273 @@
+//! Dry friction beside non-linear terms: friction of a pulse, and its derivatives.
+//!
+//! The end velocity of a body is V = P − G φ with its friction φ, G being the response within the pulse without the
+//! non-linear terms. A solution of the pulse at given friction gives P = V + G φ, which the non-linear terms change
+//! little within a pulse. The friction that belongs to P therefore converges in a few iterations.
+
+use super::channels::ForcingTerms;
+use super::march::{Failure, Moves, Pulse};
+use crate::error::Result;
+use crate::friction::contact::{ContactLaw, VELOCITY_ROUNDING_RATIO};
+use crate::friction::law::{FrictionLaw, Pulse as FrictionPulse, PulseDerivatives};
+use crate::linalg::small;
+
+/// Iterations for the friction of a pulse. Three are usual.
+const MAX_FRICTION_ITERATIONS: usize = 60;
+/// Error of a friction, relative to the velocities, that ends the iteration.
+const FRICTION_ROUNDING_RATIO: f64 = 64.0 * f64::EPSILON;
+/// Largest error of a friction, relative to the velocities.
+const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
+
+/// Bodies with friction.
+pub(super) struct Contact {
+    laws: Vec<FrictionLaw>,
+    law: ContactLaw,
+    /// State channels of the output and of the end velocity of each body.
+    outputs: Vec<usize>,
+    velocities: Vec<usize>,
+    /// Number of state channels.
+    states: usize,
+    /// Decrease of the end velocities for a unit of friction, row by row.
+    gains: Vec<f64>,
+    /// Inverse of the equations of the state channels without non-linear terms.
+    inverse: Vec<f64>,
+}
+
+/// Motion and friction of a body in a pulse.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PulseContact {
+    /// Velocity at the start.
+    start: f64,
+    /// Velocity at the end without the friction of the body.
+    free: f64,
+    /// Whether the body rests in this pulse and in the one before, so that its mean output stays.
+    rests: bool,
+    pulse: FrictionPulse,
+}
+
+/// Derivatives of the bodies with respect to a parameter.
+pub(super) struct BodyMoves {
+    /// Initial output and velocity of each body.
+    pub(super) starts: Vec<(f64, f64)>,
+    /// Derivative of the own gain of each body.
+    gains: Vec<f64>,
+    /// fc, fs and vs of each body.
+    laws: Vec<[f64; 3]>,
+}
+
+/// Bodies in motion.
+pub(super) struct Motion<'a> {
+    contact: &'a Contact,
+    /// Velocities at the start of the run.
+    first: Vec<f64>,
+    /// Velocities at the start of the pulse.
+    now: Vec<f64>,
+    /// Outputs of the last pulse, and whether each body rested in it.
+    before: Vec<(f64, bool)>,
+    /// Whether each body rests in this pulse and in the one before.
+    rests: Vec<bool>,
+    forces: Vec<f64>,
+    rounding: Vec<f64>,
+    at: Vec<(f64, FrictionPulse)>,
+    contacts: Vec<PulseContact>,
+}
+
+impl Contact {
+    /// Bodies with these laws and state channels, of the output and of the end velocity of each; `gains` are the weights of the sources in each state channel within a
+    /// pulse, the frictions being the last sources.
+    pub(super) fn new(
+        laws: Vec<FrictionLaw>,
+        channels: &[(usize, usize)],
+        gains: &[f64],
+        states: usize,
+    ) -> Result<Self> {
+        let (count, n) = (gains.len() / states, laws.len());
+        let (outputs, velocities): (Vec<usize>, Vec<usize>) = channels.iter().copied().unzip();
+        let mut matrix = vec![0.0; states * states];
+        for a in 0..states {
+            for b in 0..states {
+                matrix[a * states + b] = f64::from(u8::from(a == b)) - gains[a * count + b];
+            }
+        }
+        let inverse = small::inverse(&matrix, states)?;
+        let response = |a: usize, b: usize| -> f64 {
+            (0..states).map(|s| -inverse[velocities[a] * states + s] * gains[s * count + count - n + b]).sum()
+        };
+        let own: Vec<f64> = (0..n * n).map(|at| response(at / n, at % n)).collect();
+        let law = ContactLaw::new(laws.clone(), own.clone())?;
+        Ok(Self { laws, law, outputs, velocities, states, gains: own, inverse })
+    }
+
+    /// Number of bodies.
+    pub(super) fn count(&self) -> usize {
+        self.laws.len()
+    }
+
+    /// State channel of the output of each body, which is the index of its equation.
+    pub(super) fn outputs(&self) -> &[usize] {
+        &self.outputs
+    }
+
+    /// Bodies at the start of a run.
+    pub(super) fn start(&self, forcing: &ForcingTerms) -> Motion<'_> {
+        let first: Vec<f64> = forcing.starts.iter().map(|start| start.1).collect();
+        let before = forcing.starts.iter().map(|start| (start.0, true)).collect();
+        let largest = |(body, start): (&usize, &f64)| {
+            VELOCITY_ROUNDING_RATIO * forcing.channels[*body].iter().fold(start.abs(), |most, v| most.max(v.abs()))
+        };
+        let rounding = self.velocities.iter().zip(&first).map(largest).collect();
+        let (now, forces) = (first.clone(), vec![0.0; self.count()]);
+        let rests = vec![false; self.count()];
+        Motion { contact: self, first, now, before, rests, forces, rounding, at: Vec::new(), contacts: Vec::new() }
+    }
+
+    /// Derivatives of the bodies from those of the weights of sources, row by row.
+    pub(super) fn moves(&self, gains: &[f64], gain_moves: &[f64], moves: &Moves) -> Result<BodyMoves> {
+        let (states, n) = (self.states, self.count());
+        let count = gains.len() / states;
+        let of = |a: usize| -> f64 {
+            let friction = count - n + a;
+            let response: Vec<f64> = (0..states)
+                .map(|s| (0..states).map(|r| self.inverse[s * states + r] * gains[r * count + friction]).sum())
+                .collect();
+            let moved = (0..states).map(|s| {
+                let row = &gain_moves[s * count..(s + 1) * count];
+                row[friction] + row[..states].iter().zip(&response).map(|(g, x)| g * x).sum::<f64>()
+            });
+            moved.enumerate().map(|(s, v)| -self.inverse[self.velocities[a] * states + s] * v).sum()
+        };
+        let mut starts = moves.forcing.starts.clone();
+        starts.resize(n, (0.0, 0.0));
+        let mut laws = moves.laws.clone();
+        laws.resize(n, [0.0; 3]);
+        Ok(BodyMoves { starts, gains: (0..n).map(of).collect(), laws })
+    }
+
+    /// Add the derivatives of the frictions of a pulse to those of the sources; update those of outputs and velocities.
+    pub(super) fn linear_pulse(
+        &self,
+        at: &[PulseContact],
+        moves: &BodyMoves,
+        motion: &mut [(f64, f64)],
+        (gains, inverse): (&[f64], &[f64]),
+        x: &mut [f64],
+    ) -> Result<()> {
+        let (states, n, count) = (self.states, self.count(), x.len());
+        let moves_freely =
+            |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.rests && output == state);
+        let free: Vec<usize> = (0..states).filter(|&state| moves_freely(state)).collect();
+        // Response of the state channels to a friction, with the non-linear terms.
+        let response = |b: usize| -> Vec<f64> {
+            let of = |a: usize| free.iter().map(|&s| inverse[a * states + s] * gains[s * count + count - n + b]).sum();
+            (0..states).map(of).collect()
+        };
+        let responses: Vec<Vec<f64>> = (0..n).map(response).collect();
+        let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);
+        for (a, &PulseContact { start, free, pulse, .. }) in at.iter().enumerate() {
+            let own = self.gains[a * n + a];
+            let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
+            let rise = self.laws[a].slope(start, free, own, &pulse, &unit).0;
+            for b in 0..n {
+                let direct = if a == b { 1.0 - rise * own } else { 0.0 };
+                matrix[a * n + b] = direct - rise * responses[b][self.velocities[a]];
+            }
+            let end = moves.starts[a].1 + x[self.velocities[a]];
+            let moved = PulseDerivatives {
+                start: motion[a].1,
+                free: end + pulse.force * moves.gains[a],
+                first: moves.gains[a],
+                law: moves.laws[a],
+            };
+            right[a] = self.laws[a].slope(start, free, own, &pulse, &moved).0;
+        }
+        let solution = small::inverse(&matrix, n)?;
+        for b in 0..n {
+            let force: f64 = (0..n).map(|c| solution[b * n + c] * right[c]).sum();
+            x[..states].iter_mut().zip(&responses[b]).for_each(|(x, r)| *x += r * force);
+            x[count - n + b] = force;
+        }
+        for (a, motion) in motion.iter_mut().enumerate() {
+            *motion = (x[self.outputs[a]], moves.starts[a].1 + x[self.velocities[a]]);
+        }
+        Ok(())
+    }
+
+    /// Set the derivatives of the outputs of bodies at rest to those of the last pulse.
+    pub(super) fn keep_outputs(&self, at: &[PulseContact], motion: &[(f64, f64)], free: &mut [f64]) {
+        for (a, _) in at.iter().enumerate().filter(|(_, at)| at.rests) {
+            free[self.outputs[a]] = motion[a].0;
+        }
+    }
+}
+
+impl Motion<'_> {
+    /// Solve a pulse for its state channels and frictions.
+    ///
+    /// Within a pulse the force of another body changes while the mean of friction is constant, so that the mean output
+    /// of a body at rest would creep with the square of the step. It is kept from pulse to pulse instead.
+    pub(super) fn solve(&mut self, pulse: &mut Pulse<'_>) -> std::result::Result<(), Failure> {
+        for (rests, (before, now)) in self.rests.iter_mut().zip(self.before.iter().zip(&self.now)) {
+            *rests = before.1 && *now == 0.0;
+        }
+        loop {
+            for (a, rests) in self.rests.iter().enumerate() {
+                pulse.fixed[self.contact.outputs[a]] = rests.then_some(self.before[a].0);
+            }
+            self.solve_friction(pulse)?;
+            let mut is_done = true;
+            for (rests, (_, found)) in self.rests.iter_mut().zip(&self.at) {
+                if *rests && found.end != 0.0 {
+                    (*rests, is_done) = (false, false);
+                }
+            }
+            if is_done {
+                return Ok(());
+            }
+        }
+    }
+
+    fn solve_friction(&mut self, pulse: &mut Pulse<'_>) -> std::result::Result<(), Failure> {
+        let (contact, n) = (self.contact, self.contact.count());
+        let mut miss = f64::INFINITY;
+        let mut size: f64 = 0.0;
+        for _ in 0..MAX_FRICTION_ITERATIONS {
+            pulse.set_frictions(&self.forces);
+            pulse.solve()?;
+            let through = |a: usize| (0..n).map(|b| contact.gains[a * n + b] * self.forces[b]).sum::<f64>();
+            let free: Vec<f64> = (0..n).map(|a| self.first[a] + pulse.z[contact.velocities[a]] + through(a)).collect();
+            contact.law.pulse(&self.now, &free, &self.rounding, &self.forces, &mut self.at);
+            (miss, size) = (0.0, 0.0);
+            for (a, (_, found)) in self.at.iter().enumerate() {
+                let own = contact.gains[a * n + a];
+                miss = f64::max(miss, (found.force - self.forces[a]).abs() * own);
+                size = size.max(self.now[a].abs() + free[a].abs() + contact.laws[a].breakaway() * own);
+                self.forces[a] = found.force;
+            }
+            if miss.is_nan() || self.at.iter().any(|(_, found)| found.end.is_nan()) {
+                return Err(Failure::Overflow);
+            }
+            if miss <= FRICTION_ROUNDING_RATIO * size {
+                break;
+            }
+        }
+        if miss > MAX_FRICTION_ERROR_RATIO * size {
+            return Err(Failure::Newton("no friction agrees with its motion"));
+        }
+        for (a, (_, found)) in self.at.iter().enumerate() {
+            pulse.z[contact.velocities[a]] = found.end - self.first[a];
+        }
+        Ok(())
+    }
+
+    /// Go on to the next pulse; return the contacts of the solved one, with these state channels.
+    pub(super) fn advance(&mut self, z: &[f64]) -> &[PulseContact] {
+        self.contacts.clear();
+        for (a, &(free, pulse)) in self.at.iter().enumerate() {
+            let start = self.now[a];
+            self.contacts.push(PulseContact { start, free, rests: self.rests[a], pulse });
+            self.before[a] = (z[self.contact.outputs[a]], start == 0.0 && pulse.end == 0.0);
+            self.now[a] = pulse.end;
+        }
+        &self.contacts
+    }
+}
