@@ -85,11 +85,11 @@ class Run:
     outputs: tuple[str, ...]
     notes: tuple[str, ...]
     sample_times: NonuniformSamples | None
-    unmasked_run: Run | None = None
     _data: dict[str, Floats]
     _units: dict[str, str]
     _intersample: dict[str, Intersample]
     _metadata: dict[str, Any]
+    unmasked_run: Run | None = None
 
     def __init__(self) -> None:
         raise TypeError("a Run is made by Run.from_arrays, Run.from_frame or ftlm.load")
