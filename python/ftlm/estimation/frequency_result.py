@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
+from ftlm.analysis.frequency_response import covariance_of, frequency_response, response_deviation, response_inputs
 from ftlm.analysis.model_algebra import Ratio
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError, ModelError
@@ -71,7 +71,7 @@ def model_curve(
 ) -> tuple[Complex, Floats | None, Floats | None]:
     """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
     response = model_response(model, record, omega)
-    if isinstance(model, Circuit) or model.estimate is None or model.estimate.covariance is None:
+    if isinstance(model, Circuit) or covariance_of(model) is None:
         return response, None, None
     gain, phase = (part[_place_of(model, record)] for part in response_deviation(model, omega))
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
+from ftlm.analysis.frequency_response import covariance_of, parameter_vector, with_parameter_vector
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError
 from ftlm.model.model import Model
@@ -361,10 +361,9 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
         Lower and upper end by output. Empty for a model without covariance or with friction, and if a simulation with
         a changed parameter fails.
     """
-    covariance = None if model.estimate is None else model.estimate.covariance
-    if covariance is None or model.structure.has_friction:
+    spread = covariance_of(model)
+    if spread is None or model.structure.has_friction:
         return {}
-    spread = np.asarray(covariance, dtype=np.float64)
     errors, values = np.sqrt(np.diag(spread)), parameter_vector(model)
     if not np.all(np.isfinite(spread)):
         return {}

@@ -290,7 +290,6 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     for row, charts in zip(axes, rows, strict=True):
         for axis, (chart, test) in zip(row, charts, strict=False):
             draw_chart(axis, replace(chart, title=f"{chart.title}: {test.verdict}"))
-            axis.label_outer()
         for axis in row[len(charts) :]:
             axis.set_axis_off()
     return figure

@@ -9,7 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs, transfer_functions
+from ftlm.analysis.frequency_response import (
+    covariance_of,
+    frequency_response,
+    response_deviation,
+    response_inputs,
+    transfer_functions,
+)
 from ftlm.analysis.poles import modes
 from ftlm.analysis.time_response import Response, response
 from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER, frequency_chart
@@ -135,9 +141,7 @@ class BodeCurve:
 def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
     """Return the curves of all connected pairs of input and output; Coulomb friction is omitted."""
     response = frequency_response(model, omega)
-    spread = None
-    if model.estimate is not None and model.estimate.covariance is not None:
-        spread = response_deviation(model, omega)
+    spread = None if covariance_of(model) is None else response_deviation(model, omega)
     inputs = response_inputs(model, coupled=True)
     curves = []
     for i, output in enumerate(model.outputs):
