@@ -151,6 +151,8 @@ def test_summary_report_validation_and_json(tmp_path):
     assert found.to_dict()["circuit"] == "R0-p(R1,CPE1)-W1"
     assert list(found.to_frame().index) == list(found.values)
     assert found._repr_html_()
+    size, phase = ftlm.plot.response(found).axes
+    assert (size.get_ylabel(), size.get_yscale(), phase.get_xlabel()) == ("|Z| [Ω]", "log", "frequency [Hz]")
     (axes,) = ftlm.plot.nyquist(found).axes
     measured = next(line for line in axes.lines if len(line.get_xdata()) == F.size)
     np.testing.assert_allclose(measured.get_ydata(), -spectrum(formula(*true)).response.imag)

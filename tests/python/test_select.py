@@ -331,6 +331,8 @@ def test_what_only_drives_has_a_skeleton(runs):
 
 def test_masked_runs_keep_what_was_read(runs):
     unread = mask_outputs(runs[0], ["y"], (10, 20))
+    assert unread.unmasked_run is runs[0]
+    assert unread.select(["u", "y"]).unmasked_run is None
     assert unread.step == runs[0].step
     assert unread.name == runs[0].name
     np.testing.assert_array_equal(unread["u"], runs[0]["u"])

@@ -286,8 +286,8 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
     ModelError
         A model without covariance.
     """
-    covariance = None if model.estimate is None else model.estimate.covariance
-    if covariance is None:
+    matrix = covariance_of(model)
+    if matrix is None:
         raise ModelError(
             "this model has no covariance, so its response has no uncertainty; identify it with "
             f"{parameter('method', 'output-error')}, and without a term whose interval is infinite"
@@ -297,7 +297,7 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
     derivative = np.zeros((values.size, *centre.shape), dtype=np.complex128)
     for k, value in enumerate(values):
         step = DERIVATIVE_STEP_RATIO * max(abs(value), 1e-3)
-        if not np.any(covariance[k]):
+        if not np.any(matrix[k]):
             continue
         above, below = values.copy(), values.copy()
         above[k], below[k] = value + step, value - step
@@ -306,10 +306,16 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
         )
         with np.errstate(divide="ignore", invalid="ignore"):
             derivative[k] = (higher - lower) / (2 * step) / centre
-    matrix = np.asarray(covariance, dtype=np.float64)
     variances = [np.einsum("i...,ij,j...->...", part, matrix, part) for part in (derivative.real, derivative.imag)]
     gain, phase = (np.sqrt(np.maximum(v, 0.0)) for v in variances)
     return gain, phase
+
+
+def covariance_of(model: Model) -> Floats | None:
+    """Return the covariance of the numbers of :func:`parameter_vector`; None for a model without one."""
+    if model.estimate is None or model.estimate.covariance is None:
+        return None
+    return np.asarray(model.estimate.covariance, dtype=np.float64)
 
 
 def parameter_vector(model: Model) -> Floats:

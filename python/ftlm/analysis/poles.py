@@ -16,6 +16,7 @@ from ftlm.analysis.frequency_response import (
     Polynomial,
     check_no_input_nonlinearity,
     coupled_outputs,
+    covariance_of,
     determinant,
     equation_polynomials,
     is_coupled,
@@ -571,10 +572,9 @@ def _standard_deviations(
     model: Model, at: int, zeros: Complex, *, coupled: bool
 ) -> Sequence[tuple[float, float, float] | None]:
     """Standard deviations of Re and Im of ln s at each zero, and of ln abs(Re s): d ln s = -dD / (dD/d ln s)."""
-    covariance = None if model.estimate is None else model.estimate.covariance
-    if covariance is None or not zeros.size:
+    matrix = covariance_of(model)
+    if matrix is None or not zeros.size:
         return [None] * zeros.size
-    matrix = np.asarray(covariance, dtype=np.float64)
     values = parameter_vector(model)
     slopes = np.zeros((values.size, zeros.size), dtype=np.complex128)
 
@@ -650,10 +650,10 @@ def steady_states(model: Model) -> tuple[SteadyState, ...]:
     check_model(model)
     check_no_input_nonlinearity(model, "a steady state")
     pairs = _final_values(model)
-    covariance = None if model.estimate is None else model.estimate.covariance
+    matrix = covariance_of(model)
     errors: dict[tuple[str, str], tuple[float, float]] = {}
-    if covariance is not None:
-        matrix, values = np.asarray(covariance, dtype=np.float64), parameter_vector(model)
+    if matrix is not None:
+        values = parameter_vector(model)
         slopes = {pair: np.zeros((2, values.size)) for pair in pairs}
         for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
             step = POLE_DERIVATIVE_STEP_RATIO * max(abs(values[k]), 1e-3)

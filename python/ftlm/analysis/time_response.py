@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.analysis.frequency_response import parameter_vector, response_inputs, step_response, with_parameter_vector
+from ftlm.analysis.frequency_response import (
+    covariance_of,
+    parameter_vector,
+    response_inputs,
+    step_response,
+    with_parameter_vector,
+)
 from ftlm.analysis.poles import settling_time
 from ftlm.errors import FtlmError
 from ftlm.model.model import Model, check_model
@@ -86,10 +92,9 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
 
 def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
     """Standard deviation from changes of one standard deviation along each direction of the covariance."""
-    covariance = None if model.estimate is None else model.estimate.covariance
-    if covariance is None or model.structure.has_friction:
+    matrix, numbers = covariance_of(model), parameter_vector(model)
+    if matrix is None or model.structure.has_friction:
         return None
-    matrix, numbers = np.asarray(covariance, dtype=np.float64), parameter_vector(model)
     if matrix.shape != (numbers.size, numbers.size) or not np.all(np.isfinite(matrix)):
         return None
     size = np.sqrt(np.maximum(np.diag(matrix), 0.0))

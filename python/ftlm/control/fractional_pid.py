@@ -9,7 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import check_no_input_nonlinearity, is_coupled, parameter_vector, response_inputs
+from ftlm.analysis.frequency_response import (
+    check_no_input_nonlinearity,
+    covariance_of,
+    is_coupled,
+    parameter_vector,
+    response_inputs,
+)
 from ftlm.analysis.rational_approximation import LARGEST_ORDER, oustaloup
 from ftlm.control.arguments import check_limit, check_samples, checked_rate
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of, nyquist_frequencies
@@ -559,7 +565,7 @@ def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float
 
 def least_certain_parameter(model: Model) -> str:
     """Name of the coefficient or order with the largest relative uncertainty."""
-    covariance = None if model.estimate is None else model.estimate.covariance
+    covariance = covariance_of(model)
     if covariance is None:
         return "none is known"
     names = []

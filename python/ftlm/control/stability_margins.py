@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ftlm.analysis.frequency_response import (
+    covariance_of,
     frequency_response,
     parameter_vector,
     response_inputs,
@@ -183,10 +184,9 @@ class Plant:
 
     def samples(self, count: int, seed: int) -> list[Plant]:
         """Return plants with parameters drawn from the model's covariance; empty without a covariance."""
-        estimate = self.model.estimate
-        if estimate is None or estimate.covariance is None:
+        matrix = covariance_of(self.model)
+        if matrix is None:
             return []
-        matrix = np.asarray(estimate.covariance, dtype=np.float64)
         # A number that hardly anything tells has an infinite variance; it is drawn as wide as numbers go.
         matrix = np.nan_to_num(matrix, nan=0.0, posinf=1e12, neginf=-1e12)
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)

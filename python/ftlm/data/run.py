@@ -73,6 +73,9 @@ class Run:
     sample_times : NonuniformSamples or None
         Nonuniform samples at their own times; None if the samples lie on the grid. The grid then holds interval means
         of held inputs and linear interpolation of all other signals.
+    unmasked_run : Run or None
+        Run with the output samples that this one lacks for a validation on them; its first rows show the initial state
+        of both. None for a run without a mask, and for a run that is derived from one with a mask.
     """
 
     name: str
@@ -86,6 +89,7 @@ class Run:
     _units: dict[str, str]
     _intersample: dict[str, Intersample]
     _metadata: dict[str, Any]
+    unmasked_run: Run | None = None
 
     def __init__(self) -> None:
         raise TypeError("a Run is made by Run.from_arrays, Run.from_frame or ftlm.load")
@@ -530,6 +534,10 @@ class Run:
             readings = readings.replace_signals(**self._checked_samples("read", own, readings.times.size))
         return self._with(_data={**self._data, **checked}, sample_times=readings)
 
+    def with_unmasked_run(self, run: Run) -> Run:
+        """Return this run, a copy of another one with masked outputs, with the initial state of that one."""
+        return self._with(unmasked_run=run)
+
     def _checked_samples(self, argument: str, given: object, length: int) -> dict[str, Floats]:
         """Return new samples of some signals by name; raise if they do not fit this run."""
         checked: dict[str, Floats] = {}
@@ -838,7 +846,7 @@ class Run:
         )
 
     def _with(self, **changes: Any) -> Run:
-        return Run._from_checked(**{**vars(self), **changes})
+        return Run._from_checked(**{**vars(self), "unmasked_run": None, **changes})
 
     def _headline(self) -> str:
         return (

@@ -24,7 +24,7 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
-from ftlm.estimation.model_checks import join_names
+from ftlm.estimation.model_checks import enumerate_names
 from ftlm.estimation.nuisance_parameters import output_sensitivities
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
@@ -187,7 +187,7 @@ def _extension_findings(
 
     Another intersample behavior that changes no parameter is not reported.
     """
-    missing = [make_finding("dynamics_missing", input=join_names(names), **about)] if names else []
+    missing = [make_finding("dynamics_missing", input=enumerate_names(names), **about)] if names else []
     extension, refit = best.extension, best.fit
     if not _passes_residual_tests(best, runs):
         return missing
@@ -214,7 +214,7 @@ def _extension_findings(
         numbers = {"value": value, "error": refit.standard_errors[name], "low": 0.5 * value, "high": 2.0 * value}
         about["parameter"] = name
     if extension.inputs:
-        about["input"] = join_names(extension.inputs)
+        about["input"] = enumerate_names(extension.inputs)
     return [make_finding(extension.code, term=extension.term_text, **about, **numbers)]
 
 

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs
+from ftlm.analysis.frequency_response import covariance_of, frequency_response, response_deviation, response_inputs
 from ftlm.analysis.model_algebra import Ratio
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError, ModelError
@@ -29,7 +29,7 @@ from ftlm.structure.order import MAX_IMPROPER_ORDER
 from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
-from ftlm.svg.line_chart import line_chart
+from ftlm.svg.line_chart import LineChart, line_chart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
@@ -71,103 +71,64 @@ def model_curve(
 ) -> tuple[Complex, Floats | None, Floats | None]:
     """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
     response = model_response(model, record, omega)
-    if isinstance(model, Circuit) or model.estimate is None or model.estimate.covariance is None:
+    if isinstance(model, Circuit) or covariance_of(model) is None:
         return response, None, None
     gain, phase = (part[_place_of(model, record)] for part in response_deviation(model, omega))
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
-class ResponseCurve(NamedTuple):
-    """Gain or phase of a model with the half-width of its 95 % band, and the measured points by frequency [rad/s]."""
+def frequency_chart(
+    title: str, label: str, omega: Floats, lines: Sequence[tuple[str, Floats]], half_width: Floats | None
+) -> LineChart:
+    """Return a chart over frequency: a model's curve with its 95 % band, and any measured points."""
+    values = lines[0][1]
+    return LineChart(
+        omega,
+        lines,
+        title,
+        x_label="frequency [rad/s]",
+        y_label=label,
+        caption="" if half_width is None else "Shade: 95 % band, from the covariance of the fit.",
+        bands=[] if half_width is None else [(values - half_width, values + half_width)],
+        log_x=True,
+        dots=("measured",),
+    )
 
-    kind: str
-    label: str
-    omega: Floats
-    values: Floats
-    half_width: Floats | None
-    measured_omega: Floats
-    measured: Floats
 
-
-def bode_curves(model: Model | Circuit, record: FrequencyData) -> tuple[ResponseCurve, ResponseCurve]:
-    """Return gain and phase of a record and the model."""
+def bode_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineChart, LineChart]:
+    """Return gain and phase of a record and the model with its 95 % band; of an impedance |Z| over Hz."""
     omega = curve_frequencies(record)
     response, wide, turned = model_curve(model, record, omega)
     phase = np.degrees(np.unwrap(np.angle(response)))
     order = np.argsort(record.frequency, kind="stable")
-    at, angles = record.frequency[order], record.phase[order]
+    at = np.searchsorted(omega, record.frequency[order])
     # Whole turns are no difference.
-    angles = angles - 360.0 * np.round(np.median(angles - phase[np.searchsorted(omega, at)]) / 360.0)
-    size = f"gain [dB of {record.unit}]" if record.unit else "gain [dB]"
-    gain = DECIBELS_PER_NEPER * np.log(np.abs(response))
-    return (
-        ResponseCurve("gain", size, omega, gain, wide, at, record.gain[order]),
-        ResponseCurve("phase", "phase [degrees]", omega, phase, turned, at, angles),
-    )
-
-
-def curve_chart(
-    title: str, label: str, omega: Floats, lines: Sequence[tuple[str, Floats]], half_width: Floats | None
-) -> Figure:
-    """Return a chart over frequency: a model's curve with its 95 % band, and any measured points."""
-    values = lines[0][1]
-    return line_chart(
-        omega,
-        lines,
-        log_x=True,
-        bands=[] if half_width is None else [(values - half_width, values + half_width)],
-        title=title,
-        dots=("measured",),
-        width=SMALL_WIDTH_PX,
-        height=220,
-        x_label="frequency [rad/s]",
-        y_label=label,
-        caption="" if half_width is None else "Shade: 95 % band, from the covariance of the fit.",
-    )
-
-
-def bode_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
-    """Return gain and phase charts of a record and the model with its 95 % band; of an impedance |Z| over Hz."""
+    angles = record.phase[order] - 360.0 * np.round(np.median(record.phase[order] - phase[at]) / 360.0)
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
-    figures = []
-    for curve in bode_curves(model, record):
-        dots = np.full(curve.omega.size, np.nan)
-        dots[np.searchsorted(curve.omega, curve.measured_omega)] = curve.measured
-        lines = [("model", curve.values), ("measured", dots)]
-        if not is_impedance(record):
-            figures.append(curve_chart(f"{title}: {curve.kind}", curve.label, curve.omega, lines, curve.half_width))
-        else:
-            wide = curve.half_width
-            bands = [] if wide is None else [(curve.values - wide, curve.values + wide)]
-            figures.append(_impedance_chart(title, record.unit, curve, lines, bands))
-    return figures
 
+    def chart(kind: str, label: str, values: Floats, half_width: Floats | None, measured: Floats) -> LineChart:
+        dots = np.full(omega.size, np.nan)
+        dots[at] = measured
+        lines = [("model", values), ("measured", dots)]
+        return frequency_chart(f"{title}: {kind}", label, omega, lines, half_width)
 
-def _impedance_chart(
-    title: str,
-    unit: str,
-    curve: ResponseCurve,
-    lines: Sequence[tuple[str, Floats]],
-    bands: Sequence[tuple[Floats, Floats]],
-) -> Figure:
-    """Return a chart of the size or the phase of an impedance over frequency in Hz."""
-    is_size = curve.kind == "gain"
-    if is_size:
-        lines = [(name, np.exp(values / DECIBELS_PER_NEPER)) for name, values in lines]
-        bands = [(np.exp(low / DECIBELS_PER_NEPER), np.exp(high / DECIBELS_PER_NEPER)) for low, high in bands]
-    return line_chart(
-        curve.omega / (2.0 * math.pi),
-        lines,
-        log_x=True,
-        log_y=is_size,
-        bands=bands,
-        title=f"{title}: {'|Z|' if is_size else curve.kind}",
-        dots=("measured",),
-        width=SMALL_WIDTH_PX,
-        height=220,
-        x_label="frequency [Hz]",
-        y_label=f"|Z| [{unit}]" if is_size else curve.label,
-        caption="Shade: 95 % band, from the covariance of the fit." if bands else "",
+    size = f"gain [dB of {record.unit}]" if record.unit else "gain [dB]"
+    gains = chart("gain", size, DECIBELS_PER_NEPER * np.log(np.abs(response)), wide, record.gain[order])
+    phases = chart("phase", "phase [degrees]", phase, turned, angles)
+    if not is_impedance(record):
+        return gains, phases
+    hertz: dict[str, Any] = {"x": omega / (2.0 * math.pi), "x_label": "frequency [Hz]"}
+    return (
+        replace(
+            gains,
+            **hertz,
+            title=f"{title}: |Z|",
+            y_label=f"|Z| [{record.unit}]",
+            lines=[(name, np.exp(values / DECIBELS_PER_NEPER)) for name, values in gains.lines],
+            bands=[(np.exp(low / DECIBELS_PER_NEPER), np.exp(high / DECIBELS_PER_NEPER)) for low, high in gains.bands],
+            log_y=True,
+        ),
+        replace(phases, **hertz),
     )
 
 
@@ -189,7 +150,8 @@ def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
 
 def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
-    bode, nyquist = bode_figures(model, record), nyquist_figure(model, record)
+    bode = [chart.small_figure() for chart in bode_charts(model, record)]
+    nyquist = nyquist_figure(model, record)
     return [nyquist, *bode] if is_impedance(record) else [*bode, nyquist]
 
 

@@ -28,9 +28,9 @@ from ftlm.estimation.methods import EstimationMethod, OutputError, method_with_o
 from ftlm.estimation.model_checks import (
     dead_channel_findings,
     discretization_findings,
+    enumerate_names,
     excitation_findings,
     friction_direction_findings,
-    join_names,
     mode_sampling_findings,
     stability_findings,
     start_findings,
@@ -605,8 +605,8 @@ def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Find
     parts = [] if structure.has_friction else ["dry friction of the hubs"]
     stages = {name[len("theta")] for name in structure.signals if name.startswith("theta")}
     parts += ["the other link"] if len(stages) == 1 else []
-    outputs = join_names(list(dict.fromkeys(f.output for f in findings if f.code in LEFT_OUT_CODES)))
-    return [make_finding("arm_leaves_out", output=outputs, parts=join_names(parts))] if parts else []
+    outputs = enumerate_names(list(dict.fromkeys(f.output for f in findings if f.code in LEFT_OUT_CODES)))
+    return [make_finding("arm_leaves_out", output=outputs, parts=enumerate_names(parts))] if parts else []
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:

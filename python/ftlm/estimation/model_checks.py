@@ -86,7 +86,7 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
     unidentifiable = [n for n in joint.names if math.isinf(errors[n])]
     if unidentifiable:
         findings.append(
-            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
+            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
         )
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
         # Negated so that a standard error that is not a number counts as too large.
@@ -258,15 +258,15 @@ def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
         if evidence is None:
             continue
         known = [o for o in structure.outputs if o in evidence.levels]
-        levels = join_names([f"{o} = {evidence.levels[o]:.4g}" for o in known])
+        levels = enumerate_names([f"{o} = {evidence.levels[o]:.4g}" for o in known])
         if evidence.rows == 0 and structure.initial == "auto":
             moved = {n: int(run[n][0] != run[n][1]) for n in structure.signals if n in run.inputs}
             row = max(moved.values())
-            inputs = join_names([n for n in moved if np.any(run[n])])
+            inputs = enumerate_names([n for n in moved if np.any(run[n])])
             findings.append(make_finding("rest_assumed", run=run.name, input=inputs, row=row, shown=levels))
         elif evidence.rows and resolved.offset == "level":
             driven = [f"{n} = {v:.4g}" for n, v in evidence.inputs.items() if v]
-            beside = f" with {join_names(driven)}" if driven else ""
+            beside = f" with {enumerate_names(driven)}" if driven else ""
             shown = f"the run rests at {levels}{beside}"
             findings.append(make_finding("rests_at_level", run=run.name, rows=evidence.rows, shown=shown))
         findings += _early_output_findings(run, structure, evidence)
@@ -294,7 +294,7 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
         rows = early / slope if slope else math.inf
         if abs(early) > EARLY_SIGMAS * noise and EARLY_ROWS[0] <= rows <= EARLY_ROWS[1]:
             numbers = {"row": row, "size": abs(early) / noise, "rows": rows}
-            inputs = join_names([t.signal for t in driven])
+            inputs = enumerate_names([t.signal for t in driven])
             about = {"run": run.name, "output": item.output, "input": inputs}
             findings.append(make_finding("moves_before_input", **about, **numbers))
     return findings
@@ -565,7 +565,7 @@ def unstable_poles_text(count: float) -> str:
     return f"{int(count)} pole{'s' if count > 1 else ''} with a positive real part"
 
 
-def join_names(names: Sequence[str]) -> str:
+def enumerate_names(names: Sequence[str]) -> str:
     """Return up to three names in a row, and the number of the others."""
     shown = names if len(names) <= 3 else [*names[:3], f"{len(names) - 3} more"]
     return " and ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]

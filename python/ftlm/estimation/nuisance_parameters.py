@@ -249,7 +249,7 @@ def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str])
 
 
 def errors_with_orders(
-    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = DEFAULT_PULSES_PER_SAMPLE
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float]
 ) -> dict[str, float] | None:
     """Return standard errors of orders and coefficients from an order search; None if not computable.
 
@@ -258,7 +258,7 @@ def errors_with_orders(
     is added as an error.
     """
     try:
-        grid, here = evaluate_at_point(runs, replace(structure, coefficient_law=()), values, every)
+        grid, here = evaluate_at_point(runs, replace(structure, coefficient_law=()), values, DEFAULT_PULSES_PER_SAMPLE)
         there = grid.minimize(here, MAX_REFINEMENT_EVALUATIONS, plain=True)
         spread = np.diag(covariance(there, grid))
     except FtlmError:

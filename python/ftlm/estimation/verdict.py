@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from ftlm.analysis.poles import modes
 from ftlm.errors import FtlmError, ModelError
-from ftlm.estimation.model_checks import join_names, stability_findings
+from ftlm.estimation.model_checks import enumerate_names, stability_findings
 from ftlm.estimation.result import Identification
 from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding
 from ftlm.model.model import Estimate, Model
@@ -205,7 +205,7 @@ def saved_findings(known: Estimate) -> list[Finding]:
     unidentifiable = [n for n, e in known.standard_errors.items() if e is None]
     if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in found):
         found.append(
-            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
+            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
         )
     if known.warnings:
         found.append(make_finding("sentences_alone"))
@@ -225,7 +225,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     yield from (f for f in result.findings if f.code == "run_forgets")
     unidentifiable = [n for n, e in errors.items() if not math.isfinite(e)]
     if unidentifiable and "run_forgets" not in codes:
-        yield make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=join_names(unidentifiable))
+        yield make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
     yield from (f for f in result.findings if f.code == "equation_says_identity")
     yield from (f for f in result.findings if f.kind.names_missing_part)
     yield from _residuals(result)
@@ -233,15 +233,15 @@ def _against_result(result: Identification) -> Iterator[Finding]:
         yield make_finding("not_converged")
     vague = [n for n in errors if n not in unidentifiable and _is_uncertain(result, n)]
     if vague:
-        shown = join_names([_format_uncertain(result, n) for n in vague])
+        shown = enumerate_names([_format_uncertain(result, n) for n in vague])
         yield make_finding("number_vague", parameter=", ".join(vague), shown=shown)
     endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
     if endless:
-        yield make_finding("interval_open", parameter=join_names(endless), sides=", ".join(endless))
+        yield make_finding("interval_open", parameter=enumerate_names(endless), sides=", ".join(endless))
     runs = zip(result.comparison.offsets, result.comparison.initial, strict=False)
     hidden = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
     if hidden:
-        yield make_finding("offset_hidden", output=", ".join(hidden), shown=join_names(list(hidden)))
+        yield make_finding("offset_hidden", output=", ".join(hidden), shown=enumerate_names(list(hidden)))
     for group in group_findings(result.findings):
         if not group.first_finding.topic.has_rule and group.first_finding.level in (
             LEVEL_DO_NOT_USE,
@@ -394,7 +394,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     }
     following = {o: signals for o, signals in following.items() if signals}
     if following:
-        shown = ", ".join(f"{o} with {join_names(signals)}" for o, signals in following.items())
+        shown = ", ".join(f"{o} with {enumerate_names(signals)}" for o, signals in following.items())
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
         yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
     yield from coupled

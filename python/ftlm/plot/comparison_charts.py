@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
+from ftlm.analysis.frequency_response import covariance_of, parameter_vector, with_parameter_vector
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError
 from ftlm.model.model import Model
 from ftlm.svg.bar_chart import bar_chart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
-from ftlm.svg.line_chart import line_chart
+from ftlm.svg.line_chart import LineChart, line_chart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.statistics import NORMAL_95
@@ -259,32 +260,39 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
     label
         Role of the data, such as "validation".
     """
-    figures = []
     suffix = f", {label}" if label else ""
-    for output, judged in tests.outputs.items():
-        drawn = [("itself", judged.whiteness), *judged.inputs.items()]
-        for name, test in drawn:
-            own = name == "itself"
-            # Lag 0 of an autocorrelation is 1 and says nothing.
-            keep = test.lags != 0 if own else np.ones(test.lags.size, dtype=bool)
-            lags, values = test.lags[keep].astype(np.float64), test.values[keep]
-            band = np.full(lags.size, test.band)
-            other = "itself" if own else symbol(name)
-            figures.append(
-                line_chart(
-                    lags,
-                    [("", values)],
-                    stems=True,
-                    width=SMALL_WIDTH_PX,
-                    height=190,
-                    bands=[(-band, band)],
-                    title=f"Residual of {symbol(output)} with {other}{suffix}",
-                    x_label="lag [samples]",
-                    y_label="correlation",
-                    caption=_residual_caption(test, values, "" if own else symbol(name)),
-                )
-            )
-    return figures
+    return [
+        replace(chart, title=f"Residual of {chart.title}{suffix}").small_figure(190)
+        for charts in correlation_charts(tests)
+        for chart, _ in charts
+    ]
+
+
+def correlation_charts(tests: Residuals) -> list[list[tuple[LineChart, CorrelationTest]]]:
+    """Return the charts of the correlations of every output's residuals with themselves and each input."""
+    return [
+        [_correlation_chart(output, *each) for each in [("itself", judged.whiteness), *judged.inputs.items()]]
+        for output, judged in tests.outputs.items()
+    ]
+
+
+def _correlation_chart(output: str, name: str, test: CorrelationTest) -> tuple[LineChart, CorrelationTest]:
+    own = name == "itself"
+    # Lag 0 of an autocorrelation is 1 and says nothing.
+    keep = test.lags != 0 if own else np.ones(test.lags.size, dtype=bool)
+    lags, values = test.lags[keep].astype(np.float64), test.values[keep]
+    band = np.full(lags.size, test.band)
+    chart = LineChart(
+        lags,
+        [("", values)],
+        f"{symbol(output)} with {'itself' if own else symbol(name)}",
+        x_label="lag [samples]",
+        y_label="correlation",
+        caption=_residual_caption(test, values, "" if own else symbol(name)),
+        bands=[(-band, band)],
+        stems=True,
+    )
+    return chart, test
 
 
 def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
@@ -353,10 +361,9 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
         Lower and upper end by output. Empty for a model without covariance or with friction, and if a simulation with
         a changed parameter fails.
     """
-    covariance = None if model.estimate is None else model.estimate.covariance
-    if covariance is None or model.structure.has_friction:
+    spread = covariance_of(model)
+    if spread is None or model.structure.has_friction:
         return {}
-    spread = np.asarray(covariance, dtype=np.float64)
     errors, values = np.sqrt(np.diag(spread)), parameter_vector(model)
     if not np.all(np.isfinite(spread)):
         return {}

@@ -6,6 +6,7 @@ import importlib
 import io
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,22 +22,28 @@ from ftlm.estimation.frequency_result import (
     assign_signals,
     nyquist_curves,
 )
-from ftlm.estimation.frequency_result import bode_curves as frequency_curves
+from ftlm.estimation.frequency_result import bode_charts as record_charts
 from ftlm.estimation.result import Identification
 from ftlm.experiment_design.result import DesignedInput
 from ftlm.model.model import Model
 from ftlm.order_search.search import landscape as scores_of
-from ftlm.plot.comparison_charts import pulse_times, with_unit
-from ftlm.plot.model_charts import TimeResponse, bode_curves, pole_points, response_frequencies
+from ftlm.plot.comparison_charts import correlation_charts, pulse_times, with_unit
+from ftlm.plot.model_charts import (
+    TimeResponse,
+    bode_curves,
+    bode_line_charts,
+    pole_points,
+    response_frequencies,
+    response_line_chart,
+)
 from ftlm.structure.circuit import Circuit
 from ftlm.svg.heat_map import Landscape
-from ftlm.svg.line_chart import LINE_STYLES
+from ftlm.svg.line_chart import LINE_STYLES, LineChart, line_styles
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import optional_module
-from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, as_array, as_floats
+from ftlm.utils.validation import as_array, as_floats
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
@@ -88,16 +95,25 @@ def label_of(name: str, units: Mapping[str, str]) -> str:
     return escape_math(with_unit(symbol(name), units, name))
 
 
-def draw_curve(axis: Any, x: Floats, y: Floats, half: Floats | None = None) -> None:
-    """Plot the curve of a model with its band."""
-    axis.plot(x, y, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
-    if half is not None:
-        axis.fill_between(x, y - half, y + half, color=LINE_STYLES[1][0], alpha=0.25, linewidth=0)
-
-
-def draw_measured(axis: Any, x: Floats, y: Floats) -> None:
-    """Plot measured points as circles."""
-    axis.plot(x, y, "o", fillstyle="none", markersize=4, color=LINE_STYLES[0][0], label="measured")
+def draw_chart(axis: Any, chart: LineChart) -> None:
+    """Draw a chart of lines into axes."""
+    styles = line_styles(name for name, _ in chart.lines)
+    # Measured points are below the curves.
+    below_first = sorted(zip(chart.lines, styles, strict=True), key=lambda line: line[0][0] not in chart.dots)
+    for (name, values), style in below_first:
+        color, label = LINE_STYLES[style][0], escape_math(name) or None
+        if chart.stems:
+            axis.vlines(chart.x, 0, values, color=color, linewidth=1.2)
+            axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
+        elif name in chart.dots:
+            there = np.isfinite(values)
+            axis.plot(chart.x[there], values[there], "o", fillstyle="none", markersize=4, color=color, label=label)
+        else:
+            axis.plot(chart.x, values, color=color, linewidth=1.2, label=label)
+    for (low, high), style in zip(chart.bands, styles, strict=False):
+        axis.fill_between(chart.x, low, high, color=LINE_STYLES[style][0], alpha=0.25, linewidth=0)
+    scales = {"xscale": "log" if chart.log_x else "linear", "yscale": "log" if chart.log_y else "linear"}
+    label_axes(axis, chart.title, xlabel=escape_math(chart.x_label), ylabel=escape_math(chart.y_label), **scales)
 
 
 def label_axes(axis: Any, title: str, **labels: Any) -> None:
@@ -269,20 +285,12 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     found = tests.residuals if isinstance(tests, Identification) else tests
     if found is None:
         raise ModelError("the runs were too short for residual tests, so there is nothing to draw")
-    drawn = {output: [("itself", part.whiteness), *part.inputs.items()] for output, part in found.outputs.items()}
-    columns = max(map(len, drawn.values()))
-    figure, axes = axes_for(ax, len(drawn), columns)
-    for row, (output, correlations) in zip(axes, drawn.items(), strict=True):
-        for axis, (name, test) in zip(row, correlations, strict=False):
-            keep = test.lags != 0 if name == "itself" else np.ones(test.lags.size, dtype=bool)
-            axis.axhspan(-test.band, test.band, color=LINE_STYLES[1][0], alpha=0.2, linewidth=0)
-            axis.vlines(test.lags[keep], 0, test.values[keep], color=LINE_STYLES[1][0], linewidth=1.2)
-            axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
-            other = name if name == "itself" else symbol(name)
-            axis.set_title(escape_math(f"{symbol(output)} with {other}: {test.verdict}"), fontsize="small")
-            axis.set_xlabel("lag [samples]")
-        row[0].set_ylabel("correlation")
-        for axis in row[len(correlations) :]:
+    rows = correlation_charts(found)
+    figure, axes = axes_for(ax, len(rows), max(map(len, rows)))
+    for row, charts in zip(axes, rows, strict=True):
+        for axis, (chart, test) in zip(row, charts, strict=False):
+            draw_chart(axis, replace(chart, title=f"{chart.title}: {test.verdict}"))
+        for axis in row[len(charts) :]:
             axis.set_axis_off()
     return figure
 
@@ -368,14 +376,10 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     """
     found = _model_of(model)
     omega = response_frequencies(found) if w is None else as_floats("w", w)
-    curves = bode_curves(found, omega)
-    figure, axes = axes_for(ax, max(len(curves), 1), 2)
-    for i, curve in enumerate(curves):
-        sides = ((curve.gain, curve.gain_spread, "gain [dB]"), (curve.phase, curve.phase_spread, "phase [degrees]"))
-        title = f"{symbol(curve.output)} from {symbol(curve.input)}"
-        for axis, (values, spread, label) in zip(axes[i], sides, strict=True):
-            draw_curve(axis, omega, values, spread)
-            label_axes(axis, title, xscale="log", xlabel="frequency [rad/s]", ylabel=label)
+    charts = bode_line_charts(omega, bode_curves(found, omega))
+    figure, axes = axes_for(ax, max(len(charts) // 2, 1), 2)
+    for axis, chart in zip(axes.flat, charts, strict=False):
+        draw_chart(axis, chart)
     return figure
 
 
@@ -461,12 +465,8 @@ def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax:
 
 def _response_figure(found: TimeResponse, ax: Any) -> Any:
     figure, axes = axes_for(ax, len(found.outputs), max(len(found.inputs), 1))
-    for i, output in enumerate(found.outputs):
-        for j, signal in enumerate(found.inputs):
-            half = None if found.deviation is None else NORMAL_95 * found.deviation[i, j]
-            draw_curve(axes[i, j], found.time, found.values[i, j], half)
-            title = f"{found.kind} of {symbol(signal)}"
-            label_axes(axes[i, j], title, xlabel="time [s]", ylabel=label_of(output, found.units))
+    for i, j in np.ndindex(axes.shape) if found.inputs else ():
+        draw_chart(axes[i, j], response_line_chart(found, i, j, found.units))
     return figure
 
 
@@ -688,7 +688,7 @@ def response(
     Returns
     -------
     matplotlib.figure.Figure
-        Gain on the left, phase on the right, a row for every record.
+        Gain on the left, phase on the right, a row for every record; of an impedance |Z| and phase over Hz.
 
     Raises
     ------
@@ -700,11 +700,8 @@ def response(
     model, records = _model_and_data(result, data)
     figure, axes = axes_for(ax, len(records), 2)
     for row, record in zip(axes, records, strict=True):
-        for axis, curve in zip(row, frequency_curves(model, record), strict=True):
-            draw_measured(axis, curve.measured_omega, curve.measured)
-            draw_curve(axis, curve.omega, curve.values, curve.half_width)
-            title = f"{symbol(record.output)} from {symbol(record.input)}"
-            label_axes(axis, title, xscale="log", xlabel="frequency [rad/s]", ylabel=curve.label)
+        for axis, chart in zip(row, record_charts(model, record), strict=True):
+            draw_chart(axis, chart)
         row[0].legend(fontsize="small")
     return figure
 
@@ -736,8 +733,9 @@ def nyquist(
     figure, axes = axes_for(ax, len(records), row=3.4)
     for axis, record in zip(axes[:, 0], records, strict=True):
         curve, points, x_label, y_label = nyquist_curves(model, record)
-        draw_measured(axis, points.real, points.imag)
-        draw_curve(axis, curve.real, curve.imag)
+        measured = {"fillstyle": "none", "markersize": 4, "color": LINE_STYLES[0][0], "label": "measured"}
+        axis.plot(points.real, points.imag, "o", **measured)
+        axis.plot(curve.real, curve.imag, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
         axis.set_aspect("equal", adjustable="datalim")
         label_axes(axis, f"{symbol(record.output)} from {symbol(record.input)}", xlabel=x_label, ylabel=y_label)
         axis.legend(fontsize="small")

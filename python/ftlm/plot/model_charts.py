@@ -9,15 +9,22 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.analysis.frequency_response import frequency_response, response_deviation, response_inputs, transfer_functions
+from ftlm.analysis.frequency_response import (
+    covariance_of,
+    frequency_response,
+    response_deviation,
+    response_inputs,
+    transfer_functions,
+)
 from ftlm.analysis.poles import modes
 from ftlm.analysis.time_response import Response, response
-from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER, curve_chart
+from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER, frequency_chart
 from ftlm.model.model import Model, check_model
+from ftlm.plot.comparison_charts import with_unit
 from ftlm.simulation.discretization import COULOMB_PREFIX
 from ftlm.svg.complex_plane import plane_chart
-from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
-from ftlm.svg.line_chart import line_chart
+from ftlm.svg.figure import Figure
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.statistics import NORMAL_95
@@ -48,18 +55,18 @@ def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
         Frequencies [rad/s]; by default around the corner frequencies of the model.
     """
     omega = response_frequencies(model) if w is None else as_floats("w", w)
-    return bode_figures(omega, bode_curves(model, omega))
+    return [chart.small_figure() for chart in bode_line_charts(omega, bode_curves(model, omega))]
 
 
-def bode_figures(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
+def bode_line_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
     """Return the gain and phase charts of some curves."""
-    figures = []
+    charts = []
     for curve in curves:
         title = f"{symbol(curve.output)} from {symbol(curve.input)}"
         gain, phase = [("", curve.gain)], [("", curve.phase)]
-        figures.append(curve_chart(f"{title}: gain", "gain [dB]", omega, gain, curve.gain_spread))
-        figures.append(curve_chart(f"{title}: phase", "phase [degrees]", omega, phase, curve.phase_spread))
-    return figures
+        charts.append(frequency_chart(f"{title}: gain", "gain [dB]", omega, gain, curve.gain_spread))
+        charts.append(frequency_chart(f"{title}: phase", "phase [degrees]", omega, phase, curve.phase_spread))
+    return charts
 
 
 def pole_points(model: Model) -> tuple[float, Complex]:
@@ -134,9 +141,7 @@ class BodeCurve:
 def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
     """Return the curves of all connected pairs of input and output; Coulomb friction is omitted."""
     response = frequency_response(model, omega)
-    spread = None
-    if model.estimate is not None and model.estimate.covariance is not None:
-        spread = response_deviation(model, omega)
+    spread = None if covariance_of(model) is None else response_deviation(model, omega)
     inputs = response_inputs(model, coupled=True)
     curves = []
     for i, output in enumerate(model.outputs):
@@ -171,7 +176,7 @@ class Bode:
 
     def figures(self) -> list[Figure]:
         """Return the charts, as in a report."""
-        return bode_figures(self.frequency, self.curves)
+        return [chart.small_figure() for chart in bode_line_charts(self.frequency, self.curves)]
 
     def __str__(self) -> str:
         pairs = ", ".join(f"{c.output} from {c.input}" for c in self.curves) or "no input reaches an output"
@@ -201,31 +206,30 @@ def response_charts(found: Response, *, units: Mapping[str, str] | None = None) 
     units
         Units of the signals by name.
     """
-    figures = []
-    for i, output in enumerate(found.outputs):
-        for j, signal in enumerate(found.inputs):
-            values = found.values[i, j]
-            if signal.startswith(COULOMB_PREFIX) or not np.any(values):
-                continue
-            bands, shade = [], "No covariance, so there is no band."
-            if found.deviation is not None:
-                half = NORMAL_95 * found.deviation[i, j]
-                bands, shade = [(values - half, values + half)], "Shade: 95 % band, from the covariance of the fit."
-            unit = (units or {}).get(output, "")
-            figures.append(
-                line_chart(
-                    found.time,
-                    [("", values)],
-                    bands=bands,
-                    width=SMALL_WIDTH_PX,
-                    height=220,
-                    x_label="time [s]",
-                    title=f"{symbol(output)} after a unit {found.kind} of {symbol(signal)}",
-                    caption=shade,
-                    y_label=f"{symbol(output)} [{unit}]" if unit else symbol(output),
-                )
-            )
-    return figures
+    return [
+        response_line_chart(found, i, j, units or {}).small_figure()
+        for i in range(len(found.outputs))
+        for j, signal in enumerate(found.inputs)
+        if np.any(found.values[i, j]) and not signal.startswith(COULOMB_PREFIX)
+    ]
+
+
+def response_line_chart(found: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
+    """Return the chart of the response of output i to input j, with its 95 % band."""
+    output, values = found.outputs[i], found.values[i, j]
+    bands, shade = [], "No covariance, so there is no band."
+    if found.deviation is not None:
+        half = NORMAL_95 * found.deviation[i, j]
+        bands, shade = [(values - half, values + half)], "Shade: 95 % band, from the covariance of the fit."
+    return LineChart(
+        found.time,
+        [("", values)],
+        f"{symbol(output)} after a unit {found.kind} of {symbol(found.inputs[j])}",
+        x_label="time [s]",
+        y_label=with_unit(symbol(output), units, output),
+        caption=shade,
+        bands=bands,
+    )
 
 
 @dataclass(frozen=True)

@@ -492,10 +492,14 @@ def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
     ]
 
 
-def starts_table(joint: JointFit, *, rows: int = 10) -> Table:
+#: Initial guesses in the table of a report.
+MAX_STARTS_SHOWN = 10
+
+
+def starts_table(joint: JointFit) -> Table:
     """Return the initial guesses and their costs on decimated samples, best first."""
-    kept = joint.starts[:rows]
-    cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
+    best = joint.starts[:MAX_STARTS_SHOWN]
+    cells: list[list[Cell]] = [[rank, origin, level] for rank, (level, origin) in enumerate(best, 1)]
     note = f"{joint.origin_text}. The best ones went on on all samples." if joint.starts else ""
     return Table("Automatic initial guesses", ("rank", "start from", "cost per residual"), cells, note=note)
 

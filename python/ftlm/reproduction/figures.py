@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from ftlm.plot.comparison_charts import error_chart, pulse_times
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import ClaimVerdict
 from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
-from ftlm.svg.figure import NARROW_WIDTH_PX, Figure, svg
+from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats
@@ -192,55 +192,8 @@ def rival_figures(found: Reproduction) -> list[Figure]:
     return figures
 
 
-#: Boxes of Figure 2: (heading, equations), from left to right or from top to bottom.
-FLOW_CHART_BOXES = (
-    ("Energies", "(7)–(11)"),
-    ("Equations", "(14)–(21), (26)"),
-    ("Pulse means", "(28)–(39)"),
-    ("Orders", "on a lattice"),
-    ("Coefficients", "(42)–(44)"),
-    ("Free run", "(26), (45)"),
-    ("Smallest error", "the model"),
-)
-
-
 def flow_chart() -> Figure:
-    """Figure 2: from the physics to the model."""
-    names = ", then ".join(f"{a} {b}" for a, b in FLOW_CHART_BOXES)
-    described = f"Flow chart: {names}. From the free run an arrow leads back to the orders: every candidate in turn."
-    drawings = [_flow(described, narrow=narrow) for narrow in (False, True)]
+    """Figure 2: from the physics to the model, a drawing for wide and one for narrow screens."""
+    files = (Path(__file__).with_name(f"flow_chart_{screen}.svg") for screen in ("wide", "narrow"))
+    drawings = (Markup(file.read_text(encoding="utf-8")) for file in files)  # our own files
     return Figure("Figure 2. From the physics to the identified model", *drawings)
-
-
-def _flow(described: str, *, narrow: bool) -> Markup:
-    """Flow chart with boxes and arrows; a loop leads from the simulation back to the orders."""
-    count = len(FLOW_CHART_BOXES)
-    width, step, w, h = (NARROW_WIDTH_PX, 62, 200, 42) if narrow else (980, 140, 122, 54)
-    height = 12 + count * step if narrow else 128
-    places = [(30, 6 + k * step) if narrow else (4 + k * step, 40) for k in range(count)]
-    box, path = Markup('<rect x="{}" y="{}" width="{}" height="{}" rx="5"/>'), Markup('<path d="{}"/>')
-    out = [Markup('<g fill="none" stroke="currentColor" stroke-width="1.3">')]
-    out += [box.format(x, y, w, h) for x, y in places]
-    for (x, y), (x2, y2) in pairwise(places):
-        if narrow:
-            arrow = f"M{x + w / 2} {y + h}V{y2}M{x + w / 2 - 4} {y2 - 7}l4 7l4 -7"
-        else:
-            arrow = f"M{x + w} {y + h / 2}H{x2}M{x2 - 7} {y + h / 2 - 4}l7 4l-7 4"
-        out.append(path.format(arrow))
-    (ox, oy), (fx, fy) = places[3], places[5]
-    place: tuple[float, float]
-    if narrow:
-        edge = ox + w
-        loop = f"M{edge} {fy + h / 2}H{edge + 34}V{oy + h / 2}H{edge}m7 -4l-7 4l7 4"
-        words, place = "next", (ox + w + 62, (oy + fy + h) / 2 + 4)
-    else:
-        loop = f"M{fx + w / 2} {fy}V14H{ox + w / 2}V{oy}m-4 -7l4 7l4 -7"
-        words, place = "next candidate", ((ox + fx + w) / 2, 10)
-    out.append(Markup('<path d="{}" stroke-dasharray="none"/></g>').format(loop))
-    out.append(Markup('<g font-size="12" fill="currentColor" text-anchor="middle">'))
-    text = Markup('<text x="{}" y="{}" font-weight="600">{}</text><text x="{}" y="{}">{}</text>')
-    for (left, top), (head, below) in zip(places, FLOW_CHART_BOXES, strict=True):
-        middle = left + w / 2
-        out.append(text.format(middle, top + h / 2 - 4, head, middle, top + h / 2 + 13, below))
-    out.append(Markup('<text x="{}" y="{}">{}</text></g>').format(*place, words))
-    return svg(width, height, "Figure 2", described, out, narrow=narrow)

@@ -426,8 +426,12 @@ class _ErrorTranslator:
         raise fault from None
 
 
-def string_property(hil: Any, code: Any, size: int = 64) -> str:
+#: Maximum length of a string property of the board.
+MAX_PROPERTY_CHARACTERS = 64
+
+
+def string_property(hil: Any, code: Any) -> str:
     """Read a string property; empty for the 2022 package, whose call overflows its buffer."""
     if len(signature(hil.get_string_property).parameters) != 2:
         return ""
-    return str(hil.get_string_property(code, size))
+    return str(hil.get_string_property(code, MAX_PROPERTY_CHARACTERS))

@@ -127,19 +127,9 @@ _EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, 
 )
 
 
-#: Original run of each run with masked outputs.
-_UNMASKED_RUNS: WeakKeyDictionary[Run, Run] = WeakKeyDictionary()
-
-
-def use_rest_evidence_of(masked: Run, original: Run) -> None:
-    """Use the evidence of rest, and the levels, of the original run for a run with masked outputs."""
-    # A mask does not change the initial state.
-    _UNMASKED_RUNS[masked] = original
-
-
 def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     """Return the evidence that the plant rested before the run, or None if it may have been in motion."""
-    run = _UNMASKED_RUNS.get(run, run)
+    run = run.unmasked_run or run
     found = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
     if key not in found:
@@ -276,8 +266,8 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
     read = run.sample_times
     own = None if read is None else {n: read.data[n] - v for n, v in moved.items()}
     shifted = run.with_samples(samples, own)
-    if run in _UNMASKED_RUNS:
-        use_rest_evidence_of(shifted, deviations(_UNMASKED_RUNS[run], structure)[0])
+    if run.unmasked_run is not None:
+        shifted = shifted.with_unmasked_run(deviations(run.unmasked_run, structure)[0])
     return shifted, levels
 
 

@@ -17,7 +17,6 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
-from ftlm.simulation.initial_conditions import use_rest_evidence_of
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import vector_norm
@@ -124,8 +123,7 @@ def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run
         name=run.name,
         missing="weight",
     )
-    use_rest_evidence_of(masked, run)
-    return masked
+    return masked.with_unmasked_run(run)
 
 
 #: Most pieces of the runs of an unstable plant that are folds.

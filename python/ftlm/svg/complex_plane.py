@@ -137,9 +137,7 @@ LOCUS_HEIGHT_PX, DOT_RADIUS_PX = 240.0, 2.6
 LOCUS_MARGIN_SHARE = 0.06
 
 
-def locus_chart(
-    curve: ArrayLike, points: ArrayLike, *, title: str, x_label: str, y_label: str, caption: str = ""
-) -> Figure:
+def locus_chart(curve: ArrayLike, points: ArrayLike, *, title: str, x_label: str, y_label: str) -> Figure:
     """Return a chart of a curve and points in the complex plane.
 
     Parameters
@@ -150,8 +148,6 @@ def locus_chart(
         Measured values, complex, finite.
     title, x_label, y_label
         Text, with units.
-    caption
-        Sentence below.
 
     Raises
     ------
@@ -169,7 +165,7 @@ def locus_chart(
     wide, small = (
         _draw_locus(line, dots, (title, described, x_label, y_label), narrow=narrow) for narrow in (False, True)
     )
-    return Figure(title, wide, small, caption)
+    return Figure(title, wide, small)
 
 
 def _complex_text(value: complex) -> str:

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 
 import numpy as np
 from markupsafe import Markup
@@ -17,6 +18,7 @@ from ftlm.svg.figure import (
     MAX_LINE_POINTS,
     MAX_STRAY_HEIGHTS,
     NARROW_WIDTH_PX,
+    SMALL_WIDTH_PX,
     TENTHS_PER_PIXEL,
     TEXT_GROUP,
     Figure,
@@ -254,6 +256,39 @@ def line_chart(
     return Figure(title, wide, small, " ".join(([caption] if caption else []) + notes))
 
 
+@dataclass(frozen=True)
+class LineChart:
+    """Description of a chart of lines over a common axis, which SVG here and matplotlib in ``ftlm.plot`` draw.
+
+    Parameters
+    ----------
+    x, lines, title, x_label, y_label, caption, bands, log_x, log_y, stems, dots
+        See :func:`line_chart`.
+    """
+
+    x: Floats
+    lines: Sequence[tuple[str, Floats]]
+    title: str
+    x_label: str
+    y_label: str
+    caption: str = ""
+    bands: Sequence[tuple[Floats, Floats]] = ()
+    log_x: bool = False
+    log_y: bool = False
+    stems: bool = False
+    dots: Collection[str] = ()
+
+    def small_figure(self, height: int = 220) -> Figure:
+        """Return the chart as SVG, two of which stand side by side; the height is in pixels."""
+        return line_chart(**vars(self), width=SMALL_WIDTH_PX, height=height)
+
+
+def line_styles(names: Iterable[str]) -> list[int]:
+    """Return the style of each line: 0, the neutral one, by the beginning of its name, else the next of the others."""
+    others = cycle(range(1, len(LINE_STYLES)))
+    return [0 if name.startswith(NEUTRAL_PREFIXES) else next(others) for name in names]
+
+
 def _logarithms(values: Floats) -> Floats:
     """Coordinates on a logarithmic axis; NaN for values that are not positive."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -280,8 +315,8 @@ def _prepare_lines(
         raise DataError("a chart needs at least one line; give (name, values) pairs")
     across = as_floats("x", x, gaps=True).copy()
     across = _logarithms(across) if log_x else across
-    drawn, notes, coloured = [], [], 0
-    for name, values in lines:
+    drawn, notes = [], []
+    for (name, values), style in zip(lines, line_styles(name for name, _ in lines), strict=True):
         y = as_floats(f"line {name!r}", values, gaps=True).copy()
         if y.ndim != 1 or y.shape != across.shape:
             raise DataError(f"line {name!r} has shape {y.shape}, x {across.shape}; give arrays of one length")
@@ -296,9 +331,6 @@ def _prepare_lines(
             if np.any(below):
                 notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
             y = _logarithms(y)
-        neutral = name.startswith(NEUTRAL_PREFIXES)
-        style = 0 if neutral else 1 + coloured % (len(LINE_STYLES) - 1)
-        coloured += not neutral
         drawn.append(_Line(name, style, across, y, name in dots))
     return drawn, notes
 
