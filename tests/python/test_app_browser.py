@@ -47,7 +47,7 @@ class Served:
     def end(self, how=signal.SIGINT):
         if self.process.poll() is None:
             self.process.send_signal(how)
-        return self.process.communicate(timeout=20)
+        return self.process.communicate(timeout=120)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def served(tmp_path_factory, content):
 
 
 def test_a_thousand_requests_are_answered(served):
-    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=120)
     seen = set()
     for k in range(1000):
         connection.request("GET", f"{served.path}state" if k % 2 else "/nothing", headers={"Host": served.host})
@@ -79,7 +79,7 @@ def test_a_thousand_requests_are_answered(served):
 
 def raw(port, *pieces):
     """What comes back for bytes that no browser sends; one that is cut off is what it is."""
-    with socket.create_connection(("127.0.0.1", port), timeout=20) as sock:
+    with socket.create_connection(("127.0.0.1", port), timeout=120) as sock:
         got = b""
         with contextlib.suppress(ConnectionError):
             for piece in pieces:
@@ -279,7 +279,7 @@ def test_it_ends_cleanly_with_its_work(tmp_path, content, how):
     (tmp_path / "run.csv").write_text(content)
     served = Served(tmp_path / "own", tmp_path / "run.csv")
     headers = {"Host": served.host, "Origin": f"http://{served.host}"}
-    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)) as connection:
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", served.port, timeout=120)) as connection:
         connection.request("GET", f"{served.path}state", headers=headers)
         (key,) = json.loads(connection.getresponse().read())["files"]
         body = json.dumps({"estimation": key, "structure": SLOW})

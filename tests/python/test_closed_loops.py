@@ -35,24 +35,20 @@ def loop_codes(found: ftlm.Identification) -> list[str]:
     ],
 )
 def test_a_loop_is_found_and_weighs_what_it_moves(kind, state, code):
-    for seed in range(2):
-        found = ftlm.identify(loops.loop(kind, seed), STRUCTURE, method=ftlm.OutputError(intervals="quadratic"))
-        tests = found.residuals.outputs["y"]
-        assert tests.feedback_tests["u"].state == state
-        assert loop_codes(found) == ([] if code is None else [code])
-        assert ("closed loop of u around y" in found.details()) == (state == "found")
-        bias = tests.feedback_tests["u"].bias
-        assert bias is None if code is None else (bias > 1) == (code == "loop_found")
-        # What a controller does at once is not taken for what the model lacks.
-        assert not tests.inputs["u"].failed
-
-
-def test_the_warning_names_the_way_out():
-    found = ftlm.identify(loops.loop("closed, coloured, strong", 1), STRUCTURE)
-    (said,) = [f for f in found.findings if f.code == "loop_found"]
-    assert said.text.startswith("y: u depends on past values of y")
-    assert "name it with reference=" in said.text
-    assert "name the reference signal with reference=" in said.remedy
+    found = ftlm.identify(loops.loop(kind, 1), STRUCTURE, method=ftlm.OutputError(intervals="quadratic"))
+    tests = found.residuals.outputs["y"]
+    assert tests.feedback_tests["u"].state == state
+    assert loop_codes(found) == ([] if code is None else [code])
+    assert ("closed loop of u around y" in found.details()) == (state == "found")
+    bias = tests.feedback_tests["u"].bias
+    assert bias is None if code is None else (bias > 1) == (code == "loop_found")
+    # What a controller does at once is not taken for what the model lacks.
+    assert not tests.inputs["u"].failed
+    if code == "loop_found":
+        (said,) = [f for f in found.findings if f.code == code]
+        assert said.text.startswith("y: u depends on past values of y")
+        assert "name it with reference=" in said.text
+        assert "name the reference signal with reference=" in said.remedy
 
 
 #: Plants as numerator and denominator in s, of loops.STEP; inputs and noises of open loops by name.
@@ -403,7 +399,7 @@ def test_instrumental_variables_count_the_error_of_their_orders():
     # The true order is on no lattice; errors at the order found alone covered one in three.
     held = []
     near = ftlm.order_grid(alpha=(1.5, 1.9))
-    for seed in range(3):
+    for seed in range(2):
         run = loops.open_run(seed, noise=0.05)
         found = ftlm.identify(run, STRUCTURE, method=ftlm.InstrumentalVariables(order_grid=near))
         truth = {**loops.TRUTH, "alpha": 1.73}
