@@ -35,7 +35,7 @@ def loop_codes(found: ftlm.Identification) -> list[str]:
     ],
 )
 def test_a_loop_is_found_and_weighs_what_it_moves(kind, state, code):
-    found = ftlm.identify(loops.loop(kind, 1), STRUCTURE, method=ftlm.OutputError(intervals="quadratic"))
+    found = ftlm.identify(loops.loop(kind, 1, rows=1000), STRUCTURE, method=ftlm.OutputError(intervals="quadratic"))
     tests = found.residuals.outputs["y"]
     assert tests.feedback_tests["u"].state == state
     assert loop_codes(found) == ([] if code is None else [code])
@@ -333,7 +333,7 @@ def test_coverage_of_a_noise_model_beside_output_error_and_a_reference(kind):
 
 def test_residuals_are_orthogonal_to_what_follows_the_reference():
     # The oracle: sensitivities by differences of the exact step response's convolutions with the answer to r.
-    run = loops.loop("closed, coloured", 3)
+    run = loops.loop("closed, coloured", 3, rows=700)
     found = ftlm.identify(run, STRUCTURE, method=ftlm.OutputError(reference="r"))
     assert found.joint.converged
     values = {n: p.value for n, p in found.parameters.items()}
@@ -354,7 +354,7 @@ def test_residuals_are_orthogonal_to_what_follows_the_reference():
 
 
 def test_a_reference_is_told(tmp_path):
-    run = loops.loop("closed, coloured", 2)
+    run = loops.loop("closed, coloured", 2, rows=600)
     run.to_csv(tmp_path / "run.csv")
     words = ["identify", str(tmp_path / "run.csv"), "--structure", "D^alpha y = -a y + b u", "--initial", "rest"]
     words += ["--reference", "r", "--report", str(tmp_path / "r.html"), "--verbose"]
@@ -368,10 +368,10 @@ def test_a_reference_is_told(tmp_path):
 
 def test_a_weak_reference_is_named():
     # It hardly moves beside the noise that the loop feeds back.
-    run = loops.loop("closed, coloured, integral", 0)
+    run = loops.loop("closed, coloured, integral", 0, rows=600)
     rng = np.random.default_rng(1)
     weak = ftlm.Run.from_arrays(
-        step=run.step, inputs={"u": run["u"], "r": np.repeat(rng.choice([-1.0, 1.0], 30), 50)}, outputs={"y": run["y"]}
+        step=run.step, inputs={"u": run["u"], "r": np.repeat(rng.choice([-1.0, 1.0], 12), 50)}, outputs={"y": run["y"]}
     )
     found = ftlm.identify(weak, STRUCTURE, method=ftlm.OutputError(reference="r"))
     assert [w for w in found.warnings if "weak instrument" in w]

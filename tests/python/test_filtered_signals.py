@@ -78,7 +78,7 @@ def sensor(filtered: tuple[str, ...]) -> ftlm.SensorFilter | None:
     return ftlm.SensorFilter.low_pass(filtered, frequency=1.0) if filtered else None
 
 
-@pytest.mark.parametrize("filtered", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("filtered", SUBSETS[1:], ids="+".join)
 @pytest.mark.parametrize(
     ("method", "m"),
     [(ftlm.OutputError(intervals="quadratic"), None), ("least-squares", COUNT - 1)],
@@ -91,7 +91,7 @@ def test_one_equation_with_a_filtered_input_or_output(filtered, method, m):
     for name, value in TRUTH.items():
         assert found.coefficients[name] == pytest.approx(value, rel=1e-6), name
     assert found.model.compare(run).fit["y"] > 99.9999
-    if filtered and m is not None:
+    if m is not None:
         wrong = ftlm.identify(run, ftlm.equation(WORDS, initial="rest"), method="least-squares")
         assert max(abs(wrong.coefficients[n] / v - 1) for n, v in TRUTH.items()) > 0.05
 

@@ -200,12 +200,6 @@ def test_kill_loses_no_finished_work_and_changes_no_byte():
     assert same
 
 
-def test_kill_loses_no_finished_work_of_a_stage_and_changes_no_byte():
-    lost, _, same = bench.kills(1, of=bench.stage)
-    assert len(lost) == 1
-    assert same
-
-
 @pytest.mark.slow
 def test_fifty_kills_of_a_stage():
     lost, ended, same = bench.kills(50, of=bench.stage)
