@@ -144,6 +144,8 @@ def browser():
 def opened(browser, served, **options):
     """The page, with what it says and what it asks for."""
     context = browser.new_context(viewport={"width": 1280, "height": 900}, **options)
+    # Of a page that hangs: a busy machine takes several times as long as a free one.
+    context.set_default_timeout(240_000)
     page = context.new_page()
     page.said, page.asked = [], []
     page.on("console", lambda message: page.said.append(message.text))
@@ -159,7 +161,7 @@ def opened(browser, served, **options):
 def made(page, number):
     """The card of a model, once it is made."""
     card = page.locator(".model", has=page.locator("h3", has_text=re.compile(rf"^{number} · ")))
-    card.locator(".first").wait_for(timeout=60_000)
+    card.locator(".first").wait_for()
     return card
 
 
