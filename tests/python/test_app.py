@@ -128,10 +128,15 @@ def used(tmp_path_factory, loop, content, patience):
     loop(made.desk.close())
 
 
+async def until(condition):
+    """Wait for what other tasks of the loop bring about."""
+    while not condition():
+        await asyncio.sleep(0.005)
+
+
 async def settled(desk):
     """Until nothing waits or runs."""
-    while any(m.is_busy for m in desk.models.values()):
-        await asyncio.sleep(0.02)
+    await until(lambda: not any(m.is_busy for m in desk.models.values()))
 
 
 def told(text):
@@ -792,17 +797,15 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
         models = [desk.start(LONG) for _ in range(desks.MAX_QUEUED_MODELS)]
         with pytest.raises(DataError, match="8 models wait"):
             desk.start(LONG)
-        await asyncio.sleep(0.03)
+        await until(lambda: models[0].state == "running")
         assert [m.state for m in models] == ["running", *["waiting"] * 7]
         with pytest.raises(DataError, match="in use"):
             desk.remove_file("key-a")
         desk.stop(models[1].key)
         desk.stop(models[0].key)
-        await asyncio.sleep(0.05)
-        assert [m.state for m in models][:3] == ["stopped", "stopped", "running"]
+        await until(lambda: [m.state for m in models][:3] == ["stopped", "stopped", "running"])
         desk.remove_model(models[2].key)
-        await asyncio.sleep(0.05)
-        assert models[3].state == "running"
+        await until(lambda: models[3].state == "running")
         for model in models[3:]:
             desk.stop(model.key)
         await settled(desk)
@@ -861,10 +864,10 @@ def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_the
         desk = page.desk
         await put_beside(desk, "a.csv", 1)
         model, fit = desk.start(choice), desk.start(LONG)
-        for one in (model, fit):
-            await asyncio.sleep(0.03)
+        for number, one in enumerate((model, fit), 1):
+            await until(lambda number=number: len(asked) == number)
             desk.stop(one.key)
-        await asyncio.sleep(0.03)
+        await until(lambda: not desk._jobs)
         (desk.folder / f"{model.key}.ftlm").write_bytes(b"x")
         assert "Go on" in view.model(model)
         assert "Start again" in view.model(fit)
@@ -872,12 +875,11 @@ def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_the
             before = one.version
             assert desk.resume(one.key) is one
             assert (one.state, one.version) == ("waiting", before + 1)
-            await asyncio.sleep(0.03)
-            assert one.state == "running"
+            await until(lambda one=one: one.state == "running")
             # Who asks twice has it once.
             assert desk.resume(one.key).version == before + 2
             desk.stop(one.key)
-            await asyncio.sleep(0.03)
+            await until(lambda: not desk._jobs)
         assert asked == [str(desk.folder / f"{model.key}.ftlm"), None] * 2
         # Another file of that name is another file.
         desk.remove_file("key-a")
@@ -918,8 +920,7 @@ def test_a_process_that_works_ends_and_the_page_goes_on(page, how):
 
     async def course():
         model = page.desk.start(LONG)
-        while model.task is None or model.task._process is None:
-            await asyncio.sleep(0.01)
+        await until(lambda: model.task is not None and model.task._process is not None)
         pid = model.task._process.pid
         os.kill(pid, signal.SIGSTOP)
         if how == "stopped":
@@ -929,8 +930,7 @@ def test_a_process_that_works_ends_and_the_page_goes_on(page, how):
         else:
             await page.desk.close()
         await settled(page.desk)
-        while page.desk._jobs:
-            await asyncio.sleep(0.01)
+        await until(lambda: not page.desk._jobs)
         assert not alive(pid)
         assert model.state == ("failed" if how == "killed" else "stopped")
         if how == "killed":
@@ -1152,7 +1152,7 @@ def test_no_child_imports_an_uploaded_file(tmp_path, content):
         module = f"open({str(mark)!r}, 'a').write(__file__)\n".encode()
         names = ("sitecustomize", "usercustomize", "jinja2", "numpy", "scipy", "json", "runpy")
         for name, body in [*((f"{name}.py", module) for name in names), ("lag.csv", content)]:
-            client = http.client.HTTPConnection(address[1], timeout=60)
+            client = http.client.HTTPConnection(address[1], timeout=120)
             headers = {"Origin": f"http://{address[1]}", "Content-Type": RAW}
             client.request("POST", f"{address[2]}files?name={name}", body, headers)
             assert client.getresponse().status == 200
@@ -1162,7 +1162,7 @@ def test_no_child_imports_an_uploaded_file(tmp_path, content):
         assert all(re.fullmatch(r"[0-9a-f]{16}\.(py|csv)", name) for name in stored)
     finally:
         process.terminate()
-        process.wait(30)
+        process.wait(120)
         process.stdout.close()
     assert not mark.exists()
 

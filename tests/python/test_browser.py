@@ -90,6 +90,8 @@ class Opened:
     def __init__(self, browser, path, **options):
         options = {"viewport": {"width": 1280, "height": 900}, **options}
         self.context = browser.new_context(**options)
+        # Of a page that hangs: a busy machine takes several times as long as a free one.
+        self.context.set_default_timeout(240_000)
         self.page = self.context.new_page()
         self.said, self.asked = [], []
         self.page.on("console", lambda message: self.said.append(message.text))

@@ -20,6 +20,7 @@ import typer
 from typer.testing import CliRunner
 
 import ftlm
+from command_line import run_command
 from ftlm import progress
 from ftlm.app.server import DEFAULT_PORT
 from ftlm.cli import framework
@@ -27,13 +28,6 @@ from ftlm.cli.framework import broken_line, print_text
 from ftlm.cli.main import COMMAND_HELP, CommandTable, app
 from ftlm.utils.formatting import EscapedStream, escape_standard_streams
 from measured import DATA, needs_data
-
-
-def ftlm_command(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "NO_COLOR": "1", "COLUMNS": "200"}
-    return subprocess.run(
-        [sys.executable, "-m", "ftlm", *words], cwd=cwd, capture_output=True, text=True, check=False, env=environment
-    )
 
 
 @pytest.fixture(scope="module")
@@ -70,13 +64,13 @@ SEARCH = (
 
 
 def test_two_commands_from_a_file_to_a_validated_model(folder: Path) -> None:
-    found = ftlm_command("identify", "square.csv", *SEARCH, "-o", "model.json", "--report", "page.html", cwd=folder)
+    found = run_command("identify", "square.csv", *SEARCH, "-o", "model.json", "--report", "page.html", cwd=folder)
     assert found.returncode == 0, found.stderr
     assert "alpha" in found.stdout
     assert "1.5" in found.stdout
-    checked = ftlm_command("identify", "square.csv", *SEARCH, "--validation", "sine.csv", "--json", cwd=folder)
+    checked = run_command("identify", "square.csv", *SEARCH, "--validation", "sine.csv", "--json", cwd=folder)
     assert json.loads(checked.stdout)["validation"]["output_error"]["y"]["fit"] > 99
-    compared = ftlm_command("compare", "model.json", "sine.csv", "--min-fit", "99", cwd=folder)
+    compared = run_command("compare", "model.json", "sine.csv", "--min-fit", "99", cwd=folder)
     assert compared.returncode == 0, compared.stderr
     assert "equation error" in compared.stdout
     assert "output error" in compared.stdout
@@ -85,11 +79,9 @@ def test_two_commands_from_a_file_to_a_validated_model(folder: Path) -> None:
 
 def test_foreign_csv_by_options_and_by_columns_file_give_the_same_numbers(folder: Path) -> None:
     common = ("identify", "square-foreign.csv", *SEARCH, "--json")
-    by_options = ftlm_command(
-        *common, "--time", "seconds", "-u", "u=volts", "-y", "y=mm", "--units", "y=mm", cwd=folder
-    )
-    by_file = ftlm_command(*common, "--columns", "columns.toml", cwd=folder)
-    own = ftlm_command("identify", "square.csv", *SEARCH, "--json", cwd=folder)
+    by_options = run_command(*common, "--time", "seconds", "-u", "u=volts", "-y", "y=mm", "--units", "y=mm", cwd=folder)
+    by_file = run_command(*common, "--columns", "columns.toml", cwd=folder)
+    own = run_command("identify", "square.csv", *SEARCH, "--json", cwd=folder)
     found = [json.loads(r.stdout) for r in (by_options, by_file, own)]
     assert found[0]["coefficients"] == found[1]["coefficients"]
     assert found[0]["orders"] == found[2]["orders"] == {"alpha": 1.5, "nu": 0.5}
@@ -98,8 +90,8 @@ def test_foreign_csv_by_options_and_by_columns_file_give_the_same_numbers(folder
 
 
 def test_json_prints_the_figures_that_compare_prints(folder: Path) -> None:
-    identified = ftlm_command("identify", "square.csv", *SEARCH, "-o", "again.json", "--force", "--json", cwd=folder)
-    compared = ftlm_command("compare", "again.json", "square.csv", "--json", cwd=folder)
+    identified = run_command("identify", "square.csv", *SEARCH, "-o", "again.json", "--force", "--json", cwd=folder)
+    compared = run_command("compare", "again.json", "square.csv", "--json", cwd=folder)
     first, second = json.loads(identified.stdout), json.loads(compared.stdout)
     for figure, value in first["output_error"]["y"].items():
         assert second["output_error"]["y"][figure] == pytest.approx(value, rel=1e-12)
@@ -109,7 +101,7 @@ def test_json_prints_the_figures_that_compare_prints(folder: Path) -> None:
 
 def test_search_prints_a_ranked_table_and_counts(folder: Path) -> None:
     words = [w if w != "--method" else "--coefficients" for w in SEARCH]
-    found = ftlm_command("search", "square.csv", *words, "--top", "3", "--json", cwd=folder)
+    found = run_command("search", "square.csv", *words, "--top", "3", "--json", cwd=folder)
     assert found.returncode == 0, found.stderr
     table = json.loads(found.stdout)["y"]
     assert [row["rank"] for row in table["table"]] == [1, 2, 3]
@@ -117,8 +109,8 @@ def test_search_prints_a_ranked_table_and_counts(folder: Path) -> None:
 
 
 def test_simulate_writes_a_run_that_loads_without_columns(folder: Path) -> None:
-    ftlm_command("identify", "square.csv", *SEARCH, "-o", "sim.json", "--force", cwd=folder)
-    found = ftlm_command("simulate", "sim.json", "sine.csv", "-o", "out.csv", "--force", cwd=folder)
+    run_command("identify", "square.csv", *SEARCH, "-o", "sim.json", "--force", cwd=folder)
+    found = run_command("simulate", "sim.json", "sine.csv", "-o", "out.csv", "--force", cwd=folder)
     assert found.returncode == 0, found.stderr
     simulated, measured = ftlm.load(folder / "out.csv"), ftlm.load(folder / "sine.csv")
     assert np.max(np.abs(simulated["y"] - measured["y"])) < 2e-3 * np.max(np.abs(measured["y"]))
@@ -135,50 +127,50 @@ def test_residual_tests_of_a_saved_model_have_an_exit_code(folder: Path) -> None
     for name, a0, code in (("true", -4.0, 0), ("wrong", -3.0, 4)):
         model = ftlm.Model(ftlm.equation(f"D^1.5 y = -2.0 D^0.5 y + {a0} y + 3.0 u"))
         model.save(folder / f"{name}.json", force=True)
-        ran = ftlm_command("resid", f"{name}.json", "noisy.csv", cwd=folder)
+        ran = run_command("resid", f"{name}.json", "noisy.csv", cwd=folder)
         assert ran.returncode == code, ran.stdout + ran.stderr
         assert ("FAILED" in ran.stdout) is (code == 4)
-        document = json.loads(ftlm_command("resid", f"{name}.json", "noisy.csv", "--json", cwd=folder).stdout)
+        document = json.loads(run_command("resid", f"{name}.json", "noisy.csv", "--json", cwd=folder).stdout)
         assert document["passed"] is (code == 0)
-    assert ftlm_command("resid", "true.json", "noisy.csv", "--lags", "9999", cwd=folder).returncode == 3
+    assert run_command("resid", "true.json", "noisy.csv", "--lags", "9999", cwd=folder).returncode == 3
 
 
 def test_export_writes_for_other_tools_and_overwrites_nothing(folder: Path) -> None:
     ftlm.Model(ftlm.equation("D^1.5 y = -2.0 D^0.5 y - 4.0 y + 3.0 u")).save(folder / "out.json", force=True)
-    matlab = ftlm_command("export", "out.json", "--to", "matlab", cwd=folder)
+    matlab = run_command("export", "out.json", "--to", "matlab", cwd=folder)
     assert matlab.returncode == 0, matlab.stderr
     assert "fotf(G_y_u.a" in matlab.stdout
-    assert json.loads(ftlm_command("export", "out.json", "--to", "json", cwd=folder).stdout)["outputs"] == ["y"]
-    as_json = json.loads(ftlm_command("export", "out.json", "--to", "matlab", "--json", cwd=folder).stdout)
+    assert json.loads(run_command("export", "out.json", "--to", "json", cwd=folder).stdout)["outputs"] == ["y"]
+    as_json = json.loads(run_command("export", "out.json", "--to", "matlab", "--json", cwd=folder).stdout)
     assert as_json["text"].rstrip() == matlab.stdout.rstrip()
-    written = ftlm_command("export", "out.json", "--to", "control", "--band", "0.1:100", "-o", "sys.py", cwd=folder)
+    written = run_command("export", "out.json", "--to", "control", "--band", "0.1:100", "-o", "sys.py", cwd=folder)
     assert written.returncode == 0, written.stderr
     assert "control.ss(" in (folder / "sys.py").read_text()
-    again = ftlm_command("export", "out.json", "--to", "json", "-o", "sys.py", cwd=folder)
+    again = run_command("export", "out.json", "--to", "json", "-o", "sys.py", cwd=folder)
     assert (again.returncode, "exists" in again.stderr) == (3, True)
     for band in ([], ["--band", "3"], ["--band", "1:"], ["--band", "5:1"]):
-        refused = ftlm_command("export", "out.json", "--to", "control", *band, cwd=folder)
+        refused = run_command("export", "out.json", "--to", "control", *band, cwd=folder)
         assert refused.returncode == 2, band
 
 
 def test_a_report_of_a_saved_model(folder: Path) -> None:
     ftlm.Model(ftlm.equation("D^1.5 y = -2.0 D^0.5 y - 4.0 y + 3.0 u")).save(folder / "given.json", force=True)
     words = ("report", "given.json", "--validation", "sine.csv", "-o", "given.html")
-    ran = ftlm_command(*words, cwd=folder)
+    ran = run_command(*words, cwd=folder)
     assert ran.returncode == 0, ran.stderr
     assert "written: given.html" in ran.stdout
     text = (folder / "given.html").read_text("utf-8")
     assert "validation: sine" in text
-    again = ftlm_command(*words, cwd=folder)
+    again = run_command(*words, cwd=folder)
     assert (again.returncode, "--force" in again.stderr) == (3, True)
-    assert ftlm_command(*words, "--force", "--json", cwd=folder).returncode == 0
-    alone = ftlm_command("report", "given.json", "-o", "alone.html", cwd=folder)
+    assert run_command(*words, "--force", "--json", cwd=folder).returncode == 0
+    alone = run_command("report", "given.json", "-o", "alone.html", cwd=folder)
     assert alone.returncode == 0, alone.stderr
     assert "No validation run was given" in (folder / "alone.html").read_text("utf-8")
-    missing = ftlm_command("report", "given.json", "-o", "nowhere/x.html", cwd=folder)
+    missing = run_command("report", "given.json", "-o", "nowhere/x.html", cwd=folder)
     assert (missing.returncode, "is not a folder; make it first" in missing.stderr) == (3, True)
     np.savetxt(folder / "other.csv", np.ones((60, 2)).cumsum(axis=0), delimiter=",", header="t,w", comments="")
-    refused = ftlm_command(
+    refused = run_command(
         "report", "given.json", "--validation", "other.csv", "--time", "t", "-y", "w", "-o", "x.html", cwd=folder
     )
     assert refused.returncode == 3
@@ -187,14 +179,14 @@ def test_a_report_of_a_saved_model(folder: Path) -> None:
 
 
 def test_inspect_and_doctor_speak(folder: Path) -> None:
-    inspected = ftlm_command("inspect", "square.csv", cwd=folder)
+    inspected = run_command("inspect", "square.csv", cwd=folder)
     assert inspected.returncode == 0
     assert "1025 rows" in inspected.stdout
     assert "advice on square" in inspected.stdout
-    assert json.loads(ftlm_command("inspect", "square.csv", "--json", cwd=folder).stdout)[0]["rows"] == 1025
-    doctor = json.loads(ftlm_command("doctor", "--json", cwd=folder).stdout)
+    assert json.loads(run_command("inspect", "square.csv", "--json", cwd=folder).stdout)[0]["rows"] == 1025
+    doctor = json.loads(run_command("doctor", "--json", cwd=folder).stdout)
     assert doctor["ftlm"] == ftlm.__version__
-    assert ftlm_command("--version", cwd=folder).stdout.split() == ["ftlm", ftlm.__version__]
+    assert run_command("--version", cwd=folder).stdout.split() == ["ftlm", ftlm.__version__]
 
 
 BAD = [
@@ -252,7 +244,7 @@ def test_a_mistake_is_named_with_the_right_exit_code_and_writes_nothing(
     folder: Path, words: tuple[str, ...], code: int, said: str
 ) -> None:
     before = {p.name: p.stat().st_mtime_ns for p in folder.iterdir() if p.is_file()}
-    found = ftlm_command(*words, cwd=folder)
+    found = run_command(*words, cwd=folder)
     assert found.returncode == code, found.stderr
     assert said in found.stderr
     assert "Traceback" not in found.stderr
@@ -263,16 +255,16 @@ def test_a_mistake_is_named_with_the_right_exit_code_and_writes_nothing(
 def test_nothing_is_overwritten_without_force(folder: Path) -> None:
     kept = folder / "kept.json"
     kept.write_text("mine", encoding="utf-8")
-    refused = ftlm_command("identify", "square.csv", *SEARCH, "-o", "kept.json", cwd=folder)
+    refused = run_command("identify", "square.csv", *SEARCH, "-o", "kept.json", cwd=folder)
     assert refused.returncode == 3
     assert "--force" in refused.stderr
     assert kept.read_text(encoding="utf-8") == "mine"
-    assert ftlm_command("identify", "square.csv", *SEARCH, "-o", "kept.json", "--force", cwd=folder).returncode == 0
+    assert run_command("identify", "square.csv", *SEARCH, "-o", "kept.json", "--force", cwd=folder).returncode == 0
     assert ftlm.load_model(kept).orders == {"alpha": 1.5, "nu": 0.5}
 
 
 def test_validation_below_what_was_asked_exits_with_four(folder: Path) -> None:
-    ftlm_command(
+    run_command(
         "identify",
         "square.csv",
         "--structure",
@@ -284,7 +276,7 @@ def test_validation_below_what_was_asked_exits_with_four(folder: Path) -> None:
         "--force",
         cwd=folder,
     )
-    found = ftlm_command("compare", "poor.json", "sine.csv", "--min-fit", "99.9", cwd=folder)
+    found = run_command("compare", "poor.json", "sine.csv", "--min-fit", "99.9", cwd=folder)
     assert found.returncode == 4
     assert "99.9" in found.stderr
 
@@ -323,12 +315,12 @@ def test_ctrl_c_ends_a_search_with_130_and_shows_progress_before(folder: Path) -
     )
     os.close(slave)
     seen = b""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while b"searching" not in seen and time.monotonic() < deadline:
         seen += os.read(master, 4096)
     assert b"searching" in seen
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=30) == 130
+    assert process.wait(timeout=120) == 130
     os.close(master)
 
 
@@ -365,7 +357,7 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
             *cross,
         )
         found = [
-            ftlm_command("identify", *files, "--columns", columns, *options, "-o", out, cwd=tmp_path)
+            run_command("identify", *files, "--columns", columns, *options, "-o", out, cwd=tmp_path)
             for files, columns, out in (([str(run / "psf.csv")], "csv.toml", "a.json"), (mats, "mat.toml", "b.json"))
         ]
         assert [f.returncode for f in found] == [0, 0], [f.stderr for f in found]
@@ -373,7 +365,7 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
         assert first["orders"] == second["orders"]
         for name, value in first["coefficients"].items():
             assert second["coefficients"][name] == pytest.approx(value, rel=1e-6)
-        compared = ftlm_command(
+        compared = run_command(
             "compare",
             "a.json",
             str(DATA / "two_link_lqr" / "lqr.csv"),
@@ -413,7 +405,7 @@ def test_the_classic_data_sets_give_a_model_each(
     rest = ("--structure", structure, "--method", "least-squares", "--increment", "0.1", "--json", "-o", "m.json")
     if "alpha=1.5:2.5:0.1" not in options:
         rest = (*rest, "--order-grid", "alpha=0.3:1.5:0.05")
-    found = ftlm_command("identify", str(DATA / file), *options, *rest, cwd=tmp_path)
+    found = run_command("identify", str(DATA / file), *options, *rest, cwd=tmp_path)
     assert found.returncode == 0, found.stderr
     data = json.loads(found.stdout)
     (fit,) = (figures["fit"] for figures in data["output_error"].values())
@@ -423,11 +415,11 @@ def test_the_classic_data_sets_give_a_model_each(
 
 def test_an_equation_is_a_structure(folder: Path) -> None:
     for words in (["--equation", EQUATION], [f"--equation={EQUATION}"]):
-        found = ftlm_command("identify", "square.csv", *words, cwd=folder)
+        found = run_command("identify", "square.csv", *words, cwd=folder)
         assert found.returncode == 2
         assert "No such option: --equation; --structure takes equations in words, too." in found.stderr
     # Where there is no structure, it is as unknown as any other.
-    assert "No such option: --equation" in ftlm_command("doctor", "--equation", "x", cwd=folder).stderr
+    assert "No such option: --equation" in run_command("doctor", "--equation", "x", cwd=folder).stderr
 
 
 LONG = {

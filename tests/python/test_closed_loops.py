@@ -35,24 +35,20 @@ def loop_codes(found: ftlm.Identification) -> list[str]:
     ],
 )
 def test_a_loop_is_found_and_weighs_what_it_moves(kind, state, code):
-    for seed in range(2):
-        found = ftlm.identify(loops.loop(kind, seed), STRUCTURE, method=ftlm.OutputError(intervals="quadratic"))
-        tests = found.residuals.outputs["y"]
-        assert tests.feedback_tests["u"].state == state
-        assert loop_codes(found) == ([] if code is None else [code])
-        assert ("closed loop of u around y" in found.details()) == (state == "found")
-        bias = tests.feedback_tests["u"].bias
-        assert bias is None if code is None else (bias > 1) == (code == "loop_found")
-        # What a controller does at once is not taken for what the model lacks.
-        assert not tests.inputs["u"].failed
-
-
-def test_the_warning_names_the_way_out():
-    found = ftlm.identify(loops.loop("closed, coloured, strong", 1), STRUCTURE)
-    (said,) = [f for f in found.findings if f.code == "loop_found"]
-    assert said.text.startswith("y: u depends on past values of y")
-    assert "name it with reference=" in said.text
-    assert "name the reference signal with reference=" in said.remedy
+    found = ftlm.identify(loops.loop(kind, 1, rows=1000), STRUCTURE, method=ftlm.OutputError(intervals="quadratic"))
+    tests = found.residuals.outputs["y"]
+    assert tests.feedback_tests["u"].state == state
+    assert loop_codes(found) == ([] if code is None else [code])
+    assert ("closed loop of u around y" in found.details()) == (state == "found")
+    bias = tests.feedback_tests["u"].bias
+    assert bias is None if code is None else (bias > 1) == (code == "loop_found")
+    # What a controller does at once is not taken for what the model lacks.
+    assert not tests.inputs["u"].failed
+    if code == "loop_found":
+        (said,) = [f for f in found.findings if f.code == code]
+        assert said.text.startswith("y: u depends on past values of y")
+        assert "name it with reference=" in said.text
+        assert "name the reference signal with reference=" in said.remedy
 
 
 #: Plants as numerator and denominator in s, of loops.STEP; inputs and noises of open loops by name.
@@ -337,7 +333,7 @@ def test_coverage_of_a_noise_model_beside_output_error_and_a_reference(kind):
 
 def test_residuals_are_orthogonal_to_what_follows_the_reference():
     # The oracle: sensitivities by differences of the exact step response's convolutions with the answer to r.
-    run = loops.loop("closed, coloured", 3)
+    run = loops.loop("closed, coloured", 3, rows=700)
     found = ftlm.identify(run, STRUCTURE, method=ftlm.OutputError(reference="r"))
     assert found.joint.converged
     values = {n: p.value for n, p in found.parameters.items()}
@@ -358,7 +354,7 @@ def test_residuals_are_orthogonal_to_what_follows_the_reference():
 
 
 def test_a_reference_is_told(tmp_path):
-    run = loops.loop("closed, coloured", 2)
+    run = loops.loop("closed, coloured", 2, rows=600)
     run.to_csv(tmp_path / "run.csv")
     words = ["identify", str(tmp_path / "run.csv"), "--structure", "D^alpha y = -a y + b u", "--initial", "rest"]
     words += ["--reference", "r", "--report", str(tmp_path / "r.html"), "--verbose"]
@@ -372,10 +368,10 @@ def test_a_reference_is_told(tmp_path):
 
 def test_a_weak_reference_is_named():
     # It hardly moves beside the noise that the loop feeds back.
-    run = loops.loop("closed, coloured, integral", 0)
+    run = loops.loop("closed, coloured, integral", 0, rows=600)
     rng = np.random.default_rng(1)
     weak = ftlm.Run.from_arrays(
-        step=run.step, inputs={"u": run["u"], "r": np.repeat(rng.choice([-1.0, 1.0], 30), 50)}, outputs={"y": run["y"]}
+        step=run.step, inputs={"u": run["u"], "r": np.repeat(rng.choice([-1.0, 1.0], 12), 50)}, outputs={"y": run["y"]}
     )
     found = ftlm.identify(weak, STRUCTURE, method=ftlm.OutputError(reference="r"))
     assert [w for w in found.warnings if "weak instrument" in w]
@@ -403,7 +399,7 @@ def test_instrumental_variables_count_the_error_of_their_orders():
     # The true order is on no lattice; errors at the order found alone covered one in three.
     held = []
     near = ftlm.order_grid(alpha=(1.5, 1.9))
-    for seed in range(3):
+    for seed in range(2):
         run = loops.open_run(seed, noise=0.05)
         found = ftlm.identify(run, STRUCTURE, method=ftlm.InstrumentalVariables(order_grid=near))
         truth = {**loops.TRUTH, "alpha": 1.73}

@@ -1,12 +1,10 @@
 """Columns that nobody names: what `open` assumes is what load and every command use, and is said."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 import ftlm
+from command_line import run_command
 
 EQUATION = "D {y} = a {y} + b {u}"
 
@@ -22,10 +20,6 @@ def write(path, names, *, scale=1.0):
     ]
     path.write_text("\n".join(rows) + "\n")
     return str(path)
-
-
-def command(*words):
-    return subprocess.run([sys.executable, "-m", "ftlm", *words], capture_output=True, text=True, check=False)
 
 
 def test_load_chooses_what_open_assumes(tmp_path):
@@ -59,16 +53,18 @@ def test_ambiguous_names_are_refused_with_the_columns(tmp_path):
 )
 def test_the_signals_of_an_equation_are_found_by_name(tmp_path, names, u, y):
     file, model = write(tmp_path / "a.csv", names), str(tmp_path / "model.json")
-    made = command("identify", file, "--structure", EQUATION.format(u=u, y=y), "-o", model)
+    made = run_command("identify", file, "--structure", EQUATION.format(u=u, y=y), "-o", model)
     assert made.returncode == 0, made.stderr
     assert ftlm.load_model(model).coefficients["a"] == pytest.approx(-2.0, rel=0.01)
     assert "by their names" not in made.stdout
-    compared = command("compare", model, file)
+    compared = run_command("compare", model, file)
     assert compared.returncode == 0, compared.stderr
 
 
 def test_a_name_in_the_equation_that_no_column_has_is_an_error(tmp_path):
-    made = command("identify", write(tmp_path / "a.csv", ["t", "foo", "bar"]), "--structure", "D baz = a baz + b foo")
+    made = run_command(
+        "identify", write(tmp_path / "a.csv", ["t", "foo", "bar"]), "--structure", "D baz = a baz + b foo"
+    )
     assert made.returncode == 3
     assert "-u NAME=COLUMN and -y NAME=COLUMN" in made.stderr
     assert "'foo', 'bar'" in made.stderr
@@ -76,12 +72,12 @@ def test_a_name_in_the_equation_that_no_column_has_is_an_error(tmp_path):
 
 def test_names_that_options_give_win(tmp_path):
     file = write(tmp_path / "a.csv", ["t", "u", "y"])
-    made = command("identify", file, "-u", "x=u", "-y", "z=y", "--structure", "D z = a z + b x")
+    made = run_command("identify", file, "-u", "x=u", "-y", "z=y", "--structure", "D z = a z + b x")
     assert made.returncode == 0, made.stderr
 
 
 def test_inspect_needs_no_names(tmp_path):
-    shown = command("inspect", write(tmp_path / "a.csv", ["t", "u", "y"]))
+    shown = run_command("inspect", write(tmp_path / "a.csv", ["t", "u", "y"]))
     assert shown.returncode == 0, shown.stderr
     assert "'u' drives 'y', by their names" in shown.stdout
 
@@ -91,15 +87,15 @@ def test_open_writes_a_columns_file_that_loads_the_same_run(tmp_path):
         write(tmp_path / "a.csv", ["t", 'Motor "A" voltage [V]', "Tip angle [deg]"]),
         tmp_path / "bench.toml",
     )
-    shown = command("open", file, "--write-columns", str(columns))
+    shown = run_command("open", file, "--write-columns", str(columns))
     assert shown.returncode == 0, shown.stderr
     assert f"written: {columns}" in shown.stdout
     run, again = ftlm.open_file(file).load(), ftlm.load(file, columns=columns)
     assert run.units == again.units
     assert all(np.array_equal(run[n], again[n]) for n in run.signals)
     assert not any("by their names" in str(w) for w in again.warnings)
-    assert command("open", file, "--write-columns", str(columns)).returncode == 3
-    assert command("open", file, "--write-columns", str(columns), "--force").returncode == 0
+    assert run_command("open", file, "--write-columns", str(columns)).returncode == 3
+    assert run_command("open", file, "--write-columns", str(columns), "--force").returncode == 0
 
 
 def test_a_file_that_is_no_run_has_no_columns_to_write(tmp_path):

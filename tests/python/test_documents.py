@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 import ftlm
+from command_line import run_command
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
@@ -112,9 +113,7 @@ def test_every_command_and_option_of_the_documents_exists(command: str) -> None:
 @cache
 def help_of(name: str) -> str:
     """Help of a command."""
-    shown = subprocess.run(
-        [sys.executable, "-m", "ftlm", name, "--help"], capture_output=True, text=True, check=False, env=wide()
-    )
+    shown = run_command(name, "--help", columns=250)
     assert shown.returncode == 0, shown.stderr
     return shown.stdout
 

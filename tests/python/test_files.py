@@ -414,6 +414,9 @@ def test_mat_matrices_vectors_and_what_is_skipped(tmp_path, compress):
     for name in "bcd":
         np.testing.assert_array_equal(run[name], np.arange(30))
     np.testing.assert_array_equal(run["e"], np.arange(30) > 9)
+    if compress:
+        # Each of what follows starts a reader of its own, and is the same of what was read.
+        return
     assert load(path, outputs=["row"], step=1).step == 1
     assert load(path, outputs=["row"], time="V.1").step == 0.002
     messages(["time", "step="], lambda: load(path, outputs=["row"]))
@@ -599,7 +602,8 @@ def reader(folder, body):
 def test_a_reader_that_dies_or_babbles_gives_a_data_error(tmp_path, monkeypatch, body, words):
     path = mat(tmp_path, V=table())
     monkeypatch.setattr(apart, "_READER_PATH", reader(tmp_path, body))
-    monkeypatch.setattr(apart, "_READER_TIMEOUT_S", 1.0)
+    if "sleep" in body:
+        monkeypatch.setattr(apart, "_READER_TIMEOUT_S", 1.0)
     messages(["x.mat", *words], lambda: load(path, outputs={"y": "V.3"}))
 
 

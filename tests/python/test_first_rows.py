@@ -1,11 +1,11 @@
-"""The first rows of a run: at rest, at its own level, in motion; held against SciPy's lsim and least squares."""
+"""The first rows of a run: at rest, at its own level, in motion; held against SciPy's recursion and least squares."""
 
 import itertools
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.signal import cont2discrete, lfilter, lsim
+from scipy.signal import cont2discrete, lfilter
 from scipy.stats import beta
 
 import ftlm
@@ -15,13 +15,9 @@ H = 0.5
 
 
 def plant(numerator, denominator, u, h=H):
-    """Samples of a transfer function from rest, with a held input, by `lsim` on steps that are split at each sample."""
-    t, y, x = h * np.arange(2), [0.0], None
-    for v in u[:-1]:
-        _, out, state = lsim((numerator, denominator), [v, v], t, X0=x)
-        y.append(float(np.ravel(out)[-1]))
-        x = state[-1]
-    return np.array(y)
+    """Samples of a transfer function from rest, with a held input, by the exact recursion of SciPy."""
+    b, a, _ = cont2discrete((numerator, denominator), h)
+    return lfilter(np.ravel(b), a, u)
 
 
 def run_of(u, y, h=H, **more):
@@ -73,8 +69,7 @@ def test_a_plant_that_rests_at_its_level_gives_the_oracles_numbers(level, low):
     assert "30 quiet rows" in str(found)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("alpha", ["alpha", "1"])
+@pytest.mark.parametrize(("alpha", "seed"), [("alpha", 0), ("1", 1)])
 def test_a_step_after_rest_is_not_swallowed(alpha, seed):
     u = step_input(400, 25)
     y = plant([2.0], [15.0 * 40.0, 55.0, 1.0], u) + 0.02 * np.random.default_rng(seed).standard_normal(400)

@@ -32,7 +32,7 @@ def ftlm_child(*arguments, **options):
     return subprocess.run(
         [sys.executable, "-m", "ftlm", *arguments],
         check=False,
-        timeout=120,
+        timeout=240,
         stderr=subprocess.PIPE,
         text=True,
         **options,
@@ -360,7 +360,7 @@ print(_core.pulse_mean_rows(numpy.ones((1, 4)), 3, True)[0])
 
 
 def test_numpys_interface_is_there_before_a_ctrl_c_can_arrive():
-    done = subprocess.run([sys.executable, "-c", CAPSULE], check=True, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", CAPSULE], check=True, capture_output=True, text=True, timeout=240)
     assert done.stdout.strip() == "[1. 1. 1.]"
 
 
@@ -481,7 +481,7 @@ def test_what_a_reader_that_has_gone_leaves_is_nobodys_loss(written):
 def test_an_output_that_was_closed_stays_closed(written, closed, said):
     call = f'"$0" -m ftlm inspect "$1" {closed}'
     done = subprocess.run(
-        ["sh", "-c", call, sys.executable, str(written)], check=False, timeout=120, capture_output=True, text=True
+        ["sh", "-c", call, sys.executable, str(written)], check=False, timeout=240, capture_output=True, text=True
     )
     assert done.stderr[:6] == said
     assert "Traceback" not in done.stderr

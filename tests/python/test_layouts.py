@@ -219,13 +219,13 @@ def test_packed_text_is_limited_and_damage_is_said(tmp_path, monkeypatch):
         messages([kind, "unpack it"], lambda name=name: read(tmp_path, whole, name))
 
 
-def test_a_hundred_thousand_columns_are_read_and_shown_in_part(tmp_path):
-    width = 100_000
+def test_thousands_of_columns_are_read_and_shown_in_part(tmp_path):
+    width = 10_000
     names = ",".join(["t", *(f"n{k}" for k in range(width - 1))])
     path = write(tmp_path, names + "\n" + "".join(f"{j}" + f",{j}" * (width - 1) + "\n" for j in range(3)))
     opened = ftlm.open_file(path)
     assert len(opened.columns) == width
-    assert "… and 99960 more" in str(opened)
+    assert "… and 9960 more" in str(opened)
     assert len(str(opened)) < 6000
 
 

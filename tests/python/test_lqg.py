@@ -183,7 +183,7 @@ def test_its_response_is_that_of_what_runs():
     controller = designed(samples=0).controller
     w = np.array([3.0, 20.0, 90.0, 400.0])
     heard, asked = controller.response(w)
-    rows = 1 << 15
+    rows = 1 << 13
     turn = np.exp(-1j * np.outer(w, np.arange(rows)) / RATE)
 
     def answer(at):

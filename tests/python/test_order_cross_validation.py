@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from command_line import run_command
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction
 from ftlm.reproduction.cross_validation import (
     cross_validate_orders,
@@ -18,7 +19,6 @@ from ftlm.reproduction.cross_validation import (
     stages_in,
     verdict_sentence,
 )
-from test_cli import ftlm_command
 
 ROWS, STEP = 251, 0.02
 
@@ -275,7 +275,7 @@ def test_what_cannot_be_done_is_said_before_any_work(fractional, tmp_path, words
     ftlm.Run.from_arrays(step=0.01, inputs={"volts": np.sin(n / 7.0)}, outputs={"y": np.cos(n / 9.0)}).to_csv(
         tmp_path / "strange.csv"
     )
-    ran = ftlm_command("orders", *words, cwd=tmp_path)
+    ran = run_command("orders", *words, cwd=tmp_path)
     assert ran.returncode == code, ran.stderr
     assert message in ran.stderr
     assert ran.stdout == ""

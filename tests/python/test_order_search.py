@@ -640,7 +640,7 @@ def test_control_c_ends_a_search(large):
                 if line.startswith("started") and line.split()[2] != "0":
                     break
             child.send_signal(signal.SIGINT)
-            rest, _ = child.communicate(timeout=20)  # a loose guard: brute force would take minutes
+            rest, _ = child.communicate(timeout=120)  # a loose guard: brute force would take minutes
         finally:
             child.kill()
     lines = [line for line in rest.splitlines() if not line.startswith("started")]

@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import ftlm
+from command_line import run_command
 from ftlm import cli
 
 pytest.importorskip("matplotlib")
@@ -109,9 +110,7 @@ def test_the_command_writes_a_figure(found, small_run, tmp_path):
     small_run.to_csv(tmp_path / "r.csv")
 
     def command(*words):
-        return subprocess.run(
-            [sys.executable, "-m", "ftlm", "plot", *words], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
+        return run_command("plot", *words, cwd=tmp_path)
 
     ran = command("m.json", "r.csv", "-o", "fit.pdf")
     assert ran.returncode == 0, ran.stderr

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from command_line import run_command
 from ftlm import DataError
 from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
@@ -23,7 +24,6 @@ from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, 
 from ftlm.reproduction.stage_result import OrderComparison, Panel, compare_optimizers
 from ftlm.validation.comparison import compare_means
 from lagrange import truth
-from test_cli import ftlm_command
 from test_derivation import STIFFNESS_PAIRS, TABLE_3
 from test_oracles import PRINTED_CRITERIA, PRINTED_RIVALS
 
@@ -444,7 +444,7 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
     other = reproduction.sine.select(["theta21", "theta22", "I2"])
     run.to_csv(tmp_path / "mine.csv")
     other.to_csv(tmp_path / "other.csv")
-    ran = ftlm_command(
+    ran = run_command(
         "reproduce",
         "--square",
         "mine.csv",
@@ -566,7 +566,7 @@ def test_what_cannot_be_done_is_said_before_any_work(tmp_path, words, code, mess
     whole.to_csv(tmp_path / "whole.csv")
     strange = ftlm.Run.from_arrays(step=0.01, inputs={"volts": np.sin(n / 7.0)}, outputs={"theta11": np.cos(n / 9.0)})
     strange.to_csv(tmp_path / "strange.csv")
-    ran = ftlm_command("reproduce", *words, cwd=tmp_path)
+    ran = run_command("reproduce", *words, cwd=tmp_path)
     assert ran.returncode == code, ran.stderr
     assert message in ran.stderr
     assert ran.stdout == ""

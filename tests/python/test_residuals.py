@@ -57,14 +57,15 @@ def blank(u, step=0.02):
     return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": 0 * u}, name="blank")
 
 
-def test_one_true_model_in_a_hundred_is_refused(small_model, small_run, with_noise):
-    verdicts = [small_model.resid(with_noise(small_run, 0.05, seed)) for seed in range(300)]
+@pytest.mark.parametrize(("seeds", "most"), [(60, 4), pytest.param(300, 9, marks=pytest.mark.slow)])
+def test_one_true_model_in_a_hundred_is_refused(small_model, small_run, with_noise, seeds, most):
+    verdicts = [small_model.resid(with_noise(small_run, 0.05, seed)) for seed in range(seeds)]
     whiteness = sum(not v.white["y"] for v in verdicts)
     independence = sum(not v.independent["y"] for v in verdicts)
-    # One in a hundred each: 3 of 300, at most 9 with a probability of 99.9 %; the second is conservative for an input
-    # whose lags are alike.
-    assert whiteness <= 9
-    assert independence <= 9
+    # One in a hundred each: 3 of 300, at most 9 with a probability of 99.9 %, and at most 4 of 60; the second is
+    # conservative for an input whose lags are alike.
+    assert whiteness <= most
+    assert independence <= most
     values = np.concatenate([v.outputs["y"].whiteness.values[1:] for v in verdicts])
     outside = np.mean(np.abs(values) > verdicts[0].outputs["y"].whiteness.band)
     assert 0.005 < outside < 0.02
@@ -72,7 +73,7 @@ def test_one_true_model_in_a_hundred_is_refused(small_model, small_run, with_noi
 
 def test_coloured_noise_fails_whiteness_and_not_independence(small_model, small_run):
     refused = 0
-    for seed in range(60):
+    for seed in range(20):
         rng = np.random.default_rng([9, seed])
         white = rng.standard_normal(small_run.length + 50)
         coloured = np.convolve(white, 0.8 ** np.arange(50), "valid")[: small_run.length]
@@ -83,7 +84,7 @@ def test_coloured_noise_fails_whiteness_and_not_independence(small_model, small_
         assert not found.white["y"]
         refused += not found.independent["y"]
     # With the band of white residuals it would be a third of them.
-    assert refused <= 4
+    assert refused <= 2
 
 
 def test_a_lacking_term_is_found(long_run):

@@ -14,7 +14,7 @@ from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.discretization import recording
 from ftlm.simulation.output_samples import output_simulation
 from ftlm.utils.resources import interruptible_pool, stop_flag
-from thread_pair import run_in_two_threads
+from thread_pair import overlap
 
 
 def compared(samples: np.ndarray, inputs: np.ndarray) -> list:
@@ -152,26 +152,9 @@ def test_a_simulation_on_another_thread_is_ended_within_its_grids() -> None:
 
 def test_two_fits_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No thread is made to give up the interpreter, so that the second fit begins only if the first one lets go."""
-    core_fit, inside, most, begun = _core.joint_fit, [0], [0], threading.Barrier(2)
-
-    def watched(*arguments: object) -> object:
-        inside[0] += 1
-        most[0] = max(most[0], inside[0])
-        try:
-            return core_fit(*arguments)
-        finally:
-            inside[0] -= 1
-
-    run = moving_run(400)
+    run, start = moving_run(400), {"alpha": 1.0, "a": -0.3, "b": 0.5}
     structure = ftlm.equation("D^alpha y = a y + b u", initial="rest")
-
-    def work() -> None:
-        begun.wait()
-        fit_output_error([run], structure, start={"alpha": 1.0, "a": -0.3, "b": 0.5})
-
-    monkeypatch.setattr(_core, "joint_fit", watched)
-    run_in_two_threads(lambda _: work())
-    assert most == [2]
+    assert overlap(lambda _: fit_output_error([run], structure, start=start), monkeypatch, _core, "joint_fit")
 
 
 def moving_run(rows: int, friction: float = 0.0) -> ftlm.Run:

@@ -54,7 +54,7 @@ def test_another_linear_algebra_moves_last_digits_alone() -> None:
             check=True,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=240,
             env={**os.environ, "OPENBLAS_CORETYPE": kernels, "OPENBLAS_NUM_THREADS": "1"},
         )
         told.append(json.loads(done.stdout))

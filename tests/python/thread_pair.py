@@ -6,6 +6,32 @@ import sys
 import threading
 from collections.abc import Callable
 
+import pytest
+
+#: Pairs of calls that are tried until one overlaps: on a busy machine a call may end before the other thread wakes.
+MAX_PAIRS = 200
+
+
+def overlap(work: Callable[[int], object], monkeypatch: pytest.MonkeyPatch, owner: object, name: str) -> bool:
+    """Whether two threads are ever within a function at once, which `work` calls in each of them."""
+    call, inside, most = getattr(owner, name), [0], [0]
+
+    def watched(*arguments: object, **named: object) -> object:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        try:
+            return call(*arguments, **named)
+        finally:
+            inside[0] -= 1
+
+    monkeypatch.setattr(owner, name, watched)
+    for _ in range(MAX_PAIRS):
+        begun = threading.Barrier(2)
+        run_in_two_threads(lambda key, begun=begun: (begun.wait(), work(key)))
+        if most == [2]:
+            return True
+    return False
+
 
 def run_in_two_threads(work: Callable[[int], object]) -> None:
     """Call `work` with 0 and with 1 in threads of their own; who holds the global lock keeps it for a minute."""

@@ -1,0 +1,20 @@
+"""The command line within the process of the tests, which spares each command a start of Python."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from ftlm.cli.main import app
+
+
+def run_command(*words: str, cwd: Path | None = None, columns: int = 200) -> subprocess.CompletedProcess[str]:
+    """Run a command without colors; what it does not handle is raised."""
+    with contextlib.nullcontext() if cwd is None else contextlib.chdir(cwd):
+        done = CliRunner().invoke(
+            app, list(words), env={"NO_COLOR": "1", "COLUMNS": str(columns)}, catch_exceptions=False
+        )
+    return subprocess.CompletedProcess(words, done.exit_code, done.stdout, done.stderr)
