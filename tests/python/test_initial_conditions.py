@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 from typer.testing import CliRunner
 
 import ftlm
@@ -191,6 +191,25 @@ def test_a_run_in_motion_that_passes_zero_as_it_starts_is_found_out():
     # Whoever judges the model on this run sees it as the fit did.
     assert found.model.structure.initial == "history"
     assert ftlm.compare(found.model, run).fit == pytest.approx(found.fit, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", [3, 6])
+def test_a_swing_that_passes_zero_at_the_first_row_is_not_at_rest(seed):
+    # Eight samples a period: the residuals from rest swing, so that they do not inflate the variance of a sum.
+    step, size, before = 2 * np.pi / 300 / 8, 400, 300
+    rng, t = np.random.default_rng(seed), np.arange(size + before)
+    u = sum(np.sin(6 * np.pi * k * t / t.size + rng.uniform(0, 6)) for k in (1, 3, 7, 13, 20))
+    numerator, denominator, _ = cont2discrete(([1.8e5], [1, 6, 9e4]), step)[:3]
+    y = lfilter(np.ravel(numerator), denominator, u)[before:]
+    noise = 0.05 * y.std() * np.random.default_rng(seed).standard_normal(size)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u[before:]}, outputs={"y": y + noise}, name="cut")
+    structure = ftlm.equation("D^2 y = a1 D y + a0 y + b u")
+    assert resolve_initial_conditions(run, structure) == "rest"
+    found = ftlm.identify(run, structure)
+    assert found.settings["initial"] == "caputo"
+    assert "looked_like_rest" in [f.code for f in found.findings]
+    for name, truth in (("a1", -6.0), ("a0", -9e4), ("b", 1.8e5)):
+        assert abs(found.coefficients[name] - truth) < 3.5 * found.standard_errors[name]
 
 
 def test_whole_orders_need_whole_powers_alone():

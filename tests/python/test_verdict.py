@@ -624,6 +624,33 @@ def test_an_integrator_is_no_growth_by_chance():
     assert positive >= 2
 
 
+def double_integrator_record(seed, stiffness=0.0):
+    """The position of a mass under a force that was drawn beforehand, on a spring that may push instead of pull."""
+    rng = np.random.default_rng([seed, 43])
+    force = np.cumsum(rng.standard_normal(400)) * 0.2
+    blank = ftlm.Run.from_arrays(step=0.02, inputs={"u": force}, outputs={"y": 0 * force})
+    position = ftlm.Model(ftlm.equation(f"D^2 y = {-stiffness:g} y + 2 u")).simulate(blank)["y"]
+    noise = 0.01 * position.std() * rng.standard_normal(400)
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": force}, outputs={"y": position + noise})
+
+
+def test_a_double_integrator_is_no_growth_by_chance():
+    # Its poles meet at 0, where their errors of first order are far too small.
+    unstable = 0
+    for seed in range(8):
+        found = ftlm.identify(double_integrator_record(seed), ftlm.equation("D^2 y = a1 D y + a0 y + b u"))
+        unstable += found.model.stability().unstable_poles > 0
+        assert found.verdict.level == "with care", found.verdict
+    assert unstable >= 4
+
+
+def test_a_spring_that_pushes_grows():
+    for seed in range(4):
+        found = ftlm.identify(double_integrator_record(seed, -0.25), ftlm.equation("D^2 y = a1 D y + a0 y + b u"))
+        assert found.verdict.level == "do not use"
+        assert "free_run_grows" in [f.code for f in found.findings]
+
+
 def test_a_pole_that_grows_is_still_found():
     found = ftlm.identify(integrator_record(1, pole=0.15), ftlm.equation("D y = a0 y + b u"))
     assert found.verdict.level == "do not use"

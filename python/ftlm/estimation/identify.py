@@ -43,6 +43,7 @@ from ftlm.estimation.nuisance_parameters import (
     fit_score,
     fit_without_history,
     has_colored_residuals,
+    has_white_residuals,
     offset_test,
     output_sensitivities,
     unrequested_offset_findings,
@@ -181,11 +182,15 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
 def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
     """Return the fit with initial values of runs whose first rows look like rest, if the runs clearly refute it.
 
-    A few quiet rows do not distinguish slow motion from rest. White residuals do not refute rest.
+    A few quiet rows do not distinguish slow motion from rest. White residuals do not refute rest. Residuals that swing
+    do if initial values leave white ones: those of a structure that leaves something out stay colored.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.offset == "none" and structure.is_linear
-    if joint is None or not automatic or joint.initial != "rest" or not has_colored_residuals(joint):
+    if joint is None or not automatic or joint.initial != "rest":
+        return None
+    slow = has_colored_residuals(joint)
+    if not slow and has_white_residuals(joint):
         return None
     evidence = [rest_evidence(run, structure) for run in runs]
     if any(known is not None and known.rows == 0 for known in evidence):
@@ -202,7 +207,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
         if other.joint is None or other.joint.unstable_optimum is not None:
             continue
         score = fit_score(other.joint, joint, levels)
-        if score < least:
+        if score < least and (slow or has_white_residuals(other.joint)):
             least, chosen = score, (asked, other)
     if chosen is None:
         return None

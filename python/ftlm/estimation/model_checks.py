@@ -10,6 +10,7 @@ from statistics import NormalDist
 import numpy as np
 
 from ftlm import _core
+from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
 from ftlm.analysis.poles import modes
 from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, interpolate_gaps
@@ -25,7 +26,7 @@ from ftlm.simulation.initial_conditions import RestEvidence, noise_at_start, res
 from ftlm.simulation.output_samples import OutputSamples
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, is_white, robust_deviation
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared, is_white, robust_deviation
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_findings
 from ftlm.validation.data_advice import check_excitation, find_dead_channel
@@ -54,8 +55,11 @@ QUANTIZATION_NOISE_RATIO = 2.0
 QUANTIZATION_STEP_TOLERANCE = 0.01
 #: Smallest change within a sample that counts as motion, as a fraction of the range of the output.
 MIN_MOTION_RANGE_FRACTION = 1e-6
-#: A pole grows if its real part exceeds 0 by so many standard errors (99 %, one-sided).
-GROWTH_SIGMAS = NormalDist().inv_cdf(0.99)
+#: Level at which growth is significant, one-sided: a pole grows if its real part exceeds 0 by so many standard errors.
+GROWTH_LEVEL = 0.99
+GROWTH_SIGMAS = NormalDist().inv_cdf(GROWTH_LEVEL)
+#: Smallest part of a variance that is left of a parameter which is not determined by eliminated ones.
+MIN_VARIANCE_RATIO = 1e-9
 #: Fewest intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
 MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
 #: An end of the multistart is a second optimum if its log likelihood is smaller by no more than this, and a value
@@ -547,7 +551,16 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:
-    """Whether an unstable mode is significant at 99 %; True where modes or their errors are not known."""
+    """Whether an unstable mode is significant at 99 %; True where modes or their errors are not known.
+
+    The error of a pole is one of first order, which fails where poles meet, as those of a double integrator do. So a
+    mode is not significant either if the model is stable without terms that the data allow to leave out.
+    """
+    return _has_significant_growth(model, coupling) and not _is_stable_without_insignificant_terms(model, coupling)
+
+
+def _has_significant_growth(model: Model, coupling: str) -> bool:
+    """Whether the real part of an unstable pole exceeds its standard error significantly."""
     try:
         unstable = [mode for mode in modes(model, coupling=coupling) if mode.unstable]
     except FtlmError:
@@ -558,6 +571,41 @@ def has_growing_mode(model: Model, coupling: str) -> bool:
         for mode in unstable
     ]
     return not ratios or any(not error or abs(part) > GROWTH_SIGMAS * error for part, error in ratios)
+
+
+def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
+    """Whether backward elimination of terms of outputs ends in a stable model that a Wald test does not reject.
+
+    Each elimination moves the remaining parameters to their conditional means, and the statistics add up to that of all
+    eliminated terms (Seber & Wild, Nonlinear Regression, section 5.3). For one term the level is that of a pole.
+    """
+    covariance = None if model.estimate is None else model.estimate.covariance
+    if covariance is None:
+        return False
+    matrix, values = np.asarray(covariance, dtype=np.float64), parameter_vector(model)
+    at, terms = 0, list[int]()
+    for item in model.equations:
+        terms += [at + 2 + 2 * k for k, t in enumerate(item.terms) if t.column in model.outputs]
+        at += 1 + 2 * len(item.terms)
+    variances, statistic = np.diagonal(matrix).copy(), 0.0
+    for eliminated in range(1, len(terms) + 1):
+        # A term whose variance is gone is fixed, or tied to one that is eliminated.
+        free = [i for i in terms if matrix[i, i] > MIN_VARIANCE_RATIO * variances[i]]
+        if not free:
+            return False
+        least = min(free, key=lambda i: values[i] ** 2 / matrix[i, i])
+        statistic += values[least] ** 2 / matrix[least, least]
+        if not statistic <= chi_squared(eliminated, 2.0 * (1.0 - GROWTH_LEVEL)):
+            return False
+        column = matrix[:, least] / matrix[least, least]
+        values, matrix = values - column * values[least], matrix - np.outer(column, matrix[least])
+        values[least], matrix[least], matrix[:, least] = 0.0, 0.0, 0.0
+        try:
+            if not with_parameter_vector(model, values).stability(coupling=coupling).unstable_poles > 0:
+                return True
+        except FtlmError:
+            return False
+    return False
 
 
 def unstable_poles_text(count: float) -> str:

@@ -37,6 +37,7 @@ from ftlm.utils.statistics import (
     SIGNIFICANCE_LEVEL,
     autoregression,
     chi_squared,
+    is_white,
     variance_inflation,
 )
 from ftlm.utils.validation import Floats
@@ -326,6 +327,11 @@ def has_colored_residuals(joint: JointFit) -> bool:
     """Whether residuals have the color of a structure or of a start that leaves something out."""
     inflation = (variance_inflation(drop_missing(series)) for series in _pooled_residuals(joint))
     return max(inflation) > START_SETTINGS.white_inflation
+
+
+def has_white_residuals(joint: JointFit) -> bool:
+    """Whether the residuals of every output are white; those that swing are not, and inflate no variance of a sum."""
+    return all(is_white(drop_missing(series)) for series in _pooled_residuals(joint))
 
 
 def _pooled_residuals(joint: JointFit) -> list[Floats]:
