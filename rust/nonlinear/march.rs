@@ -597,7 +597,10 @@ impl<'a> Pulse<'a> {
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
             let own: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
-            self.residual[a] = self.z[a] - self.fixed[a].unwrap_or(self.free[a] + own);
+            self.residual[a] = match self.fixed[a] {
+                Some(value) => self.z[a] - value,
+                None => self.z[a] - self.free[a] - own,
+            };
             norm = norm.hypot(self.residual[a]);
         }
         norm
