@@ -96,7 +96,7 @@ def frequency_chart(
 
 
 def bode_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineChart, LineChart]:
-    """Return gain and phase of a record and the model with its 95 % band; of an impedance |Z| over Hz."""
+    """Return gain and phase of a record and the model with its 95 % band; of an impedance the magnitude over Hz."""
     omega = curve_frequencies(record)
     response, wide, turned = model_curve(model, record, omega)
     phase = np.degrees(np.unwrap(np.angle(response)))

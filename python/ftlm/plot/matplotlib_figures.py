@@ -688,7 +688,7 @@ def response(
     Returns
     -------
     matplotlib.figure.Figure
-        Gain on the left, phase on the right, a row for every record; of an impedance |Z| and phase over Hz.
+        Gain on the left, phase on the right, a row for every record; of an impedance magnitude and phase over Hz.
 
     Raises
     ------
