@@ -85,3 +85,25 @@ pub(super) struct ForcingTerms {
     /// Initial output and velocity of each body with friction; empty if zero.
     pub(super) starts: Vec<(f64, f64)>,
 }
+
+/// Derivatives of a system with respect to one parameter.
+pub(super) struct Moves {
+    /// Derivatives of coefficient and integration order of each term of each equation, and of its friction.
+    pub(super) terms: Vec<Vec<(f64, f64)>>,
+    /// Derivatives of the forcing by initial terms.
+    pub(super) forcing: ForcingTerms,
+    /// Derivatives of fc, fs and vs of each friction.
+    pub(super) laws: Vec<[f64; 3]>,
+    /// Derivatives of recorded signals that are inputs.
+    pub(super) inputs: Vec<(usize, Vec<f64>)>,
+}
+
+/// Why a pulse has no solution.
+pub(super) enum Failure {
+    /// A value left the range of numbers.
+    Overflow,
+    /// A function has no value for this argument.
+    Domain(&'static str, f64),
+    /// No Newton iteration converges.
+    Newton(&'static str),
+}

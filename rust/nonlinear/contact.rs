@@ -4,8 +4,7 @@
 //! non-linear terms. A solution of the pulse at given friction gives P = V + G φ, which the non-linear terms change
 //! little within a pulse. The friction that belongs to P therefore converges in a few iterations.
 
-use super::channels::ForcingTerms;
-use super::march::{Failure, Moves, Pulse};
+use super::channels::{Failure, ForcingTerms, Moves};
 use crate::error::Result;
 use crate::friction::contact::{ContactLaw, VELOCITY_ROUNDING_RATIO};
 use crate::friction::law::{FrictionLaw, Pulse as FrictionPulse, PulseDerivatives};
@@ -17,6 +16,18 @@ const MAX_FRICTION_ITERATIONS: usize = 60;
 const FRICTION_ROUNDING_RATIO: f64 = 64.0 * f64::EPSILON;
 /// Largest error of a friction, relative to the velocities.
 const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
+
+/// Equations of a pulse at given friction.
+pub(super) trait PulseEquations {
+    /// Solve the equations for the state channels at these frictions.
+    fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), Failure>;
+
+    /// Value of a state channel.
+    fn channel(&mut self, state: usize) -> &mut f64;
+
+    /// Give a state channel a value; None lets the equations determine it.
+    fn fix(&mut self, state: usize, value: Option<f64>);
+}
 
 /// Bodies with friction.
 pub(super) struct Contact {
@@ -205,13 +216,13 @@ impl Motion<'_> {
     ///
     /// Within a pulse the force of another body changes while the mean of friction is constant, so that the mean output
     /// of a body at rest would creep with the square of the step. It is kept from pulse to pulse instead.
-    pub(super) fn solve(&mut self, pulse: &mut Pulse<'_>) -> std::result::Result<(), Failure> {
+    pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), Failure> {
         for (rests, (before, now)) in self.rests.iter_mut().zip(self.before.iter().zip(&self.now)) {
             *rests = before.1 && *now == 0.0;
         }
         loop {
             for (a, rests) in self.rests.iter().enumerate() {
-                pulse.fixed[self.contact.outputs[a]] = rests.then_some(self.before[a].0);
+                pulse.fix(self.contact.outputs[a], rests.then_some(self.before[a].0));
             }
             self.solve_friction(pulse)?;
             let mut is_done = true;
@@ -226,15 +237,15 @@ impl Motion<'_> {
         }
     }
 
-    fn solve_friction(&mut self, pulse: &mut Pulse<'_>) -> std::result::Result<(), Failure> {
+    fn solve_friction(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), Failure> {
         let (contact, n) = (self.contact, self.contact.count());
         let mut miss = f64::INFINITY;
         let mut size: f64 = 0.0;
         for _ in 0..MAX_FRICTION_ITERATIONS {
-            pulse.set_frictions(&self.forces);
-            pulse.solve()?;
+            pulse.solve_with(&self.forces)?;
             let through = |a: usize| (0..n).map(|b| contact.gains[a * n + b] * self.forces[b]).sum::<f64>();
-            let free: Vec<f64> = (0..n).map(|a| self.first[a] + pulse.z[contact.velocities[a]] + through(a)).collect();
+            let free: Vec<f64> =
+                (0..n).map(|a| self.first[a] + *pulse.channel(contact.velocities[a]) + through(a)).collect();
             contact.law.pulse(&self.now, &free, &self.rounding, &self.forces, &mut self.at);
             (miss, size) = (0.0, 0.0);
             for (a, (_, found)) in self.at.iter().enumerate() {
@@ -254,7 +265,7 @@ impl Motion<'_> {
             return Err(Failure::Newton("no friction agrees with its motion"));
         }
         for (a, (_, found)) in self.at.iter().enumerate() {
-            pulse.z[contact.velocities[a]] = found.end - self.first[a];
+            *pulse.channel(contact.velocities[a]) = found.end - self.first[a];
         }
         Ok(())
     }

@@ -6,8 +6,8 @@
 //! an unstable linear part loses no digits. The mean of a pulse enters its own equation; Newton iterations that start
 //! at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
 
-use super::channels::{ForcingTerms, IntegralKernel, StateChannel};
-use super::contact::{BodyMoves, Contact, PulseContact};
+use super::channels::{Failure, ForcingTerms, IntegralKernel, Moves, StateChannel};
+use super::contact::{BodyMoves, Contact, PulseContact, PulseEquations};
 use super::forcing::{channel_powers, Link};
 use crate::equation::{Equation, Term, ORDER_GRAIN};
 use crate::error::{Error, Result};
@@ -83,18 +83,6 @@ struct InputLane {
     kernel: usize,
     at: (usize, usize),
     signal: usize,
-}
-
-/// Derivatives of a system with respect to one parameter.
-pub(super) struct Moves {
-    /// Derivatives of coefficient and integration order of each term of each equation, and of its friction.
-    pub(super) terms: Vec<Vec<(f64, f64)>>,
-    /// Derivatives of the forcing by initial terms.
-    pub(super) forcing: ForcingTerms,
-    /// Derivatives of fc, fs and vs of each friction.
-    pub(super) laws: Vec<[f64; 3]>,
-    /// Derivatives of recorded signals that are inputs.
-    pub(super) inputs: Vec<(usize, Vec<f64>)>,
 }
 
 /// Operators of a system on a record.
@@ -514,14 +502,14 @@ fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
 }
 
 /// Newton iterations of one pulse.
-pub(super) struct Pulse<'a> {
+struct Pulse<'a> {
     operators: &'a Operators,
     system: &'a NonlinearSystem,
     free: Vec<f64>,
     /// Values of state channels that are given.
-    pub(super) fixed: Vec<Option<f64>>,
+    fixed: Vec<Option<f64>>,
     known: Vec<f64>,
-    pub(super) z: Vec<f64>,
+    z: Vec<f64>,
     /// Non-linear terms at z, then frictions; derivatives with respect to state channels, then to known channels.
     values: Vec<f64>,
     slopes: Vec<f64>,
@@ -558,12 +546,6 @@ impl<'a> Pulse<'a> {
             arguments: Vec::new(),
             work: Values::default(),
         }
-    }
-
-    /// Set the frictions of the pulse.
-    pub(super) fn set_frictions(&mut self, forces: &[f64]) {
-        let terms = self.operators.terms.len();
-        self.values[terms..].copy_from_slice(forces);
     }
 
     fn source(&self, index: usize) -> f64 {
@@ -642,7 +624,7 @@ impl<'a> Pulse<'a> {
     }
 
     /// Solve the pulse from the current z, with the present frictions.
-    pub(super) fn solve(&mut self) -> std::result::Result<(), Failure> {
+    fn solve(&mut self) -> std::result::Result<(), Failure> {
         let states = self.z.len();
         let mut norm = self.evaluate();
         if !norm.is_finite() && self.free.iter().all(|v| v.is_finite()) {
@@ -693,14 +675,20 @@ impl<'a> Pulse<'a> {
     }
 }
 
-/// Why a pulse has no solution.
-pub(super) enum Failure {
-    /// A value left the range of numbers.
-    Overflow,
-    /// A function has no value for this argument.
-    Domain(&'static str, f64),
-    /// No Newton iteration converges.
-    Newton(&'static str),
+impl PulseEquations for Pulse<'_> {
+    fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), Failure> {
+        let terms = self.operators.terms.len();
+        self.values[terms..].copy_from_slice(frictions);
+        self.solve()
+    }
+
+    fn channel(&mut self, state: usize) -> &mut f64 {
+        &mut self.z[state]
+    }
+
+    fn fix(&mut self, state: usize, value: Option<f64>) {
+        self.fixed[state] = value;
+    }
 }
 
 /// Size beyond which a value without a result is an overflow, not outside of a function's domain.

@@ -1,7 +1,7 @@
 //! Parameters of equations with non-linear terms: residuals of all experiments and their derivatives.
 
-use super::channels::ForcingTerms;
-use super::march::{refuse_beside, FreeRun, FrozenProducts, Moves, NonlinearSystem, Operators};
+use super::channels::{ForcingTerms, Moves};
+use super::march::{refuse_beside, FreeRun, FrozenProducts, NonlinearSystem, Operators};
 use crate::equation::{Equation, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::optimization::levenberg_marquardt::MinimizationSettings;
