@@ -52,10 +52,22 @@ impl ContactLaw {
         self.laws.len()
     }
 
+    /// Friction law of a body.
+    #[must_use]
+    pub fn law(&self, body: usize) -> &FrictionLaw {
+        &self.laws[body]
+    }
+
+    /// Velocity change of a body at the end of the pulse for a unit of force on another or on itself.
+    #[must_use]
+    pub fn gain(&self, body: usize, other: usize) -> f64 {
+        self.gains[body * self.count() + other]
+    }
+
     /// Velocity change at the end of the pulse for a unit of force on the same body.
     #[must_use]
     pub fn own(&self, body: usize) -> f64 {
-        self.gains[body * self.count() + body]
+        self.gain(body, body)
     }
 
     /// Breakaway force of a body.
@@ -66,7 +78,7 @@ impl ContactLaw {
 
     /// Velocity change of a body by the forces on the others.
     fn coupling_velocity(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
-        (0..self.count()).filter(|&b| b != body).map(|b| self.gains[body * self.count() + b] * forces(b)).sum()
+        (0..self.count()).filter(|&b| b != body).map(|b| self.gain(body, b) * forces(b)).sum()
     }
 
     /// Solve a pulse that starts at the velocities `v` and would end at `p` without friction.

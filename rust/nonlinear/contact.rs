@@ -31,20 +31,18 @@ pub(super) trait PulseEquations {
 
 /// Bodies with friction.
 pub(super) struct Contact {
-    laws: Vec<FrictionLaw>,
+    /// Friction laws, and decrease of the end velocities for a unit of each friction without the non-linear terms.
     law: ContactLaw,
     /// State channels of the output and of the end velocity of each body.
     outputs: Vec<usize>,
     velocities: Vec<usize>,
     /// Number of state channels.
     states: usize,
-    /// Decrease of the end velocities for a unit of friction, row by row.
-    gains: Vec<f64>,
     /// Inverse of the equations of the state channels without non-linear terms.
     inverse: Vec<f64>,
 }
 
-/// Motion and friction of a body in a pulse.
+/// ContactSolver and friction of a body in a pulse.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PulseContact {
     /// Velocity at the start.
@@ -66,8 +64,8 @@ pub(super) struct BodyMoves {
     laws: Vec<[f64; 3]>,
 }
 
-/// Bodies in motion.
-pub(super) struct Motion<'a> {
+/// Solution of the contacts of all bodies, pulse by pulse.
+pub(super) struct ContactSolver<'a> {
     contact: &'a Contact,
     /// Velocities at the start of the run.
     first: Vec<f64>,
@@ -104,14 +102,13 @@ impl Contact {
         let response = |a: usize, b: usize| -> f64 {
             (0..states).map(|s| -inverse[velocities[a] * states + s] * gains[s * count + count - n + b]).sum()
         };
-        let own: Vec<f64> = (0..n * n).map(|at| response(at / n, at % n)).collect();
-        let law = ContactLaw::new(laws.clone(), own.clone())?;
-        Ok(Self { laws, law, outputs, velocities, states, gains: own, inverse })
+        let law = ContactLaw::new(laws, (0..n * n).map(|at| response(at / n, at % n)).collect())?;
+        Ok(Self { law, outputs, velocities, states, inverse })
     }
 
     /// Number of bodies.
     pub(super) fn count(&self) -> usize {
-        self.laws.len()
+        self.law.count()
     }
 
     /// State channel of the output of each body, which is the index of its equation.
@@ -120,7 +117,7 @@ impl Contact {
     }
 
     /// Bodies at the start of a run.
-    pub(super) fn start(&self, forcing: &ForcingTerms) -> Motion<'_> {
+    pub(super) fn start(&self, forcing: &ForcingTerms) -> ContactSolver<'_> {
         let first: Vec<f64> = forcing.starts.iter().map(|start| start.1).collect();
         let before = forcing.starts.iter().map(|start| (start.0, true)).collect();
         let largest = |(body, start): (&usize, &f64)| {
@@ -129,7 +126,17 @@ impl Contact {
         let rounding = self.velocities.iter().zip(&first).map(largest).collect();
         let (now, forces) = (first.clone(), vec![0.0; self.count()]);
         let rests = vec![false; self.count()];
-        Motion { contact: self, first, now, before, rests, forces, rounding, at: Vec::new(), contacts: Vec::new() }
+        ContactSolver {
+            contact: self,
+            first,
+            now,
+            before,
+            rests,
+            forces,
+            rounding,
+            at: Vec::new(),
+            contacts: Vec::new(),
+        }
     }
 
     /// Derivatives of the bodies from those of the weights of sources, row by row.
@@ -175,9 +182,9 @@ impl Contact {
         let responses: Vec<Vec<f64>> = (0..n).map(response).collect();
         let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);
         for (a, &PulseContact { start, free, pulse, .. }) in at.iter().enumerate() {
-            let own = self.gains[a * n + a];
+            let own = self.law.own(a);
             let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
-            let rise = self.laws[a].slope(start, free, own, &pulse, &unit).0;
+            let rise = self.law.law(a).slope(start, free, own, &pulse, &unit).0;
             for b in 0..n {
                 let direct = if a == b { 1.0 - rise * own } else { 0.0 };
                 matrix[a * n + b] = direct - rise * responses[b][self.velocities[a]];
@@ -189,7 +196,7 @@ impl Contact {
                 first: moves.gains[a],
                 law: moves.laws[a],
             };
-            right[a] = self.laws[a].slope(start, free, own, &pulse, &moved).0;
+            right[a] = self.law.law(a).slope(start, free, own, &pulse, &moved).0;
         }
         let solution = small::inverse(&matrix, n)?;
         for b in 0..n {
@@ -211,7 +218,7 @@ impl Contact {
     }
 }
 
-impl Motion<'_> {
+impl ContactSolver<'_> {
     /// Solve a pulse for its state channels and frictions.
     ///
     /// Within a pulse the force of another body changes while the mean of friction is constant, so that the mean output
@@ -243,15 +250,15 @@ impl Motion<'_> {
         let mut size: f64 = 0.0;
         for _ in 0..MAX_FRICTION_ITERATIONS {
             pulse.solve_with(&self.forces)?;
-            let through = |a: usize| (0..n).map(|b| contact.gains[a * n + b] * self.forces[b]).sum::<f64>();
+            let through = |a: usize| (0..n).map(|b| contact.law.gain(a, b) * self.forces[b]).sum::<f64>();
             let free: Vec<f64> =
                 (0..n).map(|a| self.first[a] + *pulse.channel(contact.velocities[a]) + through(a)).collect();
             contact.law.pulse(&self.now, &free, &self.rounding, &self.forces, &mut self.at);
             (miss, size) = (0.0, 0.0);
             for (a, (_, found)) in self.at.iter().enumerate() {
-                let own = contact.gains[a * n + a];
+                let own = contact.law.own(a);
                 miss = f64::max(miss, (found.force - self.forces[a]).abs() * own);
-                size = size.max(self.now[a].abs() + free[a].abs() + contact.laws[a].breakaway() * own);
+                size = size.max(self.now[a].abs() + free[a].abs() + contact.law.breakaway(a) * own);
                 self.forces[a] = found.force;
             }
             if miss.is_nan() || self.at.iter().any(|(_, found)| found.end.is_nan()) {

@@ -97,8 +97,8 @@ impl OutputSimulation {
         Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
 
-    /// Simulation of equations with non-linear terms, which are terms of derived signals, and the friction of some. These are numbered after the
-    /// signals of the recording.
+    /// Simulation of equations with non-linear terms, and the friction of some of them. Non-linear terms are terms of
+    /// derived signals, which are numbered after the signals of the recording.
     ///
     /// # Errors
     /// As [`NonlinearSystem::check`]; [`Error::Structure`] for other outputs than the recording's own, for a term of an

@@ -514,10 +514,14 @@ def test_help_texts_are_short():
 def test_a_validation_run_has_its_own_window(tmp_path, small_run, saved):
     words = ["identify", saved, "--structure", FREE, "--method", "least-squares", "--order-grid", "alpha=1.6:1.6:0.1"]
     half = small_run.duration / 2
-    shown = run_command(*words, "--validation", saved, "--validation-window", f"0:{half}", "--json")
-    assert shown.exit_code == 0, shown.output
-    (checked,) = json.loads(shown.stdout)["validation"]["runs"]
-    assert checked["output_error"]["y"]["fit"] is not None
+    fits = []
+    for window in ([], ["--validation-window", f"0:{half}"]):
+        shown = run_command(*words, "--validation", saved, *window, "--json")
+        assert shown.exit_code == 0, shown.output
+        (checked,) = json.loads(shown.stdout)["validation"]["runs"]
+        fits.append(checked["output_error"]["y"]["fit"])
+    # The window is a part of the run, with a fit of its own.
+    assert abs(fits[0] - fits[1]) > 1e-6
     alone = run_command(*words, "--validation-window", "0:1")
     assert alone.exit_code == 2
     assert "--validation-window is a part of the run that --validation names" in alone.stderr

@@ -2,8 +2,8 @@
 //!
 //! With measured values a derived signal is one more input, and the order grids of linear equations give initial
 //! guesses, ranked by free runs of the non-linear equations. Derivatives of measured signals are taken of raw and of
-//! smoothed samples. If no guess reaches the noise, output-error fits of these linear equations and of those without
-//! the non-linear terms add guesses.
+//! smoothed samples. With friction, output-error fits of these equations are the guesses. Without friction such fits add
+//! guesses only if no other one reaches the noise, as do fits without the non-linear terms.
 
 use super::coarse_grid::coarse_sampling;
 use super::friction::{guess_at, run_friction_multistart, values_of};
@@ -11,7 +11,7 @@ use super::halving::{
     is_same_iterate, is_same_optimum, merge_duplicates, sort_by_cost, RungExecutor, FIRST_BUDGET_EVALUATIONS,
     MAX_FINAL_SURVIVORS, MIN_SURVIVORS, SECOND_BUDGET_EVALUATIONS,
 };
-use super::search::{none_if_invalid_model, MultistartContext, NOISE_FLOOR_FACTOR};
+use super::search::{none_if_invalid_model, run_multistart, MultistartContext, NOISE_FLOOR_FACTOR};
 use crate::error::Result;
 use crate::estimation::joint_fit::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
@@ -84,10 +84,11 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
     }
     if !is_at_noise(&reached) {
         let mut more = Vec::new();
-        for source in &sources {
+        // With friction these fits have already given the guesses.
+        for source in sources.iter().filter(|_| !structure.has_friction()) {
             let starts = course.starts.for_recordings(source);
             let own = MultistartContext { source, starts: starts.as_ref(), told: None, ..course };
-            let found = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
+            let found = none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default();
             more.extend(embed(free, &linear, &found)?);
         }
         if let Some(less) = without_nonlinear_terms(structure) {
