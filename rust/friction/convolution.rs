@@ -108,7 +108,7 @@ pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
 
 /// Integration order below which a signal has direct feedthrough to the velocity at an edge, as the mean of the
 /// neighboring pulses.
-pub(crate) const SEEN_AT_ONCE: f64 = 1e-6;
+pub(crate) const MAX_FEEDTHROUGH_ORDER: f64 = 1e-6;
 
 /// Signal integrated by the order of its term, or the derivative of that in the order.
 #[derive(Debug, Clone)]
@@ -130,7 +130,7 @@ pub(super) struct InputKernels {
 impl InputKernels {
     pub(super) fn new(eta: f64, m: usize, step: f64) -> Self {
         let output = kernel_and_slope(eta, m, step);
-        let at_once = eta - 1.0 <= SEEN_AT_ONCE;
+        let at_once = eta - 1.0 <= MAX_FEEDTHROUGH_ORDER;
         let edges = if at_once { kernel_and_slope(eta - 1.0, m, step) } else { edge_kernel(eta - 1.0, m, step) };
         Self { output: [output.0, output.1], edges: [edges.0, edges.1], at_once }
     }

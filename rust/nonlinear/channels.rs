@@ -2,7 +2,7 @@
 
 use crate::equation::ORDER_GRAIN;
 use crate::fractional::kernels::kernel_and_slope;
-use crate::friction::convolution::{edge_kernel, SEEN_AT_ONCE};
+use crate::friction::convolution::{edge_kernel, MAX_FEEDTHROUGH_ORDER};
 
 /// Channel of an output that the equations determine.
 #[derive(Debug, Clone, Copy)]
@@ -64,7 +64,7 @@ pub(super) struct IntegralKernel {
 impl IntegralKernel {
     /// Whether values at pulse ends are averages of neighboring means.
     pub(super) fn is_averaged(self) -> bool {
-        self.at_ends && self.order <= SEEN_AT_ONCE
+        self.at_ends && self.order <= MAX_FEEDTHROUGH_ORDER
     }
 
     /// Values and their derivatives in the order.
@@ -77,10 +77,10 @@ impl IntegralKernel {
     }
 }
 
-/// ForcingTerms by initial terms and inputs.
+/// Forcing of the state channels by initial terms and inputs.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ForcingTerms {
-    /// ForcingTerms of each state channel; empty if zero.
+    /// Forcing of each state channel; empty if zero.
     pub(super) channels: Vec<Vec<f64>>,
     /// Initial output and velocity of each body with friction; empty if zero.
     pub(super) starts: Vec<(f64, f64)>,
@@ -104,6 +104,8 @@ pub(super) enum Failure {
     Overflow,
     /// A function has no value for this argument.
     Domain(&'static str, f64),
+    /// No friction agrees with the motion.
+    Contact,
     /// No Newton iteration converges.
     Newton(&'static str),
 }

@@ -1,8 +1,7 @@
 //! Dry friction beside non-linear terms: friction of a pulse, and its derivatives.
 //!
-//! The end velocity of a body is V = P − G φ with its friction φ, G being the response within the pulse without the
-//! non-linear terms. A solution of the pulse at given friction gives P = V + G φ, which the non-linear terms change
-//! little within a pulse. The friction that belongs to P therefore converges in a few iterations.
+//! The end velocity of a body is V = P − G φ. P is the end velocity without the friction φ, G the linear response within
+//! the pulse. Non-linear terms change P little within a pulse, so that the iteration for φ converges in a few steps.
 
 use super::channels::{Failure, ForcingTerms, Moves};
 use crate::error::Result;
@@ -30,7 +29,7 @@ pub(super) trait PulseEquations {
 }
 
 /// Bodies with friction.
-pub(super) struct Contact {
+pub(super) struct ContactOperators {
     /// Friction laws, and decrease of the end velocities for a unit of each friction without the non-linear terms.
     law: ContactLaw,
     /// State channels of the output and of the end velocity of each body.
@@ -42,7 +41,7 @@ pub(super) struct Contact {
     inverse: Vec<f64>,
 }
 
-/// ContactSolver and friction of a body in a pulse.
+/// Motion and friction of one body in one pulse.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PulseContact {
     /// Velocity at the start.
@@ -66,24 +65,24 @@ pub(super) struct BodyMoves {
 
 /// Solution of the contacts of all bodies, pulse by pulse.
 pub(super) struct ContactSolver<'a> {
-    contact: &'a Contact,
+    contact: &'a ContactOperators,
     /// Velocities at the start of the run.
-    first: Vec<f64>,
+    initial_velocities: Vec<f64>,
     /// Velocities at the start of the pulse.
-    now: Vec<f64>,
+    velocities: Vec<f64>,
     /// Outputs of the last pulse, and whether each body rested in it.
-    before: Vec<(f64, bool)>,
+    last_outputs: Vec<(f64, bool)>,
     /// Whether each body rests in this pulse and in the one before.
-    rests: Vec<bool>,
+    is_resting: Vec<bool>,
     forces: Vec<f64>,
     rounding: Vec<f64>,
     at: Vec<(f64, FrictionPulse)>,
     contacts: Vec<PulseContact>,
 }
 
-impl Contact {
-    /// Bodies with these laws and state channels, of the output and of the end velocity of each; `gains` are the weights of the sources in each state channel within a
-    /// pulse, the frictions being the last sources.
+impl ContactOperators {
+    /// Bodies with these laws. `channels` are the state channels of the output and of the end velocity of each body.
+    /// `gains` are the weights of the sources in each state channel within a pulse; the frictions are the last sources.
     pub(super) fn new(
         laws: Vec<FrictionLaw>,
         channels: &[(usize, usize)],
@@ -116,22 +115,22 @@ impl Contact {
         &self.outputs
     }
 
-    /// Bodies at the start of a run.
+    /// Return the contact solver at the start of a run.
     pub(super) fn start(&self, forcing: &ForcingTerms) -> ContactSolver<'_> {
-        let first: Vec<f64> = forcing.starts.iter().map(|start| start.1).collect();
-        let before = forcing.starts.iter().map(|start| (start.0, true)).collect();
+        let initial_velocities: Vec<f64> = forcing.starts.iter().map(|start| start.1).collect();
+        let last_outputs = forcing.starts.iter().map(|start| (start.0, true)).collect();
         let largest = |(body, start): (&usize, &f64)| {
             VELOCITY_ROUNDING_RATIO * forcing.channels[*body].iter().fold(start.abs(), |most, v| most.max(v.abs()))
         };
-        let rounding = self.velocities.iter().zip(&first).map(largest).collect();
-        let (now, forces) = (first.clone(), vec![0.0; self.count()]);
-        let rests = vec![false; self.count()];
+        let rounding = self.velocities.iter().zip(&initial_velocities).map(largest).collect();
+        let (velocities, forces) = (initial_velocities.clone(), vec![0.0; self.count()]);
+        let is_resting = vec![false; self.count()];
         ContactSolver {
             contact: self,
-            first,
-            now,
-            before,
-            rests,
+            initial_velocities,
+            velocities,
+            last_outputs,
+            is_resting,
             forces,
             rounding,
             at: Vec::new(),
@@ -162,7 +161,7 @@ impl Contact {
     }
 
     /// Add the derivatives of the frictions of a pulse to those of the sources; update those of outputs and velocities.
-    pub(super) fn linear_pulse(
+    pub(super) fn add_friction_derivatives(
         &self,
         at: &[PulseContact],
         moves: &BodyMoves,
@@ -211,7 +210,7 @@ impl Contact {
     }
 
     /// Set the derivatives of the outputs of bodies at rest to those of the last pulse.
-    pub(super) fn keep_outputs(&self, at: &[PulseContact], motion: &[(f64, f64)], free: &mut [f64]) {
+    pub(super) fn fix_resting_outputs(&self, at: &[PulseContact], motion: &[(f64, f64)], free: &mut [f64]) {
         for (a, _) in at.iter().enumerate().filter(|(_, at)| at.rests) {
             free[self.outputs[a]] = motion[a].0;
         }
@@ -221,19 +220,19 @@ impl Contact {
 impl ContactSolver<'_> {
     /// Solve a pulse for its state channels and frictions.
     ///
-    /// Within a pulse the force of another body changes while the mean of friction is constant, so that the mean output
-    /// of a body at rest would creep with the square of the step. It is kept from pulse to pulse instead.
+    /// A constant friction cannot balance a force that varies within the pulse. The mean output of a resting body would
+    /// drift with the square of the step, so the solver fixes it.
     pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), Failure> {
-        for (rests, (before, now)) in self.rests.iter_mut().zip(self.before.iter().zip(&self.now)) {
+        for (rests, (before, now)) in self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities)) {
             *rests = before.1 && *now == 0.0;
         }
         loop {
-            for (a, rests) in self.rests.iter().enumerate() {
-                pulse.fix(self.contact.outputs[a], rests.then_some(self.before[a].0));
+            for (a, rests) in self.is_resting.iter().enumerate() {
+                pulse.fix(self.contact.outputs[a], rests.then_some(self.last_outputs[a].0));
             }
             self.solve_friction(pulse)?;
             let mut is_done = true;
-            for (rests, (_, found)) in self.rests.iter_mut().zip(&self.at) {
+            for (rests, (_, found)) in self.is_resting.iter_mut().zip(&self.at) {
                 if *rests && found.end != 0.0 {
                     (*rests, is_done) = (false, false);
                 }
@@ -251,17 +250,21 @@ impl ContactSolver<'_> {
         for _ in 0..MAX_FRICTION_ITERATIONS {
             pulse.solve_with(&self.forces)?;
             let through = |a: usize| (0..n).map(|b| contact.law.gain(a, b) * self.forces[b]).sum::<f64>();
-            let free: Vec<f64> =
-                (0..n).map(|a| self.first[a] + *pulse.channel(contact.velocities[a]) + through(a)).collect();
-            contact.law.pulse(&self.now, &free, &self.rounding, &self.forces, &mut self.at);
+            let free: Vec<f64> = (0..n)
+                .map(|a| self.initial_velocities[a] + *pulse.channel(contact.velocities[a]) + through(a))
+                .collect();
+            for (rounding, free) in self.rounding.iter_mut().zip(&free) {
+                *rounding = f64::max(*rounding, VELOCITY_ROUNDING_RATIO * free.abs());
+            }
+            contact.law.pulse(&self.velocities, &free, &self.rounding, &self.forces, &mut self.at);
             (miss, size) = (0.0, 0.0);
             for (a, (_, found)) in self.at.iter().enumerate() {
                 let own = contact.law.own(a);
                 miss = f64::max(miss, (found.force - self.forces[a]).abs() * own);
-                size = size.max(self.now[a].abs() + free[a].abs() + contact.law.breakaway(a) * own);
+                size = size.max(self.velocities[a].abs() + free[a].abs() + contact.law.breakaway(a) * own);
                 self.forces[a] = found.force;
             }
-            if miss.is_nan() || self.at.iter().any(|(_, found)| found.end.is_nan()) {
+            if self.at.iter().any(|(_, found)| found.end.is_nan()) {
                 return Err(Failure::Overflow);
             }
             if miss <= FRICTION_ROUNDING_RATIO * size {
@@ -269,10 +272,10 @@ impl ContactSolver<'_> {
             }
         }
         if miss > MAX_FRICTION_ERROR_RATIO * size {
-            return Err(Failure::Newton("no friction agrees with its motion"));
+            return Err(Failure::Contact);
         }
         for (a, (_, found)) in self.at.iter().enumerate() {
-            *pulse.channel(contact.velocities[a]) = found.end - self.first[a];
+            *pulse.channel(contact.velocities[a]) = found.end - self.initial_velocities[a];
         }
         Ok(())
     }
@@ -281,10 +284,10 @@ impl ContactSolver<'_> {
     pub(super) fn advance(&mut self, z: &[f64]) -> &[PulseContact] {
         self.contacts.clear();
         for (a, &(free, pulse)) in self.at.iter().enumerate() {
-            let start = self.now[a];
-            self.contacts.push(PulseContact { start, free, rests: self.rests[a], pulse });
-            self.before[a] = (z[self.contact.outputs[a]], start == 0.0 && pulse.end == 0.0);
-            self.now[a] = pulse.end;
+            let start = self.velocities[a];
+            self.contacts.push(PulseContact { start, free, rests: self.is_resting[a], pulse });
+            self.last_outputs[a] = (z[self.contact.outputs[a]], start == 0.0 && pulse.end == 0.0);
+            self.velocities[a] = pulse.end;
         }
         &self.contacts
     }

@@ -7,13 +7,13 @@
 //! at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
 
 use super::channels::{Failure, ForcingTerms, IntegralKernel, Moves, StateChannel};
-use super::contact::{BodyMoves, Contact, PulseContact, PulseEquations};
+use super::contact::{BodyMoves, ContactOperators, PulseContact, PulseEquations};
 use super::forcing::{channel_powers, Link};
 use crate::equation::{Equation, Term, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::expression::{DerivedSignal, Values};
 use crate::fractional::kernels::{kernel, MAX_EXCESS};
-use crate::friction::convolution::{average_neighbors, product, Heads, OnlineConvolution, SEEN_AT_ONCE};
+use crate::friction::convolution::{average_neighbors, product, Heads, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
 use crate::friction::initial_state::{means_of, InitialForcing};
 use crate::friction::{Body, FrictionLaw};
 use crate::linalg::small;
@@ -26,7 +26,7 @@ const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 const MAX_NEWTON_ITERATIONS: usize = 50;
 /// Halvings of a Newton step that does not reduce the residual.
 const MAX_STEP_HALVINGS: usize = 12;
-/// Newton step, relative to the channel, that ends the iteration. Convergence is quadratic, so the next one is below
+/// Newton step, relative to the terms of the channel, that ends the iteration. Convergence is quadratic, so the next one is below
 /// rounding, and the linearization before it is that of the solution to this relative error.
 const NEWTON_TOLERANCE: f64 = 1e-8;
 
@@ -104,7 +104,7 @@ pub(super) struct Operators {
     /// Whether an expression acts on its own channel without integration.
     algebraic: bool,
     /// Dry friction; None without.
-    contact: Option<Contact>,
+    contact: Option<ContactOperators>,
 }
 
 /// Free run with the linearization of every pulse.
@@ -169,8 +169,8 @@ impl NonlinearSystem {
             return Ok(());
         }
         Body { equations: self.equations.clone(), frictions: self.frictions.clone() }.check(signals)?;
-        for &(place, _) in &self.frictions {
-            let structure = &self.equations[place].structure;
+        for channel in self.state_channels().into_iter().filter(|channel| channel.is_at_ends()) {
+            let structure = &self.equations[channel.equation()].structure;
             let limit = structure.order - 1.0;
             let above = |term: &&Term| term.signal >= self.recorded && term.order > limit - MIN_INTEGRATION_ORDER;
             if let Some(term) = structure.terms.iter().find(above) {
@@ -198,6 +198,14 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(of).collect()
     }
 
+    /// Whether an output enters the end velocities of another one by its means, as an input does.
+    ///
+    /// That needs no end velocity of the output, which only bodies with friction have anyway.
+    fn enters_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
+        let has_friction = self.frictions.iter().any(|friction| friction.0 == output);
+        output != equation && !has_friction && integration > 1.0 + MAX_FEEDTHROUGH_ORDER
+    }
+
     /// State channels: the outputs, then the derivatives that expressions, friction and coupled terms need.
     fn state_channels(&self) -> Vec<StateChannel> {
         let mut states: Vec<StateChannel> =
@@ -217,13 +225,18 @@ impl NonlinearSystem {
             }
         }
         self.frictions.iter().for_each(|&(equation, _)| add(&mut states, StateChannel::EndVelocity { equation }));
-        // A derivative of an output has terms with the same derivative of the outputs coupled to it.
+        // A derivative of an output has terms with the same derivative of the outputs coupled to it, except for those that
+        // enter its end velocity by their means.
         let mut done = 0;
         while done < states.len() {
             let channel = states[done];
             for term in &self.equations[channel.equation()].structure.terms {
-                if let Some(l) = self.output_index(channel.equation(), term.signal) {
-                    add(&mut states, channel.with_equation(l));
+                let eta = self.equations[channel.equation()].structure.order - term.order;
+                match self.output_index(channel.equation(), term.signal) {
+                    Some(l) if !(channel.is_at_ends() && self.enters_by_means(channel.equation(), l, eta)) => {
+                        add(&mut states, channel.with_equation(l));
+                    }
+                    _ => {}
                 }
             }
             done += 1;
@@ -287,11 +300,16 @@ impl Operators {
                     if eta < if l == j { MIN_INTEGRATION_ORDER } else { MIN_INTEGRATION_ORDER - MAX_EXCESS } {
                         return Err(beyond());
                     }
-                    (find(channel.with_equation(l)), kernel_index(&mut integrals, eta, false))
+                    if at_ends && system.enters_by_means(j, l, eta) {
+                        let mean = StateChannel::Mean { equation: l, order: 0.0 };
+                        (find(mean), kernel_index(&mut integrals, eta - 1.0, true))
+                    } else {
+                        (find(channel.with_equation(l)), kernel_index(&mut integrals, eta, false))
+                    }
                 } else if let Some(q) = terms.iter().position(|t| (t.equation, t.term) == (j, k)) {
                     let driven = terms[q].places.iter().any(|place| matches!(place, Place::Known(_)));
                     let left = eta - rho;
-                    let least = if at_ends { SEEN_AT_ONCE } else { -ORDER_GRAIN };
+                    let least = if at_ends { MAX_FEEDTHROUGH_ORDER } else { -ORDER_GRAIN };
                     if left < least || (driven && eta < MIN_INTEGRATION_ORDER) {
                         return Err(beyond());
                     }
@@ -313,6 +331,9 @@ impl Operators {
                 }
             }
             if let Some(friction) = system.frictions.iter().position(|friction| friction.0 == j) {
+                if structure.order - rho < if at_ends { MAX_FEEDTHROUGH_ORDER } else { MIN_INTEGRATION_ORDER } {
+                    return Err(beyond());
+                }
                 let kernel = kernel_index(&mut integrals, structure.order - rho, at_ends);
                 let source = states.len() + terms.len() + friction;
                 add(&mut lanes, kernel, Contribution { source, at: (j, structure.terms.len()), weight: -1.0 });
@@ -332,7 +353,8 @@ impl Operators {
             find(StateChannel::EndVelocity { equation }).map(|velocity| (law, (equation, velocity)))
         });
         let (laws, channels): (Vec<FrictionLaw>, Vec<(usize, usize)>) = bodies.unzip();
-        let contact = if laws.is_empty() { None } else { Some(Contact::new(laws, &channels, &gains, states.len())?) };
+        let contact =
+            if laws.is_empty() { None } else { Some(ContactOperators::new(laws, &channels, &gains, states.len())?) };
         let outputs = system.equations.len();
         Ok(Self {
             m,
@@ -357,14 +379,22 @@ impl Operators {
 
     /// Number of non-linear terms and frictions.
     fn values(&self) -> usize {
-        self.terms.len() + self.contact.as_ref().map_or(0, Contact::count)
+        self.terms.len() + self.contact.as_ref().map_or(0, ContactOperators::count)
     }
 
-    /// ForcingTerms by initial terms, (exponent, coefficient) by equation.
-    pub(super) fn initial_forcing(&self, links: &[Vec<Link>], powers: &[Vec<(f64, f64)>]) -> Result<ForcingTerms> {
+    /// Forcing by initial terms, given as (exponent, coefficient) by equation.
+    pub(super) fn initial_forcing(&self, system: &NonlinearSystem, powers: &[Vec<(f64, f64)>]) -> Result<ForcingTerms> {
+        let links = &system.links();
         let mut out = ForcingTerms { channels: vec![vec![0.0; self.m]; self.states.len()], starts: Vec::new() };
         let at_ends = match &self.contact {
-            Some(_) => Some(InitialForcing::of(powers, links, self.m, self.step)?),
+            Some(_) => {
+                let of = |(i, row): (usize, &Vec<Link>)| {
+                    let by_means = |link: &&Link| !system.enters_by_means(i, link.output, link.integration);
+                    row.iter().filter(by_means).copied().collect()
+                };
+                let links: Vec<Vec<Link>> = links.iter().enumerate().map(of).collect();
+                Some(InitialForcing::of(powers, &links, self.m, self.step)?)
+            }
             None => None,
         };
         for (row, channel) in out.channels.iter_mut().zip(&self.states) {
@@ -451,6 +481,7 @@ impl Operators {
                     Failure::Overflow => (String::new(), true),
                     Failure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
                     // Integrals of short pulses are small, so that only growth within a pulse has no solution.
+                    Failure::Contact => ("no friction agrees with the motion".into(), false),
                     Failure::Newton(why) => (why.into(), !self.algebraic),
                 };
                 return (run, Some(End { index: k, why, is_overflow }));
@@ -516,6 +547,8 @@ struct Pulse<'a> {
     inverse: Vec<f64>,
     determinant: f64,
     residual: Vec<f64>,
+    /// Sums of the sizes of the terms of each state channel.
+    sizes: Vec<f64>,
     matrix: Vec<f64>,
     step: Vec<f64>,
     before: Vec<f64>,
@@ -539,6 +572,7 @@ impl<'a> Pulse<'a> {
             inverse: vec![0.0; states * states],
             determinant: 1.0,
             residual: vec![0.0; states],
+            sizes: vec![0.0; states],
             matrix: vec![0.0; states * states],
             step: vec![0.0; states],
             before: vec![0.0; states],
@@ -579,6 +613,8 @@ impl<'a> Pulse<'a> {
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
             let own: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
+            let sizes = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| (g * x).abs());
+            self.sizes[a] = sizes.sum::<f64>() + self.z[a].abs() + self.free[a].abs();
             self.residual[a] = match self.fixed[a] {
                 Some(value) => self.z[a] - value,
                 None => self.z[a] - self.free[a] - own,
@@ -643,7 +679,7 @@ impl<'a> Pulse<'a> {
             for a in 0..states {
                 let row = &self.inverse[a * states..(a + 1) * states];
                 self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
-                is_small &= self.step[a].abs() <= NEWTON_TOLERANCE * (self.z[a].abs() + self.free[a].abs());
+                is_small &= self.step[a].abs() <= NEWTON_TOLERANCE * self.sizes[a];
             }
             self.before.clone_from(&self.z);
             let (mut share, mut left) = (1.0, MAX_STEP_HALVINGS);
@@ -827,7 +863,7 @@ impl Operators {
         run: &FreeRun,
         forcing: &[Vec<f64>],
         known: &[(usize, Vec<f64>)],
-        bodies: Option<(&Contact, BodyMoves)>,
+        bodies: Option<(&ContactOperators, BodyMoves)>,
     ) -> Result<Vec<Vec<f64>>> {
         let (states, terms, values, count) = (self.states.len(), self.terms.len(), self.values(), self.sources());
         let width = states + self.known.len();
@@ -853,14 +889,18 @@ impl Operators {
                 }
             }
             if let Some((contact, motion, _)) = &bodies {
-                contact.keep_outputs(&run.contacts[k * contact.count()..(k + 1) * contact.count()], motion, &mut free);
+                contact.fix_resting_outputs(
+                    &run.contacts[k * contact.count()..(k + 1) * contact.count()],
+                    motion,
+                    &mut free,
+                );
             }
             for a in 0..states {
                 x[a] = (0..states).map(|b| inverse[a * states + b] * free[b]).sum();
             }
             if let Some((contact, motion, moves)) = &mut bodies {
                 let at = &run.contacts[k * contact.count()..(k + 1) * contact.count()];
-                contact.linear_pulse(at, moves, motion, (&self.gains, inverse), &mut x)?;
+                contact.add_friction_derivatives(at, moves, motion, (&self.gains, inverse), &mut x)?;
             }
             for q in 0..terms {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();

@@ -52,7 +52,7 @@ impl NonlinearSystem {
         check_length("initial terms", self.equations.len(), initial.len())?;
         let (powers, impulses) = split_impulses(initial);
         let operators = march::Operators::new(self, record)?;
-        let mut forcing = operators.initial_forcing(&self.links(), &powers)?;
+        let mut forcing = operators.initial_forcing(self, &powers)?;
         operators.add_inputs(self, record, &mut forcing);
         let (run, end) = operators.run(self, &forcing);
         if let Some(end) = end.filter(|end| !end.is_overflow) {

@@ -87,14 +87,14 @@ impl NonlinearModel {
         (State::all(&equations, &self.model.initial, &self.filtered, moves), equations)
     }
 
-    /// ForcingTerms by the initial states of a run.
+    /// Forcing by the initial states of a run.
     fn initial_forcing(
         &self,
         operators: &Operators,
         (orders, coefficients, values): (&[f64], &[f64], &[f64]),
     ) -> Result<ForcingTerms> {
         let (powers, _) = split_impulses(&self.powers(orders, coefficients, values));
-        operators.initial_forcing(&self.system(orders, coefficients, usize::MAX).links(), &powers)
+        operators.initial_forcing(&self.system(orders, coefficients, usize::MAX), &powers)
     }
 
     /// Derivatives of the system with respect to a parameter.

@@ -376,7 +376,10 @@ impl<'a> Grid<'a> {
                 Ok(motion) => Ok(motion.outputs),
                 // The inverse of an unstable body grows until motion and friction cancel in its products. Steps without
                 // the inverse lose no digits there.
-                Err(Error::Diverged { .. }) => self.simulation.system().run(&self.record, terms),
+                Err(error @ Error::Diverged { .. }) => match self.simulation.system().run(&self.record, terms) {
+                    Ok(outputs) if outputs.iter().flatten().all(|v| v.is_finite()) => Ok(outputs),
+                    _ => Err(error),
+                },
                 Err(error) => Err(error),
             };
         }

@@ -1,4 +1,4 @@
-"""The command line within the process of the tests, which spares each command a start of Python."""
+"""Run the command line in the process of the tests, which saves starting Python."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ftlm.cli.main import app
 
 
 def run_command(*words: str, cwd: Path | None = None, columns: int = 200) -> subprocess.CompletedProcess[str]:
-    """Run a command without colors; what it does not handle is raised."""
+    """Run a command without colors; unexpected exceptions are raised."""
     with contextlib.nullcontext() if cwd is None else contextlib.chdir(cwd):
         done = CliRunner().invoke(
             app, list(words), env={"NO_COLOR": "1", "COLUMNS": str(columns)}, catch_exceptions=False

@@ -203,6 +203,11 @@ JACOBIANS = {
         {"alpha": 1.8, "mu": 0.7, "a": -0.7, "k": -2.0, "k3": -3.0, "b": 6.0, "fc": 0.8},
         {},
     ),
+    "friction and actuator": (
+        "D^alpha y = k y + k3 y^3 + c w - fc*sign(D y); D^beta w = a w + e w^3 + b u",
+        {"alpha": 1.9, "beta": 0.95, "k": -2.0, "k3": -3.0, "c": 3.0, "fc": 0.5, "a": -1.5, "e": -0.5, "b": 5.0},
+        {"coupling": "simulated"},
+    ),
     "delay": (
         "D^alpha y = k y^3 + b u + e u*y",
         {"alpha": 1.2, "k": -2.0, "b": 3.0, "e": -0.3, "delay_u": 0.087},
@@ -301,6 +306,49 @@ def test_friction_beside_a_cubic_spring_is_that_of_small_steps():
     errors = [np.max(np.abs(y - euler_with_friction(u, 0.01, fine))) for fine in (20, 40)]
     assert errors[0] < 5e-3 * np.max(np.abs(y))
     assert errors[1] < 0.6 * errors[0]
+
+
+def euler_with_actuator(u, step, fine):
+    """Positions of D^2 y = -y - y^3 + w - 0.2 sign(D y) with D w = -w - w^3 + 3 u by small steps that stop at rest."""
+    y = v = w = 0.0
+    out = []
+    for level in u:
+        out.append((y, w))
+        for _ in range(fine):
+            force = w - y - y**3
+            w += step / fine * (3 * level - w - w**3)
+            if v == 0 and abs(force) <= 0.2:
+                continue
+            ahead = v + step / fine * (force - 0.2 * np.sign(v or force))
+            ahead = 0.0 if ahead * v < 0 else ahead
+            y, v = y + 0.5 * step / fine * (v + ahead), ahead
+    return np.array(out).T
+
+
+def test_a_nonlinear_actuator_moves_a_body_with_friction():
+    u = np.repeat([0.0, 2.0, -2.0, 1.0, 0.02], 200)
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * u, "w": 0 * u})
+    text = "D^2 y = -1 y - 1 y^3 + 1 w - 0.2*sign(D y); D w = -1 w - 1 w^3 + 3 u"
+    found = ftlm.Model(ftlm.equation(text, coupling="simulated")).simulate(run, tolerance=1e-5)
+    y, w = euler_with_actuator(u, 0.01, 40)
+    assert np.max(np.abs(found["y"] - y)) < 5e-3 * np.max(np.abs(y))
+    assert np.max(np.abs(found["w"] - w)) < 5e-3 * np.max(np.abs(w))
+    # A first-order actuator whose derivative drives the body would have to have an end velocity itself.
+    text = "D^2 y = -1 y - 1 y^3 + 1 D w - 0.2*sign(D y); D w = -1 w - 1 w^3 + 3 u"
+    refused = ftlm.Model(ftlm.equation(text, coupling="simulated"))
+    with pytest.raises(ftlm.ModelError, match="order of a non-linear term beside friction"):
+        refused.simulate(run)
+
+
+def test_a_linear_actuator_moves_a_body_with_friction_beside_a_vanishing_term():
+    u = np.repeat([2.0, -2.0, 1.0], 150)
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * u, "w": 0 * u})
+    found = []
+    for term in ("", " + 1e-300 y^3"):
+        text = f"D^2 y = -1 y{term} + 1 w - 0.2*sign(D y); D w = -1 w + 3 u"
+        model = ftlm.Model(ftlm.equation(text, coupling="simulated"))
+        found.append(model.simulate(run, tolerance=1e-5)["y"])
+    assert np.max(np.abs(found[0] - found[1])) < 2e-5 * np.max(np.abs(found[0]))
 
 
 @pytest.mark.parametrize("alpha", [2.0, 1.6])

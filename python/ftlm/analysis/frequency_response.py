@@ -312,7 +312,7 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
 
 
 def covariance_of(model: Model) -> Floats | None:
-    """Return the covariance of the numbers of :func:`parameter_vector`; None for a model without one."""
+    """Return the covariance of :func:`parameter_vector`; None if the model has none."""
     if model.estimate is None or model.estimate.covariance is None:
         return None
     return np.asarray(model.estimate.covariance, dtype=np.float64)

@@ -74,8 +74,8 @@ class Run:
         Nonuniform samples at their own times; None if the samples lie on the grid. The grid then holds interval means
         of held inputs and linear interpolation of all other signals.
     unmasked_run : Run or None
-        Run with the output samples that this one lacks for a validation on them; its first rows show the initial state
-        of both. None for a run without a mask, and for a run that is derived from one with a mask.
+        Original run before its outputs were masked; its first samples determine the initial state. None without a
+        mask; derived runs do not inherit it.
     """
 
     name: str

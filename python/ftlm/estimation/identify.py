@@ -182,8 +182,8 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
 def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
     """Return the fit with initial values of runs whose first rows look like rest, if the runs clearly refute it.
 
-    A few quiet rows do not distinguish slow motion from rest. White residuals do not refute rest. Residuals that swing
-    do if initial values leave white ones: those of a structure that leaves something out stay colored.
+    A few quiet rows do not distinguish slow motion from rest. White residuals do not refute rest. Oscillating
+    residuals refute it only if the fit with initial values has white residuals.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.offset == "none" and structure.is_linear

@@ -10,7 +10,7 @@ from statistics import NormalDist
 import numpy as np
 
 from ftlm import _core
-from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
+from ftlm.analysis.frequency_response import covariance_of, parameter_vector, with_parameter_vector
 from ftlm.analysis.poles import modes
 from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, interpolate_gaps
@@ -58,7 +58,7 @@ MIN_MOTION_RANGE_FRACTION = 1e-6
 #: Level at which growth is significant, one-sided: a pole grows if its real part exceeds 0 by so many standard errors.
 GROWTH_LEVEL = 0.99
 GROWTH_SIGMAS = NormalDist().inv_cdf(GROWTH_LEVEL)
-#: Smallest part of a variance that is left of a parameter which is not determined by eliminated ones.
+#: A parameter whose variance falls below this share is fixed by the eliminated ones.
 MIN_VARIANCE_RATIO = 1e-9
 #: Fewest intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
 MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
@@ -553,8 +553,8 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
 def has_growing_mode(model: Model, coupling: str) -> bool:
     """Whether an unstable mode is significant at 99 %; True where modes or their errors are not known.
 
-    The error of a pole is one of first order, which fails where poles meet, as those of a double integrator do. So a
-    mode is not significant either if the model is stable without terms that the data allow to leave out.
+    The standard error of a pole is a first-order approximation. It fails at multiple poles, such as those of a double
+    integrator. A mode is therefore not significant if the model is stable without its insignificant terms.
     """
     return _has_significant_growth(model, coupling) and not _is_stable_without_insignificant_terms(model, coupling)
 
@@ -579,10 +579,10 @@ def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
     Each elimination moves the remaining parameters to their conditional means, and the statistics add up to that of all
     eliminated terms (Seber & Wild, Nonlinear Regression, section 5.3). For one term the level is that of a pole.
     """
-    covariance = None if model.estimate is None else model.estimate.covariance
+    covariance = covariance_of(model)
     if covariance is None:
         return False
-    matrix, values = np.asarray(covariance, dtype=np.float64), parameter_vector(model)
+    matrix, values = covariance.copy(), parameter_vector(model)
     at, terms = 0, list[int]()
     for item in model.equations:
         terms += [at + 2 + 2 * k for k, t in enumerate(item.terms) if t.column in model.outputs]

@@ -330,7 +330,10 @@ def has_colored_residuals(joint: JointFit) -> bool:
 
 
 def has_white_residuals(joint: JointFit) -> bool:
-    """Whether the residuals of every output are white; those that swing are not, and inflate no variance of a sum."""
+    """Whether the residuals of every output are white.
+
+    Unlike :func:`has_colored_residuals`, this detects oscillation.
+    """
     return all(is_white(drop_missing(series)) for series in _pooled_residuals(joint))
 
 

@@ -85,7 +85,8 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
     if !is_at_noise(&reached) {
         let mut more = Vec::new();
         // With friction these fits have already given the guesses.
-        for source in sources.iter().filter(|_| !structure.has_friction()) {
+        let others = if structure.has_friction() { &[][..] } else { &sources };
+        for source in others {
             let starts = course.starts.for_recordings(source);
             let own = MultistartContext { source, starts: starts.as_ref(), told: None, ..course };
             let found = none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default();
