@@ -7,5 +7,4 @@ pub mod multi_innovation;
 pub mod optimization;
 pub mod output_error;
 pub mod resonance_scan;
-pub(crate) mod state_fit;
 pub mod streaming;

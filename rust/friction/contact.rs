@@ -12,8 +12,7 @@
 //! Stribeck friction falls with speed. In long pulses several combinations may then be consistent. The one found from
 //! the forces of the previous pulse is used.
 
-use super::convolution::{Heads, OnlineConvolution};
-use super::law::{FrictionLaw, Phase, Pulse, PulseDerivatives};
+use super::law::{FrictionLaw, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
@@ -27,6 +26,8 @@ pub struct ContactLaw {
 
 /// Most iterations for the frictions of a pulse. Two weakly coupled bodies need two.
 const MAX_FORCE_ITERATIONS: usize = 200;
+/// Rounding error relative to the largest velocity without friction. A force that equals friction moves nothing.
+pub(crate) const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
 /// Largest error of a solution, relative to the velocities.
 const FORCE_TOLERANCE_RATIO: f64 = 1e-9;
 
@@ -106,7 +107,8 @@ impl ContactLaw {
                 break;
             }
             let misses: Vec<f64> = at.iter().zip(&forces).map(|(x, f)| x.1.force - f).collect();
-            let newton = self.through(&self.rises(v, at), &misses);
+            let newton =
+                self.through(&(0..n).map(|a| self.rise(a, v[a], at[a].0, &at[a].1)).collect::<Vec<_>>(), &misses);
             let ahead: Vec<f64> = forces.iter().zip(&newton).map(|(f, s)| f + s).collect();
             let there: Vec<(f64, Pulse)> = (0..n).map(|a| of(a, &ahead)).collect();
             let left = wrong(&there, &ahead);
@@ -128,10 +130,11 @@ impl ContactLaw {
         }
     }
 
-    /// Derivative of each body's friction with respect to its end velocity without friction.
-    fn rises(&self, v: &[f64], at: &[(f64, Pulse)]) -> Vec<f64> {
+    /// Derivative of a body's friction with respect to its end velocity without friction.
+    #[must_use]
+    pub fn rise(&self, body: usize, velocity: f64, free: f64, pulse: &Pulse) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
-        (0..self.count()).map(|a| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, &unit).0).collect()
+        self.laws[body].slope(velocity, free, self.own(body), pulse, &unit).0
     }
 
     /// Solution of (1 + diag(rises) (G − diag G)) x = `vector`.
@@ -147,23 +150,6 @@ impl ContactLaw {
             Ok(inverse) => (0..n).map(|a| (0..n).map(|b| inverse[a * n + b] * vector[b]).sum()).collect(),
             // A P-matrix is never singular here. NaN in gives NaN out.
             Err(_) => vec![f64::NAN; n],
-        }
-    }
-
-    /// Derivatives of frictions and end velocities from those of each body without the forces on the others.
-    pub fn slope(&self, v: &[f64], at: &[(f64, Pulse)], moves: &[PulseDerivatives], out: &mut Vec<(f64, f64)>) {
-        let n = self.count();
-        let of = |a: usize, moves: &PulseDerivatives| self.laws[a].slope(v[a], at[a].0, self.own(a), &at[a].1, moves);
-        out.clear();
-        out.extend((0..n).map(|a| of(a, &moves[a])));
-        if n == 1 {
-            return;
-        }
-        let alone: Vec<f64> = out.iter().map(|x| x.0).collect();
-        let forces = self.through(&self.rises(v, at), &alone);
-        for (a, moved) in out.iter_mut().enumerate() {
-            *moved =
-                of(a, &PulseDerivatives { free: moves[a].free - self.coupling_velocity(a, |b| forces[b]), ..moves[a] });
         }
     }
 }
@@ -182,132 +168,4 @@ pub fn is_p_matrix(matrix: &[f64], n: usize) -> bool {
     let beside: Vec<f64> =
         (1..n).flat_map(|i| (1..n).map(move |j| matrix[i * n + j] - matrix[i * n] * matrix[j] / first)).collect();
     is_p_matrix(&without, n - 1) && is_p_matrix(&beside, n - 1)
-}
-
-/// Trajectory of a body with friction.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Trace {
-    /// Mean friction over each pulse, in the unit of D^α y, at most the breakaway force up to rounding.
-    pub force: Vec<f64>,
-    /// Velocity at the pulse edges, one more than there are pulses. Exactly 0 at rest.
-    pub edges: Vec<f64>,
-    /// State of the body in each pulse.
-    pub phases: Vec<Phase>,
-    /// Velocity at the end of each pulse without the body's friction in it.
-    free: Vec<f64>,
-}
-
-impl Trace {
-    /// Whether the body never moves.
-    #[must_use]
-    pub fn is_always_at_rest(&self) -> bool {
-        self.edges.iter().all(|v| *v == 0.0)
-    }
-}
-
-/// Solution of the contact problem over all pulses.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ContactSolution {
-    /// Trajectory of each body with friction.
-    pub bodies: Vec<Trace>,
-    contact_law: ContactLaw,
-}
-
-/// Rounding error relative to the largest velocity without friction. A force that equals friction moves nothing.
-pub(crate) const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
-
-impl ContactSolution {
-    /// Solve pulse by pulse from initial velocities.
-    ///
-    /// `linear` is L of each body at the ends of the pulses, `responses` are the responses g of the velocities (rows)
-    /// to forces.
-    #[must_use]
-    pub fn new(linear: &[Vec<f64>], responses: &[Vec<Heads>], contact_law: ContactLaw, start: &[f64]) -> Self {
-        let n = contact_law.count();
-        let m = linear.first().map_or(0, Vec::len);
-        let mut bodies: Vec<Trace> = (start.iter())
-            .map(|&v| {
-                let (force, phases, free) = (Vec::new(), Vec::with_capacity(m), Vec::with_capacity(m));
-                let mut edges = Vec::with_capacity(m + 1);
-                edges.push(v);
-                Trace { force, edges, phases, free }
-            })
-            .collect();
-        let rounding: Vec<f64> = linear
-            .iter()
-            .map(|row| VELOCITY_ROUNDING_RATIO * row.iter().fold(0.0_f64, |a, v| a.max(v.abs())))
-            .collect();
-        let mut pasts: Vec<Vec<OnlineConvolution>> =
-            responses.iter().map(|row| row.iter().map(OnlineConvolution::new).collect()).collect();
-        let (mut v, mut forces) = (start.to_vec(), vec![0.0; n]);
-        let (mut p, mut at) = (vec![0.0; n], Vec::with_capacity(n));
-        for k in 0..m {
-            for ((p, row), linear) in p.iter_mut().zip(&pasts).zip(linear) {
-                *p = linear[k] - row.iter().map(OnlineConvolution::past).sum::<f64>();
-            }
-            contact_law.pulse(&v, &p, &rounding, &forces, &mut at);
-            for (a, &(free, Pulse { force, end, phase })) in at.iter().enumerate() {
-                pasts.iter_mut().for_each(|row| row[a].push(force));
-                let body = &mut bodies[a];
-                body.free.push(free);
-                body.phases.push(phase);
-                body.edges.push(end);
-                (v[a], forces[a]) = (end, force);
-            }
-        }
-        if let Some(row) = pasts.into_iter().next() {
-            bodies.iter_mut().zip(row).for_each(|(body, past)| body.force = past.into_signal());
-        }
-        Self { bodies, contact_law }
-    }
-
-    /// Friction laws and gains of the bodies.
-    #[must_use]
-    pub fn contact_law(&self) -> &ContactLaw {
-        &self.contact_law
-    }
-
-    /// Derivatives of the frictions with respect to a parameter. None if all are zero.
-    ///
-    /// `moved` is the derivative of L − g ∗ φ of each body at the ends of the pulses for constant φ, `first` that of
-    /// its own g₀, `laws` those of its fc, fs and vs, `start` that of its initial velocity.
-    #[must_use]
-    pub fn slope(
-        &self,
-        moved: &[Vec<f64>],
-        responses: &[Vec<Heads>],
-        first: &[f64],
-        laws: &[[f64; 3]],
-        start: &[f64],
-    ) -> Option<Vec<Vec<f64>>> {
-        let n = self.bodies.len();
-        let m = moved.first().map_or(0, Vec::len);
-        let mut pasts: Vec<Vec<OnlineConvolution>> =
-            responses.iter().map(|row| row.iter().map(OnlineConvolution::new).collect()).collect();
-        let mut dv = start.to_vec();
-        let (mut v, mut at, mut moves) = (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
-        let mut slopes = Vec::with_capacity(n);
-        let mut any = false;
-        for k in 0..m {
-            v.clear();
-            at.clear();
-            moves.clear();
-            for (a, (body, moved)) in self.bodies.iter().zip(moved).enumerate() {
-                v.push(body.edges[k]);
-                let (force, end, phase) = (body.force[k], body.edges[k + 1], body.phases[k]);
-                at.push((body.free[k], Pulse { force, end, phase }));
-                let past: f64 = pasts[a].iter().map(OnlineConvolution::past).sum();
-                let free = moved[k] + first[a] * force - past;
-                moves.push(PulseDerivatives { start: dv[a], free, first: first[a], law: laws[a] });
-            }
-            self.contact_law.slope(&v, &at, &moves, &mut slopes);
-            for (a, &(force, end)) in slopes.iter().enumerate() {
-                dv[a] = end;
-                any |= force != 0.0;
-                pasts.iter_mut().for_each(|row| row[a].push(force));
-            }
-        }
-        let row = pasts.into_iter().next()?;
-        any.then(|| row.into_iter().map(OnlineConvolution::into_signal).collect())
-    }
 }

@@ -1,8 +1,8 @@
 //! Channels of equations with non-linear terms, their integral kernels and their forcing.
 
+use super::convolution::{edge_kernel, ConvolutionKernel, MAX_FEEDTHROUGH_ORDER};
 use crate::equation::ORDER_GRAIN;
 use crate::fractional::kernels::kernel_and_slope;
-use crate::friction::convolution::{edge_kernel, MAX_FEEDTHROUGH_ORDER};
 
 /// Channel of an output that the equations determine.
 #[derive(Debug, Clone, Copy)]
@@ -65,6 +65,11 @@ impl IntegralKernel {
     /// Whether values at pulse ends are averages of neighboring means.
     pub(super) fn is_averaged(self) -> bool {
         self.at_ends && self.order <= MAX_FEEDTHROUGH_ORDER
+    }
+
+    /// Kernel of its online convolution.
+    pub(super) fn kernel(self, m: usize, step: f64) -> ConvolutionKernel {
+        ConvolutionKernel::of_integral(self.order, self.values_and_slopes(m, step).0)
     }
 
     /// Values and their derivatives in the order.

@@ -1,4 +1,4 @@
-//! Dry friction beside non-linear terms: friction of a pulse, and its derivatives.
+//! Dry friction in a free run: friction of a pulse, and its derivatives.
 //!
 //! The end velocity of a body is V = P − G φ. P is the end velocity without the friction φ, G the linear response within
 //! the pulse. Non-linear terms change P little within a pulse, so that the iteration for φ converges in a few steps.
@@ -6,7 +6,7 @@
 use super::channels::{Failure, ForcingTerms, Moves};
 use crate::error::Result;
 use crate::friction::contact::{ContactLaw, VELOCITY_ROUNDING_RATIO};
-use crate::friction::law::{FrictionLaw, Pulse as FrictionPulse, PulseDerivatives};
+use crate::friction::law::{FrictionLaw, Phase, Pulse as FrictionPulse, PulseDerivatives};
 use crate::linalg::small;
 
 /// Iterations for the friction of a pulse. Three are usual.
@@ -39,6 +39,17 @@ pub(super) struct ContactOperators {
     states: usize,
     /// Inverse of the equations of the state channels without non-linear terms.
     inverse: Vec<f64>,
+}
+
+/// Motion of a body with friction in a free run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BodyMotion {
+    /// Mean friction over each pulse, in the unit of D^α y, at most the breakaway force up to rounding.
+    pub force: Vec<f64>,
+    /// Velocity at the pulse edges, one more than there are pulses. Exactly 0 at rest.
+    pub velocity: Vec<f64>,
+    /// State of the body in each pulse.
+    pub phases: Vec<Phase>,
 }
 
 /// Motion and friction of one body in one pulse.
@@ -115,6 +126,19 @@ impl ContactOperators {
         &self.outputs
     }
 
+    /// Motion of each body, from its contacts pulse after pulse.
+    pub(super) fn motions(&self, forcing: &ForcingTerms, contacts: &[PulseContact]) -> Vec<BodyMotion> {
+        let of = |(body, start): (usize, &(f64, f64))| {
+            let pulses = || contacts.iter().skip(body).step_by(self.count()).map(|contact| &contact.pulse);
+            BodyMotion {
+                force: pulses().map(|pulse| pulse.force).collect(),
+                velocity: std::iter::once(start.1).chain(pulses().map(|pulse| pulse.end)).collect(),
+                phases: pulses().map(|pulse| pulse.phase).collect(),
+            }
+        };
+        forcing.starts.iter().enumerate().map(of).collect()
+    }
+
     /// Return the contact solver at the start of a run.
     pub(super) fn start(&self, forcing: &ForcingTerms) -> ContactSolver<'_> {
         let initial_velocities: Vec<f64> = forcing.starts.iter().map(|start| start.1).collect();
@@ -182,8 +206,7 @@ impl ContactOperators {
         let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);
         for (a, &PulseContact { start, free, pulse, .. }) in at.iter().enumerate() {
             let own = self.law.own(a);
-            let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
-            let rise = self.law.law(a).slope(start, free, own, &pulse, &unit).0;
+            let rise = self.law.rise(a, start, free, &pulse);
             for b in 0..n {
                 let direct = if a == b { 1.0 - rise * own } else { 0.0 };
                 matrix[a * n + b] = direct - rise * responses[b][self.velocities[a]];

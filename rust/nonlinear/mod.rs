@@ -1,33 +1,48 @@
-//! Equations with non-linear terms: free run by Newton iterations pulse by pulse, sensitivities, output error.
+//! Equations with non-linear terms and dry friction: free run pulse by pulse, sensitivities, output error.
 //!
-//! D^α y = Σ c D^ν s + Σ k D^μ n, where n is an expression over signals and derivatives of them
-//! ([`DerivedSignal`](crate::expression::DerivedSignal)). Orders of the derivatives of outputs are at most α − μ. The
-//! scheme is of second order in the step, and implicit. Dry friction may act beside the expressions. Memory is a blocked online convolution with the
-//! kernels of fractional integrals alone.
+//! D^α y = Σ c D^ν s + Σ k D^μ n − F(Dy) sgn(Dy), where n is an expression over signals and derivatives of them
+//! ([`DerivedSignal`](crate::expression::DerivedSignal)) and F a [`FrictionLaw`](crate::friction::FrictionLaw). Orders of
+//! the derivatives of outputs are at most α − μ. The scheme is of second order in the step, and implicit: Newton
+//! iterations solve the non-linear terms of a pulse, the contact law its friction. Memory is an online convolution with
+//! the kernels of fractional integrals alone.
 
 mod channels;
 mod contact;
-mod forcing;
+pub mod convolution;
+mod fit;
+mod initial_state;
 mod march;
 mod model;
+mod system;
 
-pub(crate) use march::refuse_beside;
-pub use march::NonlinearSystem;
-pub use model::{fit, NonlinearModel};
+pub use contact::BodyMotion;
+pub use fit::{fit, Start, StateFit};
+pub use model::{filtered_outputs, FreeFrictionLaw, NonlinearModel};
+pub(crate) use system::refuse_beside;
+pub use system::NonlinearSystem;
 
 use crate::error::{check_length, Result};
 use crate::regressors::{add_impulses, split_impulses, Record};
 
+/// Free run of a system.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FreeRun {
+    /// Pulse means of each output.
+    pub outputs: Vec<Vec<f64>>,
+    /// Motion of each body with friction.
+    pub bodies: Vec<BodyMotion>,
+}
+
 impl NonlinearSystem {
-    /// Pulse means of each output in a free run with initial terms, (exponent, coefficient) pairs of powers of t by
-    /// equation; NaN from the pulse on at which the run leaves the range of numbers. O(d m log² m) for d convolutions.
+    /// Free run with initial terms, (exponent, coefficient) pairs of powers of t by equation. Outputs are NaN from the
+    /// pulse on at which the run leaves the range of numbers. O(d m log² m) for d convolutions; O(d m) for whole orders.
     ///
-    /// The exponents −1, −2, … are an impulse and its derivatives in the output alone, as for
-    /// [`Body::run`](crate::friction::Body::run).
+    /// The exponents −1, −2, … are an impulse and its derivatives in the output alone, which move nothing.
+    /// After the filter of an output they become its initial transient.
     ///
     /// # Errors
-    /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution, although the run is finite; as
-    /// [`NonlinearSystem::check`].
+    /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution, although the run is finite;
+    /// [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction on this grid; as [`NonlinearSystem::check`].
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -43,11 +58,29 @@ impl NonlinearSystem {
     /// let frictions = Vec::new();
     /// let system = NonlinearSystem { equations: vec![equation], derived, recorded: 2, coupled: true, frictions };
     /// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 200], vec![1.0; 200]]), None)?;
-    /// let y = &system.run(&run, &[vec![]])?[0];
+    /// let y = &system.run(&run, &[vec![]])?.outputs[0];
     /// assert!((0.5 * (y[99] + y[100]) - 1.0_f64.tanh()).abs() < 1e-4);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
+    ///
+    /// ```
+    /// # use ftlm::signal::block_pulse::PulseMeans;
+    /// use ftlm::equation::{Equation, Structure, Term};
+    /// use ftlm::friction::FrictionLaw;
+    /// use ftlm::nonlinear::NonlinearSystem;
+    /// use ftlm::regressors::Record;
+    /// // A block slides at 1 m/s with friction of 2 m/s²: it stops after half a second and 0.25 m.
+    /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
+    /// let frictions = vec![(0, FrictionLaw::coulomb(2.0))];
+    /// let block = NonlinearSystem::linear(vec![Equation::new(structure, vec![1.0])?], frictions, 2);
+    /// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 100], vec![0.0; 100]]), None)?;
+    /// let motion = block.run(&run, &[vec![(1.0, 1.0)]])?;
+    /// let velocity = &motion.bodies[0].velocity;
+    /// assert!((velocity[25] - 0.5).abs() < 1e-12 && velocity[50..].iter().all(|v| v.abs() < 1e-12));
+    /// assert!((motion.outputs[0][99] - 0.25).abs() < 1e-9);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<FreeRun> {
         self.check()?;
         check_length("initial terms", self.equations.len(), initial.len())?;
         let (powers, impulses) = split_impulses(initial);
@@ -58,10 +91,11 @@ impl NonlinearSystem {
         if let Some(end) = end.filter(|end| !end.is_overflow) {
             return Err(end.error(record.step()));
         }
+        let bodies = operators.body_motions(&forcing, &run);
         let mut outputs = run.sources;
         outputs.truncate(self.equations.len());
         outputs.iter_mut().for_each(|row| row.resize(record.m(), f64::NAN));
         add_impulses(&mut outputs, &impulses, record.step());
-        Ok(outputs)
+        Ok(FreeRun { outputs, bodies })
     }
 }

@@ -1,20 +1,64 @@
 //! Parameters of equations with non-linear terms: residuals of all experiments and their derivatives.
 
 use super::channels::{ForcingTerms, Moves};
-use super::march::{refuse_beside, FreeRun, FrozenProducts, NonlinearSystem, Operators};
-use crate::equation::{Equation, Structure, Term};
-use crate::error::{check_length, Error, Result};
-use crate::estimation::optimization::levenberg_marquardt::MinimizationSettings;
-use crate::estimation::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, FreeModel};
-use crate::estimation::state_fit::{self, Evaluation, Parameter, Point, Start, StateFit, StateModel};
+use super::initial_state::{merge_powers, State};
+use super::march::{FrozenProducts, LinearizedRun, Operators};
+use super::system::{refuse_beside, NonlinearSystem};
+use crate::equation::Equation;
+use crate::error::{Error, Result};
+use crate::estimation::output_error::{Experiment, FreeModel, Monomial};
 use crate::expression::DerivedSignal;
-use crate::friction::initial_state::{merge_powers, State};
-use crate::friction::model::state_guesses;
-use crate::friction::FreeFrictionLaw;
+use crate::friction::FrictionLaw;
 use crate::parallel::Stop;
 use crate::regressors::{add_impulses, split_impulses, Record};
 
-/// Model with free parameters and non-linear terms.
+/// Friction law with free parameters, each a multiple of one coefficient.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FreeFrictionLaw {
+    /// fc.
+    pub coulomb: Monomial,
+    /// fs.
+    pub stribeck: Monomial,
+    /// vs.
+    pub speed: Monomial,
+}
+
+impl FreeFrictionLaw {
+    /// Friction that does not depend on speed.
+    #[must_use]
+    pub fn coulomb(coulomb: Monomial) -> Self {
+        let known = |factor: f64| Monomial { factor, powers: Vec::new() };
+        Self { coulomb, stribeck: known(0.0), speed: known(1.0) }
+    }
+
+    fn numbers(&self) -> [&Monomial; 3] {
+        [&self.coulomb, &self.stribeck, &self.speed]
+    }
+
+    /// Law at these coefficients.
+    pub(super) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
+        let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
+        FrictionLaw { coulomb, stribeck, speed }
+    }
+
+    /// Derivatives of fc, fs and vs with respect to a coefficient.
+    pub(super) fn slope(&self, coefficients: &[f64], coefficient: usize) -> [f64; 3] {
+        self.numbers().map(|number| number.slope(coefficients, coefficient))
+    }
+
+    /// Whether a coefficient is a force of this law, which must not be negative.
+    pub(super) fn is_force(&self, coefficient: usize) -> bool {
+        [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
+    }
+}
+
+/// Outputs that pass a filter before the comparison.
+#[must_use]
+pub fn filtered_outputs(experiments: &[Experiment]) -> Vec<bool> {
+    experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
+}
+
+/// Model with free parameters: equations with non-linear terms, some with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonlinearModel {
     /// Equations over recorded signals and, after these, derived ones.
@@ -30,46 +74,79 @@ pub struct NonlinearModel {
 /// Step of central differences of initial terms, which are smooth in orders and at most quadratic in coefficients.
 const DIFFERENCE_STEP: f64 = 1e-5;
 
-/// Least-squares fit with weights of the output error from an initial guess.
-///
-/// # Errors
-/// An initial guess whose simulation ends ([`Error::Diverged`], [`Error::NoSolution`]), an inconsistent model or
-/// experiments that do not fit it; [`Error::Interrupted`].
-pub fn fit(
-    model: &NonlinearModel,
-    experiments: &[Experiment],
-    start: &Start,
-    settings: MinimizationSettings,
-    stop: &Stop,
-) -> Result<StateFit> {
-    state_fit::fit(model, experiments, start, settings, stop)
+/// Samples for the initial velocity of a run.
+const FIRST_SAMPLES: usize = 8;
+
+/// Constant forces tried as initial guesses, relative to each friction. The rest position depends on the sign of the
+/// net force, which a local optimization does not change.
+const INITIAL_FORCE_RATIOS: [f64; 2] = [0.5, -0.5];
+
+/// Values of all free parameters.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Point {
+    pub(super) orders: Vec<f64>,
+    pub(super) coefficients: Vec<f64>,
+    /// Free parameters of inputs.
+    pub(super) inputs: Vec<f64>,
+    /// Initial states of each run.
+    pub(super) states: Vec<Vec<f64>>,
+}
+
+/// Residuals at a point, with intermediate results of each experiment for their derivatives.
+pub(super) struct Evaluation {
+    pub(super) residuals: Vec<f64>,
+    pub(super) size: f64,
+    pub(super) parts: Vec<Part>,
+}
+
+impl Evaluation {
+    /// Evaluation before any experiment.
+    pub(super) fn empty() -> Self {
+        Self { residuals: Vec::new(), size: 0.0, parts: Vec::new() }
+    }
+}
+
+/// Parameter of a derivative.
+pub(super) enum Parameter {
+    /// Free order, free coefficient, or state of one run.
+    Order(usize),
+    Coefficient(usize),
+    State(usize, usize),
+    /// Free parameter of an input.
+    Input(usize),
+}
+
+impl Parameter {
+    /// Parameters at a point: orders, coefficients and inputs if `numbers`, then the states of run after run.
+    pub(super) fn all(point: &Point, numbers: bool) -> Vec<Self> {
+        let mut all = Vec::new();
+        if numbers {
+            all.extend((0..point.orders.len()).map(Self::Order));
+            all.extend((0..point.coefficients.len()).map(Self::Coefficient));
+            all.extend((0..point.inputs.len()).map(Self::Input));
+        }
+        let states = point.states.iter().enumerate();
+        all.extend(states.flat_map(|(run, states)| (0..states.len()).map(move |state| Self::State(run, state))));
+        all
+    }
 }
 
 /// Intermediate results of an experiment.
-pub(crate) struct Part {
+pub(super) struct Part {
     system: NonlinearSystem,
     record: Option<Record>,
     operators: Operators,
-    run: FreeRun,
+    run: LinearizedRun,
     /// Derivatives of the means of each input with respect to its free parameter.
     input_slopes: Vec<Vec<f64>>,
 }
 
 impl NonlinearModel {
     fn system(&self, orders: &[f64], coefficients: &[f64], recorded: usize) -> NonlinearSystem {
-        let at = |law: &crate::equation::AffineOrder| {
-            law.constant + law.weights.iter().zip(orders).map(|(w, x)| w * x).sum::<f64>()
-        };
-        let of = |equation: &FreeEquation| Equation {
-            structure: Structure {
-                output: equation.output,
-                order: at(&equation.order),
-                terms: equation.terms.iter().map(|(s, o, _)| Term { signal: *s, order: at(o) }).collect(),
-            },
-            coefficients: equation.terms.iter().map(|t| t.2.at(coefficients)).collect(),
-        };
+        let terms = |k: usize| self.model.equations[k].terms.iter().map(|term| term.2.at(coefficients)).collect();
+        let structures = self.model.structures(orders).into_iter().enumerate();
         NonlinearSystem {
-            equations: self.model.equations.iter().map(of).collect(),
+            equations: structures.map(|(k, structure)| Equation { structure, coefficients: terms(k) }).collect(),
             derived: self.derived.clone(),
             recorded,
             coupled: self.model.coupled || !self.frictions.is_empty(),
@@ -182,45 +259,30 @@ impl NonlinearModel {
     }
 }
 
-impl StateModel for NonlinearModel {
-    type Part = Part;
-
-    fn order_bounds(&self) -> &[(f64, f64)] {
-        &self.model.order_bounds
-    }
-
-    fn coordinates(&self) -> &[Coordinate] {
-        &self.model.coordinates
-    }
-
-    fn inputs(&self) -> &[FreeInput] {
-        &self.model.inputs
-    }
-
-    /// Friction forces are not negative.
-    fn is_nonnegative(&self, coefficient: usize) -> bool {
-        self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
-    }
-
-    /// Times at which a body stops or reverses move from pulse to pulse with any parameter.
-    fn has_kinks(&self) -> bool {
-        !self.frictions.is_empty()
-    }
-
-    fn check(&self, experiments: &[Experiment]) -> Result<()> {
+impl NonlinearModel {
+    /// Return an error for an inconsistent model, or for experiments that do not fit it.
+    ///
+    /// # Errors
+    /// [`Error::Structure`], [`Error::Length`]; as [`FreeModel::check`].
+    pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
+        let refuse = |what: &str, remedy: &str| Err(Error::Structure { what: what.into(), remedy: remedy.into() });
         let Some(recorded) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
         };
-        let signals = recorded + self.derived.len();
-        let missing = |e: &FreeEquation| e.output >= recorded || e.terms.iter().any(|t| t.0 >= signals);
-        let lost = self.derived.iter().flat_map(|d| &d.channels).any(|(signal, _)| *signal >= recorded);
-        if lost || self.model.equations.iter().any(missing) {
-            let what = "an equation names a signal that is not there".to_owned();
-            return Err(Error::Structure { what, remedy: "number them from 0".into() });
+        if self.derived.iter().flat_map(|d| &d.channels).any(|(signal, _)| *signal >= recorded) {
+            return refuse("an expression names a signal that is not there", "number them from 0");
+        }
+        self.model.check_structure(recorded, self.derived.len())?;
+        if self.frictions.iter().any(|friction| friction.0 >= self.model.equations.len()) {
+            return refuse("friction stands in an equation that is not there", "number them from 0");
+        }
+        let known = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.model.coordinates.len());
+        let mut numbers = self.frictions.iter().flat_map(|(_, law)| law.numbers());
+        if numbers.any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
+            return refuse("friction is no multiple of one free coefficient", "give it one that is not negative");
         }
         for experiment in experiments {
-            experiment.check()?;
-            check_length("outputs", self.model.equations.len(), experiment.samples.len())?;
+            self.model.check_experiment(experiment)?;
             if experiment.nonuniform.is_some() {
                 return Err(refuse_beside("samples at times of their own", "resample the runs"));
             }
@@ -232,21 +294,36 @@ impl StateModel for NonlinearModel {
         self.model.initial.check()
     }
 
-    fn check_orders(&self, orders: &[f64]) -> Result<()> {
+    /// Whether a coefficient must not be negative: friction forces.
+    pub(super) fn is_nonnegative(&self, coefficient: usize) -> bool {
+        self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
+    }
+
+    /// Whether the cost has kinks, so that its gradient need not vanish at a minimum: times at which a body stops or
+    /// reverses move from pulse to pulse with any parameter.
+    pub(super) fn has_kinks(&self) -> bool {
+        !self.frictions.is_empty()
+    }
+
+    /// Return an error for invalid free orders.
+    pub(super) fn check_orders(&self, orders: &[f64]) -> Result<()> {
         let system = self.system(orders, &vec![0.0; self.model.coordinates.len()], usize::MAX);
         system.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
     }
 
-    fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
+    /// Initial guesses of the states of a run from its first samples; the first has the length of all.
+    pub(super) fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
         let frictions = self.system(orders, coefficients, usize::MAX).frictions;
         state_guesses(&self.states(orders), &frictions, experiment)
     }
 
-    fn state_count(&self, orders: &[f64]) -> usize {
+    /// Number of states of each run.
+    pub(super) fn state_count(&self, orders: &[f64]) -> usize {
         self.states(orders).0.len()
     }
 
-    fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
+    /// Initial terms of a run's states by equation: (exponent, coefficient).
+    pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
         let system = self.system(orders, coefficients, usize::MAX);
         let links = system.links();
         let (states, _) = self.states(orders);
@@ -256,7 +333,8 @@ impl StateModel for NonlinearModel {
         merge_powers(system.equations.len(), parts)
     }
 
-    fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation<Part>> {
+    /// Residuals at a point.
+    pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation> {
         let mut out = Evaluation::empty();
         for (experiment, values) in experiments.iter().zip(&point.states) {
             stop.check()?;
@@ -289,11 +367,12 @@ impl StateModel for NonlinearModel {
         Ok(out)
     }
 
-    fn jacobian(
+    /// Derivatives of the residuals with respect to [`Parameter::all`].
+    pub(super) fn jacobian(
         &self,
         experiments: &[Experiment],
         point: &Point,
-        at: &Evaluation<Part>,
+        at: &Evaluation,
         numbers: bool,
         stop: &Stop,
     ) -> Result<Vec<Vec<f64>>> {
@@ -334,4 +413,52 @@ impl StateModel for NonlinearModel {
         }
         Ok(columns)
     }
+}
+
+/// Guesses of the initial states from the first samples of a run: positions and velocities of the outputs, with several
+/// constant forces within the frictions, all other states 0.
+fn state_guesses(
+    (states, equations): &(Vec<State>, Vec<Equation>),
+    frictions: &[(usize, FrictionLaw)],
+    experiment: &Experiment,
+) -> Vec<Vec<f64>> {
+    let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
+    let with_force = |body: usize, force: f64| -> Vec<f64> {
+        let value = |state: &State| match *state {
+            State::Level(i) => begun[i].0,
+            State::Rate(i) => begun[i].1,
+            State::Offset(i, 0) if i == body => force / libm::tgamma(equations[i].structure.order + 1.0),
+            _ => 0.0,
+        };
+        states.iter().map(value).collect()
+    };
+    let mut guesses = vec![with_force(0, 0.0)];
+    for ratio in INITIAL_FORCE_RATIOS {
+        for &(body, law) in frictions {
+            let guess = with_force(body, ratio * law.breakaway());
+            if guess != guesses[0] {
+                guesses.push(guess);
+            }
+        }
+    }
+    guesses
+}
+
+/// Initial position and velocity of an output from its first samples.
+fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
+    let near = &samples[..samples.len().min(FIRST_SAMPLES)];
+    #[allow(clippy::cast_precision_loss)]
+    let (count, step) = (near.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);
+    let middle = 0.5 * (count - 1.0);
+    let mean = near.iter().sum::<f64>() / count.max(1.0);
+    #[allow(clippy::cast_precision_loss)]
+    let (mut across, mut along) = (0.0, 0.0);
+    for (k, value) in near.iter().enumerate() {
+        #[allow(clippy::cast_precision_loss)]
+        let x = k as f64 - middle;
+        across += x * (value - mean);
+        along += x * x;
+    }
+    let rate = if along > 0.0 { across / along / step } else { 0.0 };
+    (mean - rate * middle * step, rate)
 }

@@ -9,9 +9,9 @@ use crate::error::{check_length, Error, Result};
 use crate::estimation::output_error::{FreeEquation, FreeModel, MinimizationSettings, Monomial};
 use crate::expression::DerivedSignal;
 use crate::fractional::kernels::first_coefficient;
-use crate::friction::{self, Body, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
+use crate::friction::FrictionLaw;
 use crate::linalg::small;
-use crate::nonlinear::{self, NonlinearModel, NonlinearSystem};
+use crate::nonlinear::{self, FreeFrictionLaw, NonlinearModel, NonlinearSystem, Start};
 use crate::parallel::Stop;
 use crate::recording::{Recording, Role, Sampling};
 use crate::regressors::Record;
@@ -184,7 +184,7 @@ impl OutputSimulation {
     /// start of the run.
     ///
     /// # Errors
-    /// As [`Recording::experiment`] and [`friction::fit_until`].
+    /// As [`Recording::experiment`] and [`nonlinear::fit`].
     ///
     /// ```
     /// use ftlm::equation::{Equation, Initial, Structure, Term};
@@ -225,25 +225,25 @@ impl OutputSimulation {
             speed: known(law.speed),
         };
         let (equations, filtered) =
-            (self.equations.iter().map(fixed).collect(), friction::filtered_outputs(&experiments));
-        let (order_bounds, coordinates, inputs) = (Vec::new(), Vec::new(), Vec::new());
+            (self.equations.iter().map(fixed).collect(), nonlinear::filtered_outputs(&experiments));
         let frictions = self.frictions.iter().map(|(place, friction)| (*place, law(*friction))).collect();
-        let found = if self.derived.is_empty() {
-            let model = FrictionModel { equations, frictions, inputs, order_bounds, coordinates, initial, filtered };
-            friction::fit_until(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?
-        } else {
-            let coupled = self.recording.is_coupled;
-            let model = FreeModel { equations, order_bounds, coordinates, inputs, coupled, initial };
-            let model = NonlinearModel { model, derived: self.derived.clone(), frictions, filtered };
-            nonlinear::fit(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?
+        let model = FreeModel {
+            equations,
+            order_bounds: Vec::new(),
+            coordinates: Vec::new(),
+            inputs: Vec::new(),
+            coupled: self.recording.is_coupled,
+            initial,
         };
+        let model = NonlinearModel { model, derived: self.derived.clone(), frictions, filtered };
+        let found = nonlinear::fit(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?;
         Ok(found.initial.into_iter().flatten().collect())
     }
 
     /// Samples on a grid of `every` pulses per sampling interval; not finite if the model diverges there.
     ///
     /// # Errors
-    /// As [`Recording::pulses`], [`simulate::respond`], [`Body::run`].
+    /// As [`Recording::pulses`], [`simulate::respond`], [`NonlinearSystem::run`].
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};
@@ -366,22 +366,9 @@ impl<'a> Grid<'a> {
 
     /// Pulse means of the outputs before the sensor filter.
     fn respond(&self, terms: &Terms) -> Result<Rows> {
-        let OutputSimulation { recording, equations, frictions, .. } = self.simulation;
-        if !self.simulation.derived.is_empty() {
-            return self.simulation.system().run(&self.record, terms);
-        }
-        if !frictions.is_empty() {
-            let body = Body { equations: equations.clone(), frictions: frictions.clone() };
-            return match body.run(&self.record, terms) {
-                Ok(motion) => Ok(motion.outputs),
-                // The inverse of an unstable body grows until motion and friction cancel in its products. Steps without
-                // the inverse lose no digits there.
-                Err(error @ Error::Diverged { .. }) => match self.simulation.system().run(&self.record, terms) {
-                    Ok(outputs) if outputs.iter().flatten().all(|v| v.is_finite()) => Ok(outputs),
-                    _ => Err(error),
-                },
-                Err(error) => Err(error),
-            };
+        let OutputSimulation { recording, equations, .. } = self.simulation;
+        if !self.simulation.is_linear() {
+            return Ok(self.simulation.system().run(&self.record, terms)?.outputs);
         }
         if recording.is_coupled {
             return simulate::respond(equations, &self.record, terms);

@@ -6,9 +6,9 @@ use pyo3::types::PyDict;
 
 use super::convert::{record, stack_rows, structure, to_vectors, List, RecordArg, StructureArg};
 use crate::equation::Equation;
-use crate::friction::contact::Trace;
 use crate::friction::law::Phase;
-use crate::friction::{Body, FrictionLaw};
+use crate::friction::FrictionLaw;
+use crate::nonlinear::{BodyMotion, NonlinearSystem};
 use crate::python::order_search::watch::run_interruptible;
 
 #[pyfunction]
@@ -33,12 +33,12 @@ pub fn friction_respond<'py>(
             Ok(Equation { structure, coefficients: coefficients.into() })
         })
         .collect::<PyResult<_>>()?;
-    let body = Body { equations, frictions };
-    let motion = run_interruptible(py, record.m(), None, move |_| body.run(&record, &to_vectors(terms)))?;
+    let system = NonlinearSystem::linear(equations, frictions, record.len());
+    let motion = run_interruptible(py, record.m(), None, move |_| system.run(&record, &to_vectors(terms)))?;
     let dict = PyDict::new(py);
     dict.set_item("outputs", stack_rows(py, &motion.outputs)?)?;
-    let rows = |of: fn(&Trace) -> &Vec<f64>| motion.bodies.iter().map(|body| of(body).clone()).collect::<Vec<_>>();
-    dict.set_item("velocity", stack_rows(py, &rows(|body| &body.edges))?)?;
+    let rows = |of: fn(&BodyMotion) -> &Vec<f64>| motion.bodies.iter().map(|body| of(body).clone()).collect::<Vec<_>>();
+    dict.set_item("velocity", stack_rows(py, &rows(|body| &body.velocity))?)?;
     dict.set_item("force", stack_rows(py, &rows(|body| &body.force))?)?;
     let stuck: Vec<Vec<bool>> =
         (motion.bodies.iter()).map(|body| body.phases.iter().map(|phase| *phase == Phase::Stick).collect()).collect();

@@ -6,7 +6,9 @@ use ftlm::estimation::output_error::{
     self, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, MinimizationSettings, Monomial,
     ParameterPoint, PointValues,
 };
-use ftlm::friction::{self, FreeFrictionLaw, FrictionLaw, FrictionModel, Start};
+use ftlm::friction::FrictionLaw;
+use ftlm::nonlinear::{self, FreeFrictionLaw, NonlinearModel, NonlinearSystem, Start};
+use ftlm::parallel::Stop;
 use ftlm::regressors::Record;
 use ftlm::signal::block_pulse::{point_samples, PulseMeans};
 
@@ -67,16 +69,10 @@ fn linear(law: InputLaw) -> FreeModel {
     }
 }
 
-fn rubbing(law: InputLaw) -> FrictionModel {
-    FrictionModel {
-        equations: vec![equation()],
-        frictions: vec![(0, FreeFrictionLaw::coulomb(free(2, 1.0)))],
-        inputs: limited(law),
-        order_bounds: vec![(1.2, 2.0)],
-        coordinates: vec![Coordinate::Plain; 3],
-        initial: Initial::Rest,
-        filtered: vec![],
-    }
+fn rubbing(law: InputLaw) -> NonlinearModel {
+    let model = FreeModel { coordinates: vec![Coordinate::Plain; 3], coupled: true, ..linear(law) };
+    let frictions = vec![(0, FreeFrictionLaw::coulomb(free(2, 1.0)))];
+    NonlinearModel { model, derived: vec![], frictions, filtered: vec![] }
 }
 
 /// A run of a body with friction f (or none) whose input acts as a law says; the record has it as commanded.
@@ -85,7 +81,8 @@ fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error
     let u = command(seed);
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
     let structure = Structure { output: 0, order: 1.8, terms };
-    let body = friction::Body::single(Equation { structure, coefficients: vec![-1.0, 1.5] }, FrictionLaw::coulomb(f));
+    let equation = Equation { structure, coefficients: vec![-1.0, 1.5] };
+    let body = NonlinearSystem::linear(vec![equation], vec![(0, FrictionLaw::coulomb(f))], 2);
     let record = Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; M], acting(&u, law, limit)]), None)?;
     let output = body.run(&record, &[vec![]])?.outputs.swap_remove(0);
     let record = Record::new(STEP, PulseMeans::from_signals(vec![output.clone(), u]), None)?;
@@ -116,7 +113,7 @@ fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
         let here = |value: f64| {
             let start =
                 Start { orders: vec![1.7], coefficients: vec![0.8, 1.4, 0.3], inputs: vec![value], states: vec![] };
-            friction::fit(&rubbing(law), std::slice::from_ref(&experiment), &start, settings)
+            nonlinear::fit(&rubbing(law), std::slice::from_ref(&experiment), &start, settings, &Stop::default())
         };
         let (at, up, down) = (here(1.0)?, here(1.000_001)?, here(0.999_999)?);
         let slope: Vec<f64> = up.residuals.iter().zip(&down.residuals).map(|(u, d)| (u - d) / 2e-6).collect();
@@ -135,7 +132,7 @@ fn a_limit_is_found_with_the_rest() -> Result<(), Error> {
         assert!((found.point.orders[0] - 1.8).abs() < 1e-6, "{law:?} {:?}", found.point);
         let start = Start { orders: vec![1.9], coefficients: vec![0.7, 1.2, 0.3], inputs: vec![0.9], states: vec![] };
         let settings = MinimizationSettings { evaluations: 300, tolerance: 1e-14 };
-        let found = friction::fit(&rubbing(law), &[run(law, limit, 0.5, 7)?], &start, settings)?;
+        let found = nonlinear::fit(&rubbing(law), &[run(law, limit, 0.5, 7)?], &start, settings, &Stop::default())?;
         assert!((found.inputs[0] - limit).abs() < 1e-4, "{law:?} {:?} {:?}", found.inputs, found.coefficients);
         assert!((found.coefficients[2] - 0.5).abs() < 1e-4, "{law:?} {:?}", found.coefficients);
     }
@@ -151,12 +148,14 @@ fn what_is_no_limit_of_an_input_is_refused() -> Result<(), Error> {
     {
         let model = FreeModel { inputs: inputs.clone(), ..linear(InputLaw::Saturation) };
         assert!(matches!(model.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
-        let model = FrictionModel { inputs, ..rubbing(InputLaw::Saturation) };
+        let mut model = rubbing(InputLaw::Saturation);
+        model.model.inputs = inputs;
         assert!(matches!(model.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
     }
-    let late = |bounds: (f64, f64)| FrictionModel {
-        inputs: vec![FreeInput { signal: 1, law: InputLaw::Delay, bounds }],
-        ..rubbing(InputLaw::Saturation)
+    let late = |bounds: (f64, f64)| {
+        let mut model = rubbing(InputLaw::Saturation);
+        model.model.inputs = vec![FreeInput { signal: 1, law: InputLaw::Delay, bounds }];
+        model
     };
     late((0.0, 0.2)).check(std::slice::from_ref(&experiment))?;
     assert!(matches!(late((0.0, f64::INFINITY)).check(&[experiment]), Err(Error::Structure { .. })));

@@ -11,7 +11,7 @@ use crate::error::Result;
 use crate::estimation::output_error::parameterization::TimeUnit as Unit;
 use crate::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial};
 use crate::fractional::kernels::MAX_ORDER;
-use crate::friction::FreeFrictionLaw;
+use crate::nonlinear::FreeFrictionLaw;
 use crate::signal::statistics::median;
 
 /// Default upper bound of free orders, unless the structure contains a higher order.

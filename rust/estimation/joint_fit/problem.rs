@@ -6,9 +6,8 @@ use crate::estimation::output_error::{
     fit_until, Coordinate, Experiment, FreeModel, MinimizationSettings, Monomial, ParameterPoint, Status,
 };
 use crate::expression::DerivedSignal;
-use crate::friction::{self, FreeFrictionLaw, FrictionModel, Start};
 use crate::linalg::dense;
-use crate::nonlinear::{self, NonlinearModel};
+use crate::nonlinear::{self, FreeFrictionLaw, NonlinearModel, Start};
 use crate::parallel::Stop;
 use crate::signal::statistics::inner;
 
@@ -115,7 +114,7 @@ impl Problem {
     /// Minimize the cost by Levenberg–Marquardt; if `steady`, a stable iterate does not become unstable.
     ///
     /// # Errors
-    /// As [`fit_until`], with friction [`friction::fit_until`], and with non-linear terms [`nonlinear::fit`].
+    /// As [`fit_until`], with friction or non-linear terms [`nonlinear::fit`].
     pub fn minimize(
         &self,
         experiments: &[Experiment],
@@ -136,25 +135,12 @@ impl Problem {
                 status: found.status,
             });
         }
-        let filtered = friction::filtered_outputs(experiments);
+        let filtered = nonlinear::filtered_outputs(experiments);
         let Iterate { point: ParameterPoint { orders, coefficients, inputs }, states } = start.clone();
         let start = Start { orders, coefficients, inputs, states };
-        let found = if self.derived.is_empty() {
-            let model = FrictionModel {
-                equations: self.model.equations.clone(),
-                frictions: self.frictions.clone(),
-                inputs: self.model.inputs.clone(),
-                order_bounds: self.model.order_bounds.clone(),
-                coordinates: self.model.coordinates.clone(),
-                initial: self.model.initial.clone(),
-                filtered,
-            };
-            friction::fit_until(&model, experiments, &start, settings, stop)?
-        } else {
-            let (model, derived, frictions) = (self.model.clone(), self.derived.clone(), self.frictions.clone());
-            let model = NonlinearModel { model, derived, frictions, filtered };
-            nonlinear::fit(&model, experiments, &start, settings, stop)?
-        };
+        let (model, derived, frictions) = (self.model.clone(), self.derived.clone(), self.frictions.clone());
+        let model = NonlinearModel { model, derived, frictions, filtered };
+        let found = nonlinear::fit(&model, experiments, &start, settings, stop)?;
         let point = ParameterPoint { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };
         Ok(OptimizationResult {
             initial: found.states.iter().map(|states| vec![states.clone()]).collect(),

@@ -149,11 +149,18 @@ impl FreeModel {
         let Some(signals) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
         };
+        self.check_structure(signals, 0)?;
+        experiments.iter().try_for_each(|experiment| self.check_experiment(experiment))?;
+        self.initial.check()
+    }
+
+    /// Check signals, coefficients and bounds on records of as many signals, followed by derived ones.
+    pub(crate) fn check_structure(&self, signals: usize, derived: usize) -> Result<()> {
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
         let coefficients = self.coordinates.len();
         for equation in &self.equations {
             let missing = |(signal, _, c): &(usize, AffineOrder, Monomial)| {
-                *signal >= signals || c.powers.iter().any(|&(i, _)| i >= coefficients)
+                *signal >= signals + derived || c.powers.iter().any(|&(i, _)| i >= coefficients)
             };
             if equation.output >= signals || equation.terms.iter().any(missing) {
                 let what = "an equation names a signal or a coefficient that is not there".to_owned();
@@ -181,15 +188,18 @@ impl FreeModel {
         {
             return refuse(format!("bounds {low} to {high} of an order"), "give two rising orders");
         }
-        for experiment in experiments {
-            experiment.check()?;
-            check_length("outputs", self.equations.len(), experiment.samples.len())?;
-            if experiment.nonuniform.is_some() && !self.inputs.is_empty() {
-                let what = "a free delay or limit with samples at times of their own".to_owned();
-                return refuse(what, "give its value, or samples at regular times");
-            }
+        Ok(())
+    }
+
+    /// Check that an experiment has the outputs of the model, and samples that its inputs allow.
+    pub(crate) fn check_experiment(&self, experiment: &Experiment) -> Result<()> {
+        experiment.check()?;
+        check_length("outputs", self.equations.len(), experiment.samples.len())?;
+        if experiment.nonuniform.is_some() && !self.inputs.is_empty() {
+            let what = "a free delay or limit with samples at times of their own".into();
+            return Err(Error::Structure { what, remedy: "give its value, or samples at regular times".into() });
         }
-        self.initial.check()
+        Ok(())
     }
 
     /// Index of the free input parameter of a signal, if any.

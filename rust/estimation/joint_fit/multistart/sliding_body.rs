@@ -168,7 +168,8 @@ mod tests {
     use super::*;
     use crate::equation;
     use crate::estimation::joint_fit::structure::{FrictionParameters, Order, ParametricTerm};
-    use crate::friction::{Body, FrictionLaw};
+    use crate::friction::FrictionLaw;
+    use crate::nonlinear::NonlinearSystem;
     use crate::recording::{Channel, Role};
     use crate::signal::block_pulse::Intersample;
 
@@ -179,7 +180,8 @@ mod tests {
         let u: Vec<f64> = (0..rows).map(|k| if (k / 130) % 2 == 0 { 1.0 } else { -1.0 }).collect();
         let terms = vec![equation::Term { signal: 0, order: 1.0 }, equation::Term { signal: 1, order: 0.0 }];
         let linear = equation::Structure { output: 0, order: 2.0, terms };
-        let body = Body::single(equation::Equation::new(linear, vec![-2.0, 3.0])?, FrictionLaw::coulomb(0.5));
+        let equation = equation::Equation::new(linear, vec![-2.0, 3.0])?;
+        let body = NonlinearSystem::linear(vec![equation], vec![(0, FrictionLaw::coulomb(0.5))], 2);
         let record = Record::from_rows(step, vec![vec![0.0; rows - 1], u[..rows - 1].to_vec()], None)?;
         let means = body.run(&record, &[Vec::new()])?.outputs.remove(0);
         let y: Vec<f64> = std::iter::once(0.0).chain(means.windows(2).map(|w| 0.5 * (w[0] + w[1]))).collect();

@@ -1,6 +1,5 @@
 //! Initial states and constant forces of a run, as powers of t that enter outputs and velocities.
 
-use super::convolution::IntegratedSignal;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, power_means};
@@ -9,58 +8,28 @@ use crate::regressors::is_impulse;
 
 /// Term of an equation with a simulated output as signal.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Link {
+pub(super) struct Link {
     /// Equation of the output.
-    pub(crate) output: usize,
-    pub(crate) order: f64,
+    pub(super) output: usize,
+    pub(super) order: f64,
     /// Integration order: α of the equation minus the order of the term.
-    pub(crate) integration: f64,
-    pub(crate) coefficient: f64,
+    pub(super) integration: f64,
+    pub(super) coefficient: f64,
 }
 
-/// Initial states and constant forces as inputs at the levels of outputs and velocities, by equation.
+/// Motion of each output at the ends of pulses by initial terms: its start, and the forcing of its velocity.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct InitialForcing {
-    /// Pulse means at the level of the output.
-    pub(super) output: Vec<Vec<f64>>,
+pub(super) struct EndForcing {
     /// Contribution to the velocity at pulse ends, relative to the initial velocity.
-    pub(crate) edges: Vec<Vec<f64>>,
+    pub(super) velocities: Vec<Vec<f64>>,
     /// Initial velocities.
-    pub(crate) start: Vec<f64>,
+    pub(super) initial_velocities: Vec<f64>,
     /// Initial outputs.
-    pub(crate) levels: Vec<f64>,
-    m: usize,
+    pub(super) initial_outputs: Vec<f64>,
 }
 
-impl InitialForcing {
-    pub(super) fn zeros(m: usize, n: usize) -> Self {
-        let rows = vec![vec![0.0; m]; n];
-        Self { output: rows.clone(), edges: rows, start: vec![0.0; n], levels: vec![0.0; n], m }
-    }
-
-    /// Zero forcing of the same size.
-    pub(super) fn zeros_like(&self) -> Self {
-        Self::zeros(self.m, self.levels.len())
-    }
-
-    /// Add a weighted forcing.
-    pub(super) fn add(&mut self, weight: f64, other: &Self) {
-        let rows = self.output.iter_mut().chain(&mut self.edges).zip(other.output.iter().chain(&other.edges));
-        for (sum, part) in rows {
-            sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
-        }
-        self.start.iter_mut().zip(&other.start).for_each(|(s, v)| *s += weight * v);
-        self.levels.iter_mut().zip(&other.levels).for_each(|(s, v)| *s += weight * v);
-    }
-
-    /// Add a weighted integrated signal to one equation.
-    pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &IntegratedSignal) {
-        let add = |sum: &mut Vec<f64>, part: &[f64]| sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
-        add(&mut self.output[equation], &part.output);
-        add(&mut self.edges[equation], &part.edges);
-    }
-
-    /// Forcing of powers of t at the level of the outputs, (exponent, coefficient) by equation, with coupling terms.
+impl EndForcing {
+    /// Forcing by powers of t at the level of the outputs, (exponent, coefficient) by equation, with coupling terms.
     ///
     /// Coupling terms integrate an initial level x₀, and also the jump to it: in the velocity it is c x₀ t^{η−1}/Γ(η).
     /// An initial velocity v₀ is c v₀ t^η/Γ(η + 1) in the velocities coupled to it.
@@ -69,27 +38,20 @@ impl InitialForcing {
     /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] if the
     /// initial levels or velocities are not determined by the equations.
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn of(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
+    pub(super) fn new(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
         let n = powers.len();
-        let mut out = Self::zeros(m, n);
         let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
-        out.levels = solve_feedthrough(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
-        let mut all = vec![Sum::default(); n];
+        let initial_outputs = solve_feedthrough(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
+        let mut rates = vec![Sum::default(); n];
         for (i, own) in powers.iter().enumerate() {
-            for &(exponent, value) in own {
-                if value != 0.0 {
-                    let means = means_of(exponent, m, step);
-                    out.output[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
-                }
-                if exponent.abs() >= ORDER_GRAIN {
-                    all[i].add(exponent - 1.0, value * exponent);
-                }
+            for &(exponent, value) in own.iter().filter(|power| power.0.abs() >= ORDER_GRAIN) {
+                rates[i].add(exponent - 1.0, value * exponent);
             }
             for link in links[i].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
                 let eta = link.integration;
-                all[i].add(eta - 1.0, link.coefficient * out.levels[link.output] / libm::tgamma(eta));
+                rates[i].add(eta - 1.0, link.coefficient * initial_outputs[link.output] / libm::tgamma(eta));
             }
-            if let Some((exponent, _)) = all[i].powers().find(|power| power.0 <= -1.0) {
+            if let Some((exponent, _)) = rates[i].powers().find(|power| power.0 <= -1.0) {
                 return Err(Error::OutOfRange {
                     name: "exponent of an initial term".into(),
                     value: exponent + 1.0,
@@ -101,29 +63,30 @@ impl InitialForcing {
             }
         }
         let given: Vec<f64> =
-            all.iter().map(|own| own.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
-        out.start = solve_feedthrough(&given, links)?;
-        for (i, own) in all.iter_mut().enumerate() {
-            own.add(0.0, -out.start[i]);
+            rates.iter().map(|own| own.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
+        let initial_velocities = solve_feedthrough(&given, links)?;
+        let mut velocities = vec![vec![0.0; m]; n];
+        for (i, own) in rates.iter_mut().enumerate() {
+            own.add(0.0, -initial_velocities[i]);
             for link in &links[i] {
                 let eta = link.integration;
-                own.add(eta, link.coefficient * out.start[link.output] / libm::tgamma(eta + 1.0));
+                own.add(eta, link.coefficient * initial_velocities[link.output] / libm::tgamma(eta + 1.0));
             }
             for (exponent, value) in own.powers() {
                 let ends = (1..=m).map(|k| libm::pow(k as f64 * step, exponent));
-                out.edges[i].iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
+                velocities[i].iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
             }
         }
-        Ok(out)
+        Ok(Self { velocities, initial_velocities, initial_outputs })
     }
 }
 
 /// Sum of powers of t with distinct exponents.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Sum(Vec<(f64, f64, f64)>);
+pub(super) struct Sum(Vec<(f64, f64, f64)>);
 
 impl Sum {
-    pub(crate) fn add(&mut self, exponent: f64, value: f64) {
+    pub(super) fn add(&mut self, exponent: f64, value: f64) {
         match self.0.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
             Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
             None => self.0.push((exponent, value, value.abs())),
@@ -131,13 +94,62 @@ impl Sum {
     }
 
     /// (exponent, coefficient) of the powers that do not cancel up to rounding.
-    pub(crate) fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
+    pub(super) fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
         self.0.iter().filter(|r| r.1.abs() > 1e-13 * r.2).map(|r| (r.0, r.1))
     }
 }
 
+/// Powers of t, (exponent, coefficient), of the derivative of an output of this order, from those of all equations.
+///
+/// D^ρ I^η y is I^η D^ρ y, and the powers of t that y(0), y′(0), … add. They cancel those of Caputo's initial terms.
+pub(super) fn channel_powers(
+    equation: usize,
+    order: f64,
+    links: &[Vec<Link>],
+    powers: &[Vec<(f64, f64)>],
+) -> Result<Vec<(f64, f64)>> {
+    let mut sum = Sum::default();
+    powers[equation].iter().for_each(|&(exponent, value)| sum.add(exponent, value));
+    let mut whole = 0.0;
+    while whole < order - ORDER_GRAIN {
+        let at = |own: &Vec<(f64, f64)>| -> f64 {
+            own.iter().filter(|p| (p.0 - whole).abs() < ORDER_GRAIN).map(|p| p.1).sum()
+        };
+        let given: Vec<f64> = powers.iter().map(at).collect();
+        let begun = solve_feedthrough(&given, links)?;
+        for link in links[equation].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
+            let exponent = link.integration + whole;
+            let value = begun[link.output] * libm::tgamma(whole + 1.0);
+            sum.add(exponent, link.coefficient * value / libm::tgamma(exponent + 1.0));
+        }
+        whole += 1.0;
+    }
+    let mut out = Vec::new();
+    for (exponent, value) in sum.powers() {
+        if order < ORDER_GRAIN {
+            out.push((exponent, value));
+            continue;
+        }
+        let is_whole = (exponent - exponent.round()).abs() < ORDER_GRAIN;
+        if value == 0.0 || (is_whole && exponent < order - ORDER_GRAIN) {
+            continue;
+        }
+        if exponent - order <= -1.0 {
+            return Err(Error::OutOfRange {
+                name: "exponent of an initial term".into(),
+                value: exponent,
+                range: format!("above {}, or 0, 1, …", order - 1.0),
+                remedy: "the derivative in a non-linear term has no mean over the first pulse".into(),
+            });
+        }
+        let scale = libm::tgamma(exponent + 1.0) / libm::tgamma(exponent - order + 1.0);
+        out.push((exponent - order, value * scale));
+    }
+    Ok(out)
+}
+
 /// Pulse means of t^e. Negative powers are those of the derivative kernels applied to a step.
-pub(crate) fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+pub(super) fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent >= 0.0 {
         return power_means(exponent, m, step);
     }
@@ -150,7 +162,7 @@ pub(crate) fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 }
 
 /// Initial outputs or velocities from the given values, with direct feedthrough between equations.
-pub(crate) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+pub(super) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
     let n = given.len();
     if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
         return Ok(given.to_vec());
@@ -168,7 +180,7 @@ pub(crate) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Ve
 
 /// Free initial state of a run: a combination of powers of t in the named equation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum State {
+pub(super) enum State {
     /// Initial level of the output.
     Level(usize),
     /// Initial velocity of the output.
@@ -191,7 +203,7 @@ impl State {
     ///
     /// `free` says whether the integration order of an equation's term depends on a free order. Each filtered output
     /// (`filtered`, empty if none) also has the transients of the filter.
-    pub(crate) fn all(
+    pub(super) fn all(
         equations: &[Equation],
         initial: &Initial,
         filtered: &[bool],
@@ -231,12 +243,12 @@ impl State {
     }
 
     /// Whether the state acts on the filter of an output only and not on a body.
-    pub(crate) fn is_impulse(&self) -> bool {
+    pub(super) fn is_impulse(&self) -> bool {
         matches!(self, Self::Power(_, e) if is_impulse(*e))
     }
 
     /// Powers of t of a unit of this state at the level of the outputs: equation, exponent, coefficient.
-    pub(crate) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
+    pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
         // Caputo derivatives of a constant are 0, so only terms of order 0 respond to a level.
         let unseen = |output: usize, whole: f64| {
             let mut all = vec![(output, whole, 1.0)];
@@ -262,7 +274,7 @@ impl State {
 }
 
 /// Merge the powers of t of several states by equation and exponent.
-pub(crate) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+pub(super) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
     let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
     for (i, exponent, value) in parts {
         match out[i].iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {
@@ -272,4 +284,23 @@ pub(crate) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64
     }
     out.iter_mut().for_each(|own| own.sort_by(|a, b| a.0.total_cmp(&b.0)));
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn initial_values_leave_no_power_that_caputo_derivatives_lack() -> Result<()> {
+        // D² y = −c D^0.6 y from y = 3 + 2 t: y is 3 + 2 t plus −c I^1.4 (y − 3), whose 3 t^1.4 cancels.
+        let links = vec![vec![Link { output: 0, order: 0.6, integration: 1.4, coefficient: -0.7 }]];
+        let taken = 0.7 * 3.0 / libm::tgamma(2.4);
+        let powers = vec![vec![(0.0, 3.0), (1.0, 2.0), (1.4, taken)]];
+        assert_eq!(channel_powers(0, 1.0, &links, &powers)?, [(0.0, 2.0)]);
+        let half = channel_powers(0, 0.5, &links, &powers)?;
+        assert!(half.len() == 1 && (half[0].0 - 0.5).abs() < 1e-12);
+        assert!((half[0].1 - 2.0 / libm::tgamma(1.5)).abs() < 1e-12);
+        assert_eq!(channel_powers(0, 0.0, &links, &powers)?.len(), 3);
+        Ok(())
+    }
 }

@@ -1,116 +1,14 @@
-//! Output-error fit of simulations that are not linear in their initial states, by Levenberg–Marquardt.
+//! Output-error fit of systems with non-linear terms or friction, by Levenberg–Marquardt.
 //!
 //! Orders, coefficients, free parameters of inputs, and the initial states of each run are optimized together.
 
-use super::output_error::{Coordinate, Experiment, FreeInput};
+use super::model::{Evaluation, NonlinearModel, Point};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::optimization::damped_step::LeastSquaresProblem;
 use crate::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings, Status};
+use crate::estimation::output_error::Experiment;
 use crate::linalg::orthogonal::extend_orthonormal;
 use crate::parallel::Stop;
-
-/// Values of all free parameters.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Point {
-    pub(crate) orders: Vec<f64>,
-    pub(crate) coefficients: Vec<f64>,
-    /// Free parameters of inputs.
-    pub(crate) inputs: Vec<f64>,
-    /// Initial states of each run.
-    pub(crate) states: Vec<Vec<f64>>,
-}
-
-/// Residuals at a point, with intermediate results `P` of each experiment for their derivatives.
-pub(crate) struct Evaluation<P> {
-    pub(crate) residuals: Vec<f64>,
-    pub(crate) size: f64,
-    pub(crate) parts: Vec<P>,
-}
-
-impl<P> Evaluation<P> {
-    /// Evaluation before any experiment.
-    pub(crate) fn empty() -> Self {
-        Self { residuals: Vec::new(), size: 0.0, parts: Vec::new() }
-    }
-}
-
-/// Parameter of a derivative.
-pub(crate) enum Parameter {
-    /// Free order, free coefficient, or state of one run.
-    Order(usize),
-    Coefficient(usize),
-    State(usize, usize),
-    /// Free parameter of an input.
-    Input(usize),
-}
-
-impl Parameter {
-    /// Parameters at a point: orders, coefficients and inputs if `numbers`, then the states of run after run.
-    pub(crate) fn all(point: &Point, numbers: bool) -> Vec<Self> {
-        let mut all = Vec::new();
-        if numbers {
-            all.extend((0..point.orders.len()).map(Self::Order));
-            all.extend((0..point.coefficients.len()).map(Self::Coefficient));
-            all.extend((0..point.inputs.len()).map(Self::Input));
-        }
-        let states = point.states.iter().enumerate();
-        all.extend(states.flat_map(|(run, states)| (0..states.len()).map(move |state| Self::State(run, state))));
-        all
-    }
-}
-
-/// Model whose simulation is not linear in its initial states.
-pub(crate) trait StateModel {
-    /// Intermediate results of an experiment.
-    type Part;
-
-    /// Bounds of each free order.
-    fn order_bounds(&self) -> &[(f64, f64)];
-
-    /// Coordinate of each free coefficient.
-    fn coordinates(&self) -> &[Coordinate];
-
-    /// Free parameters of inputs.
-    fn inputs(&self) -> &[FreeInput];
-
-    /// Whether a coefficient must not be negative.
-    fn is_nonnegative(&self, _coefficient: usize) -> bool {
-        false
-    }
-
-    /// Whether the cost has kinks, so that its gradient need not vanish at a minimum.
-    fn has_kinks(&self) -> bool {
-        false
-    }
-
-    /// Return an error for an inconsistent model, or for experiments that do not fit it.
-    fn check(&self, experiments: &[Experiment]) -> Result<()>;
-
-    /// Return an error for invalid free orders.
-    fn check_orders(&self, orders: &[f64]) -> Result<()>;
-
-    /// Initial guesses of the states of a run from its first samples; the first has the length of all.
-    fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>>;
-
-    /// Number of states of each run.
-    fn state_count(&self, orders: &[f64]) -> usize;
-
-    /// Initial terms of a run's states by equation: (exponent, coefficient).
-    fn powers(&self, orders: &[f64], coefficients: &[f64], states: &[f64]) -> Vec<Vec<(f64, f64)>>;
-
-    /// Residuals at a point.
-    fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation<Self::Part>>;
-
-    /// Derivatives of the residuals with respect to [`Parameter::all`].
-    fn jacobian(
-        &self,
-        experiments: &[Experiment],
-        point: &Point,
-        at: &Evaluation<Self::Part>,
-        numbers: bool,
-        stop: &Stop,
-    ) -> Result<Vec<Vec<f64>>>;
-}
 
 /// Initial guess of a fit.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -151,25 +49,25 @@ pub struct StateFit {
     pub status: Status,
 }
 
-struct OutputError<'a, M> {
-    model: &'a M,
+struct OutputError<'a> {
+    model: &'a NonlinearModel,
     experiments: &'a [Experiment],
     stop: &'a Stop,
 }
 
-impl<M: StateModel> LeastSquaresProblem for OutputError<'_, M> {
+impl LeastSquaresProblem for OutputError<'_> {
     type Point = Point;
-    type Evaluation = Evaluation<M::Part>;
+    type Evaluation = Evaluation;
 
-    fn evaluate(&self, point: &Point) -> Result<Evaluation<M::Part>> {
+    fn evaluate(&self, point: &Point) -> Result<Evaluation> {
         self.model.evaluate(self.experiments, point, self.stop)
     }
 
-    fn residuals<'a>(&self, evaluation: &'a Evaluation<M::Part>) -> &'a [f64] {
+    fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
         &evaluation.residuals
     }
 
-    fn jacobian(&self, point: &Point, evaluation: &Evaluation<M::Part>) -> Result<Vec<Vec<f64>>> {
+    fn jacobian(&self, point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
         self.model.jacobian(self.experiments, point, evaluation, true, self.stop)
     }
 
@@ -179,7 +77,7 @@ impl<M: StateModel> LeastSquaresProblem for OutputError<'_, M> {
         let (orders, rest) = steps.split_at(point.orders.len());
         let (coefficients, rest) = rest.split_at(point.coefficients.len());
         let (inputs, mut states) = rest.split_at(point.inputs.len());
-        for ((order, &(low, high)), step) in next.orders.iter_mut().zip(self.model.order_bounds()).zip(orders) {
+        for ((order, &(low, high)), step) in next.orders.iter_mut().zip(&self.model.model.order_bounds).zip(orders) {
             let before = *order;
             *order = (before + step).clamp(low, high);
             moved = moved.max((*order - before).abs());
@@ -187,13 +85,13 @@ impl<M: StateModel> LeastSquaresProblem for OutputError<'_, M> {
         let share = |before: f64, after: f64| (after - before).abs() / before.abs().max(f64::MIN_POSITIVE);
         for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
             let before = *value;
-            *value = self.model.coordinates()[j].shift(before, *step);
+            *value = self.model.model.coordinates[j].shift(before, *step);
             if self.model.is_nonnegative(j) {
                 *value = value.max(0.0);
             }
             moved = moved.max(share(before, *value));
         }
-        for ((value, input), step) in next.inputs.iter_mut().zip(self.model.inputs()).zip(inputs) {
+        for ((value, input), step) in next.inputs.iter_mut().zip(&self.model.model.inputs).zip(inputs) {
             let (before, (low, high)) = (*value, input.bounds);
             *value = (before + step).clamp(low, high);
             moved = moved.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
@@ -213,21 +111,21 @@ impl<M: StateModel> LeastSquaresProblem for OutputError<'_, M> {
         parameter
             .checked_sub(point.orders.len())
             .filter(|j| *j < point.coefficients.len())
-            .map_or(1.0, |j| self.model.coordinates()[j].derivative(point.coefficients[j]))
+            .map_or(1.0, |j| self.model.model.coordinates[j].derivative(point.coefficients[j]))
     }
 
     /// Orders, input parameters and forces of friction have bounds.
     fn distance_to_bounds(&self, point: &Point, parameter: usize) -> (f64, f64) {
         if let Some(order) = point.orders.get(parameter) {
-            let (low, high) = self.model.order_bounds()[parameter];
+            let (low, high) = self.model.model.order_bounds[parameter];
             return (order - low, high - order);
         }
         let j = parameter - point.orders.len();
         let input = j.checked_sub(point.coefficients.len());
-        if let Some((value, free)) = input.and_then(|i| point.inputs.get(i).zip(self.model.inputs().get(i))) {
+        if let Some((value, free)) = input.and_then(|i| point.inputs.get(i).zip(self.model.model.inputs.get(i))) {
             return (value - free.bounds.0, free.bounds.1 - value);
         }
-        let plain = self.model.coordinates().get(j).is_some_and(|c| c.derivative(2.0) == 1.0);
+        let plain = self.model.model.coordinates.get(j).is_some_and(|c| c.derivative(2.0) == 1.0);
         if plain && self.model.is_nonnegative(j) {
             return (point.coefficients[j], f64::INFINITY);
         }
@@ -238,14 +136,14 @@ impl<M: StateModel> LeastSquaresProblem for OutputError<'_, M> {
         self.model.has_kinks()
     }
 
-    fn signal_norm(&self, evaluation: &Evaluation<M::Part>) -> f64 {
+    fn signal_norm(&self, evaluation: &Evaluation) -> f64 {
         evaluation.size
     }
 }
 
 /// Estimation of the initial state of one run with all other parameters fixed.
-struct InitialStateProblem<'a, M> {
-    model: &'a M,
+struct InitialStateProblem<'a> {
+    model: &'a NonlinearModel,
     experiment: &'a Experiment,
     orders: &'a [f64],
     coefficients: &'a [f64],
@@ -253,7 +151,7 @@ struct InitialStateProblem<'a, M> {
     stop: &'a Stop,
 }
 
-impl<M> InitialStateProblem<'_, M> {
+impl InitialStateProblem<'_> {
     fn at(&self, states: &[f64]) -> Point {
         Point {
             orders: self.orders.to_vec(),
@@ -264,19 +162,19 @@ impl<M> InitialStateProblem<'_, M> {
     }
 }
 
-impl<M: StateModel> LeastSquaresProblem for InitialStateProblem<'_, M> {
+impl LeastSquaresProblem for InitialStateProblem<'_> {
     type Point = Vec<f64>;
-    type Evaluation = Evaluation<M::Part>;
+    type Evaluation = Evaluation;
 
-    fn evaluate(&self, states: &Vec<f64>) -> Result<Evaluation<M::Part>> {
+    fn evaluate(&self, states: &Vec<f64>) -> Result<Evaluation> {
         self.model.evaluate(std::slice::from_ref(self.experiment), &self.at(states), self.stop)
     }
 
-    fn residuals<'a>(&self, evaluation: &'a Evaluation<M::Part>) -> &'a [f64] {
+    fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
         &evaluation.residuals
     }
 
-    fn jacobian(&self, states: &Vec<f64>, evaluation: &Evaluation<M::Part>) -> Result<Vec<Vec<f64>>> {
+    fn jacobian(&self, states: &Vec<f64>, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
         self.model.jacobian(std::slice::from_ref(self.experiment), &self.at(states), evaluation, false, self.stop)
     }
 
@@ -290,7 +188,7 @@ impl<M: StateModel> LeastSquaresProblem for InitialStateProblem<'_, M> {
         self.model.has_kinks()
     }
 
-    fn signal_norm(&self, evaluation: &Evaluation<M::Part>) -> f64 {
+    fn signal_norm(&self, evaluation: &Evaluation) -> f64 {
         evaluation.size
     }
 }
@@ -306,8 +204,8 @@ const BEGINNING_SHARES: [f64; 3] = [0.125, 0.25, 0.5];
 
 /// Initial state of a run at fixed parameters: best result of local optimizations from its first samples, and from
 /// fits of ever longer beginnings of the run.
-fn estimate_initial_state<M: StateModel>(
-    model: &M,
+fn estimate_initial_state(
+    model: &NonlinearModel,
     (orders, coefficients, inputs): (&[f64], &[f64], &[f64]),
     experiment: &Experiment,
     stop: &Stop,
@@ -350,31 +248,31 @@ fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
 /// Least-squares fit with weights of the output error from an initial guess.
 ///
 /// # Errors
-/// An initial guess whose simulation overflows, an inconsistent model or experiments that do not fit it;
-/// [`Error::Interrupted`].
-pub(crate) fn fit<M: StateModel>(
-    model: &M,
+/// An initial guess whose simulation ends ([`Error::Diverged`], [`Error::NoSolution`]), an inconsistent model or
+/// experiments that do not fit it ([`NonlinearModel::check`]); [`Error::Interrupted`].
+pub fn fit(
+    model: &NonlinearModel,
     experiments: &[Experiment],
     start: &Start,
     settings: MinimizationSettings,
     stop: &Stop,
 ) -> Result<StateFit> {
     model.check(experiments)?;
-    check_length("orders", model.order_bounds().len(), start.orders.len())?;
-    check_length("coefficients", model.coordinates().len(), start.coefficients.len())?;
+    check_length("orders", model.model.order_bounds.len(), start.orders.len())?;
+    check_length("coefficients", model.model.coordinates.len(), start.coefficients.len())?;
     check_finite("orders of the start", &start.orders)?;
     check_finite("coefficients of the start", &start.coefficients)?;
-    check_length("inputs", model.inputs().len(), start.inputs.len())?;
+    check_length("inputs", model.model.inputs.len(), start.inputs.len())?;
     check_finite("inputs of the start", &start.inputs)?;
     let orders: Vec<f64> =
-        start.orders.iter().zip(model.order_bounds()).map(|(o, &(low, high))| o.clamp(low, high)).collect();
+        start.orders.iter().zip(&model.model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
     model.check_orders(&orders)?;
     let mut coefficients = start.coefficients.clone();
     for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.is_nonnegative(*j)) {
         *value = value.max(0.0);
     }
     let inputs: Vec<f64> =
-        start.inputs.iter().zip(model.inputs()).map(|(v, i)| v.clamp(i.bounds.0, i.bounds.1)).collect();
+        start.inputs.iter().zip(&model.model.inputs).map(|(v, i)| v.clamp(i.bounds.0, i.bounds.1)).collect();
     let count = model.state_count(&orders);
     let mut states = start.states.clone();
     if states.len() != experiments.len() || states.iter().any(|s| s.len() != count) {

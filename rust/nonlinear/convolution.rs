@@ -1,0 +1,181 @@
+//! Online convolution, and kernels at the ends of pulses.
+//!
+//! A block of the past is multiplied with the equally long block that follows as soon as it is complete, by one
+//! transform (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6): O(N log² N). Within a short block terms are summed
+//! directly. Kernels of whole orders are polynomials in the lag, for which running sums of the signal suffice: O(N).
+
+use crate::fractional::kernels::digamma;
+use crate::series::{Buffers, Kernel};
+
+/// Length of a block that is summed directly. Transforms of shorter blocks cost more.
+const DIRECT_SUM_LENGTH: usize = 64;
+/// Largest whole order whose kernel is summed as a polynomial. Sums of higher ones lose digits on long runs.
+const MAX_POLYNOMIAL_ORDER: usize = 3;
+
+/// Kernel of an online convolution, shared by all signals.
+pub struct ConvolutionKernel {
+    values: Vec<f64>,
+    memory: Memory,
+}
+
+/// How a kernel sums the past.
+enum Memory {
+    /// Spectra of the first values of the kernel, each twice as long as the previous one.
+    Blocks(Vec<Kernel>),
+    /// Coefficients of the values from lag 1 on in the polynomials 1, n, n(n + 1)/2, … of the lag n.
+    Polynomial(Vec<f64>),
+}
+
+impl ConvolutionKernel {
+    /// Kernel of a convolution of as many values.
+    #[must_use]
+    pub fn new(values: Vec<f64>) -> Self {
+        let mut spectra = Vec::new();
+        let mut length = DIRECT_SUM_LENGTH;
+        while length < values.len() {
+            // Only the later of two blocks is read, so wrapped-around terms do not matter.
+            spectra.push(Kernel::with_length(&values[..(2 * length).min(values.len())], 2 * length));
+            length *= 2;
+        }
+        Self { values, memory: Memory::Blocks(spectra) }
+    }
+
+    /// Kernel of an integral of this order, which is a polynomial of the lag if the order is whole.
+    #[must_use]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    pub fn of_integral(order: f64, values: Vec<f64>) -> Self {
+        let degrees = order.max(0.0) as usize;
+        if order != degrees as f64 || degrees > MAX_POLYNOMIAL_ORDER || values.len() <= degrees {
+            return Self::new(values);
+        }
+        // The j-th backward difference of C(n + i − 1, i) at n = 0 is 1 for j = i and 0 for others; the polynomial is
+        // extended to n ≤ 0 by its differences at 1, 2, ….
+        let mut differences: Vec<f64> = values[1..=degrees].to_vec();
+        for level in 1..degrees {
+            for at in (level..degrees).rev() {
+                differences[at] -= differences[at - 1];
+            }
+        }
+        // Forward differences at 1 become backward differences at 0: ∇^j p(0) = Σ_k (−1)^k C(j + k, k) Δ^{j+k} p(1).
+        let coefficients = (0..degrees)
+            .map(|j| {
+                let mut factor = 1.0;
+                let mut sum = 0.0;
+                for k in 0..degrees - j {
+                    sum += factor * differences[j + k];
+                    factor *= -((j + k + 1) as f64) / (k + 1) as f64;
+                }
+                sum
+            })
+            .collect();
+        Self { values, memory: Memory::Polynomial(coefficients) }
+    }
+
+    /// Values of the kernel.
+    #[must_use]
+    pub fn values(&self) -> &[f64] {
+        &self.values
+    }
+}
+
+/// Online convolution of one signal with a kernel.
+pub struct OnlineConvolution<'a> {
+    kernel: &'a ConvolutionKernel,
+    /// Sums over the past of each coming value, or the sums Σ_j C(k − j + i − 1, i) x_j of a polynomial kernel.
+    sums: Vec<f64>,
+    signal: Vec<f64>,
+    buffers: Buffers,
+    block: Vec<f64>,
+}
+
+impl<'a> OnlineConvolution<'a> {
+    /// Convolution of a signal without values yet; [`OnlineConvolution::push`] appends them.
+    #[must_use]
+    pub fn new(kernel: &'a ConvolutionKernel) -> Self {
+        let (sums, signal) = match &kernel.memory {
+            Memory::Blocks(_) => (vec![0.0; kernel.values.len()], Vec::with_capacity(kernel.values.len())),
+            Memory::Polynomial(coefficients) => (vec![0.0; coefficients.len()], Vec::new()),
+        };
+        Self { kernel, sums, signal, buffers: Buffers::default(), block: Vec::new() }
+    }
+
+    /// Sum Σ_{j<k} κ_{k−j} x_j for the next value k.
+    #[must_use]
+    pub fn past(&self) -> f64 {
+        if let Memory::Polynomial(coefficients) = &self.kernel.memory {
+            return coefficients.iter().zip(&self.sums).map(|(c, sum)| c * sum).sum();
+        }
+        self.sums.get(self.signal.len()).copied().unwrap_or(0.0)
+    }
+
+    /// Append the next value of the signal.
+    pub fn push(&mut self, value: f64) {
+        let spectra = match &self.kernel.memory {
+            Memory::Polynomial(_) => {
+                let mut added = value;
+                for sum in &mut self.sums {
+                    *sum += added;
+                    added = *sum;
+                }
+                return;
+            }
+            Memory::Blocks(spectra) => spectra,
+        };
+        self.signal.push(value);
+        let known = self.signal.len();
+        let end = known.next_multiple_of(DIRECT_SUM_LENGTH).min(self.sums.len());
+        if let Some(coming) = self.sums.get_mut(known..end) {
+            coming.iter_mut().zip(&self.kernel.values[1..]).for_each(|(sum, c)| *sum += c * value);
+        }
+        if !known.is_multiple_of(DIRECT_SUM_LENGTH) || known >= self.sums.len() {
+            return;
+        }
+        let level = (known / DIRECT_SUM_LENGTH).trailing_zeros() as usize;
+        let length = DIRECT_SUM_LENGTH << level;
+        let past = &self.signal[known - length..];
+        let Some(spectrum) = spectra.get(level).filter(|_| past.iter().any(|x| *x != 0.0)) else { return };
+        self.block.resize(2 * length, 0.0);
+        spectrum.apply(past, &mut self.block[..2 * length], &mut self.buffers);
+        self.sums[known..].iter_mut().zip(&self.block[length..2 * length]).for_each(|(sum, v)| *sum += v);
+    }
+}
+
+/// Response at the ends of pulses to the pulses of a signal integrated by η > 0, and its derivative in η.
+#[allow(clippy::cast_precision_loss)]
+pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
+    let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
+    let turn = libm::log(step) - digamma(eta + 1.0);
+    (0..m)
+        .map(|n| {
+            // (n + 1)^η − n^η without cancellation.
+            let (value, slope) = if n == 0 {
+                (1.0, 0.0)
+            } else {
+                let (n, near) = (n as f64, libm::log1p(1.0 / n as f64));
+                let (power, grown) = (libm::pow(n, eta), libm::expm1(eta * near));
+                (power * grown, power * (libm::log(n) * grown + near * (grown + 1.0)))
+            };
+            (scale * value, scale * (value * turn + slope))
+        })
+        .unzip()
+}
+
+/// Integration order below which a signal has direct feedthrough to the velocity at an edge, as the mean of the
+/// neighboring pulses.
+pub(crate) const MAX_FEEDTHROUGH_ORDER: f64 = 1e-6;
+
+/// Product with a cached series.
+pub(crate) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
+    let mut out = vec![0.0; series.len()];
+    cached.apply(series, &mut out, &mut Buffers::default());
+    out
+}
+
+/// Values at pulse ends from means: averages of neighboring pulses, the last value extrapolated.
+pub(crate) fn average_neighbors(means: &[f64]) -> Vec<f64> {
+    let m = means.len();
+    let mut out: Vec<f64> = means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
+    let last = means.last().copied().unwrap_or(0.0);
+    out.push(if m > 1 { 1.5 * last - 0.5 * means[m - 2] } else { last });
+    out
+}

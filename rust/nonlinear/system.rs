@@ -1,0 +1,226 @@
+//! Systems of equations with non-linear terms and dry friction at known orders and coefficients.
+
+use super::channels::StateChannel;
+use super::convolution::MAX_FEEDTHROUGH_ORDER;
+use super::initial_state::Link;
+use crate::equation::{check_regular, Equation, Term, ORDER_GRAIN};
+use crate::error::{check_finite, Error, Result};
+use crate::expression::DerivedSignal;
+use crate::friction::contact::is_p_matrix;
+use crate::friction::FrictionLaw;
+use crate::linalg::small;
+
+/// Smallest integration order of a linear term of the equation's own output, and of a term with an input.
+pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
+
+/// Equations with non-linear terms at known orders and coefficients.
+///
+/// The signals from `recorded` on are derived signals.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NonlinearSystem {
+    /// D^α y = Σ c D^ν s over recorded and derived signals.
+    pub equations: Vec<Equation>,
+    /// Expressions of the derived signals.
+    pub derived: Vec<DerivedSignal>,
+    /// Number of recorded signals.
+    pub recorded: usize,
+    /// Whether outputs enter other equations as simulated, not as measured.
+    pub coupled: bool,
+    /// Equations with dry friction, and F of − F(Dy) sgn(Dy).
+    pub frictions: Vec<(usize, FrictionLaw)>,
+}
+
+impl NonlinearSystem {
+    /// System without non-linear terms, whose outputs enter each other's equations as simulated.
+    #[must_use]
+    pub fn linear(equations: Vec<Equation>, frictions: Vec<(usize, FrictionLaw)>, recorded: usize) -> Self {
+        Self { equations, derived: Vec::new(), recorded, coupled: true, frictions }
+    }
+
+    /// Index of the simulated output that a signal of equation i is; None for an input.
+    pub(crate) fn output_index(&self, i: usize, signal: usize) -> Option<usize> {
+        if self.coupled {
+            self.equations.iter().position(|e| e.structure.output == signal)
+        } else {
+            (signal == self.equations[i].structure.output).then_some(i)
+        }
+    }
+
+    /// Return an error for signals that do not exist, and for coefficients, orders or frictions that no equation has.
+    ///
+    /// # Errors
+    /// [`Error::Structure`], [`Error::OutOfRange`], [`Error::NotFinite`]; as [`Equation::check`].
+    pub fn check(&self) -> Result<()> {
+        let signals = self.recorded + self.derived.len();
+        let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+        for (i, equation) in self.equations.iter().enumerate() {
+            equation.check(signals)?;
+            let output = equation.structure.output;
+            if output >= self.recorded {
+                return refuse("a derived signal as output of an equation".into(), "simulate recorded signals only");
+            }
+            if self.equations[..i].iter().any(|other| other.structure.output == output) {
+                let what = format!("two equations have signal {output} as their output");
+                return refuse(what, "give one equation an output");
+            }
+        }
+        match self.derived.iter().flat_map(|d| &d.channels).find(|(signal, _)| *signal >= self.recorded) {
+            None => self.check_frictions(),
+            Some((signal, _)) => refuse(format!("signal {signal} of {} in an expression", self.recorded), "record it"),
+        }
+    }
+
+    /// Return an error for frictions that no body has, and for orders that this law does not support.
+    fn check_frictions(&self) -> Result<()> {
+        let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
+            Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
+        };
+        for (k, &(place, _)) in self.frictions.iter().enumerate() {
+            if place >= self.equations.len() || self.frictions[..k].iter().any(|f| f.0 == place) {
+                return Err(Error::Structure {
+                    what: format!("friction in equation {place}"),
+                    remedy: format!("there are {}, each with one friction", self.equations.len()),
+                });
+            }
+        }
+        for &(place, FrictionLaw { coulomb, stribeck, speed }) in &self.frictions {
+            check_finite("friction", &[coulomb, stribeck, speed])?;
+            let alpha = self.equations[place].structure.order;
+            if !(alpha > 1.0 && alpha <= 2.0) {
+                return refuse("order of a body with friction", alpha, "(1, 2]", "a velocity needs inertia");
+            }
+            if let Some(force) = [coulomb, stribeck].into_iter().find(|f| *f < 0.0) {
+                return refuse("friction", force, "[0, ∞)", "friction takes energy, it does not give any");
+            }
+            if speed <= 0.0 {
+                let remedy = "it is the speed at which friction falls";
+                return refuse("speed of Stribeck friction", speed, "(0, ∞)", remedy);
+            }
+        }
+        if self.frictions.is_empty() {
+            return Ok(());
+        }
+        for (i, Equation { structure, .. }) in self.equations.iter().enumerate() {
+            // An input must not jump in a velocity. Other bodies, which friction moves, may depend on each other's
+            // accelerations.
+            let above = |order: f64| order >= structure.order - ORDER_GRAIN;
+            if let Some(term) =
+                structure.terms.iter().find(|t| above(t.order) && self.output_index(i, t.signal).is_none())
+            {
+                let rubs = self.frictions.iter().any(|f| f.0 == i);
+                let name = if rubs { "order beside friction" } else { "order of what drives a body" };
+                return refuse(name, term.order, "below that of the body", "lower it");
+            }
+        }
+        check_regular(&self.equations)?;
+        self.check_response_to_forces()?;
+        for channel in self.state_channels().into_iter().filter(|channel| channel.is_at_ends()) {
+            let structure = &self.equations[channel.equation()].structure;
+            let limit = structure.order - 1.0;
+            let above = |term: &&Term| term.signal >= self.recorded && term.order > limit - MIN_INTEGRATION_ORDER;
+            if let Some(term) = structure.terms.iter().find(above) {
+                return Err(Error::OutOfRange {
+                    name: "order of a non-linear term beside friction".into(),
+                    value: term.order,
+                    range: format!("below {limit}, the order of the equation minus 1"),
+                    remedy: "lower it, or leave the friction out".into(),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Return an error if coupled accelerations move a body against a force on it, so that friction has no unique
+    /// solution.
+    ///
+    /// Terms above a body's own order are checked on the grid instead.
+    fn check_response_to_forces(&self) -> Result<()> {
+        let (n, links) = (self.equations.len(), self.links());
+        let bodies: Vec<usize> = self.frictions.iter().map(|friction| friction.0).collect();
+        if links.iter().flatten().any(|link| link.integration < -ORDER_GRAIN) {
+            return Ok(());
+        }
+        let mut matrix = vec![0.0; n * n];
+        for (i, row) in links.iter().enumerate() {
+            matrix[i * n + i] = 1.0;
+            for link in row.iter().filter(|link| link.integration.abs() < ORDER_GRAIN) {
+                matrix[i * n + link.output] -= link.coefficient;
+            }
+        }
+        let inverse = small::inverse(&matrix, n)?;
+        let pairs = bodies.iter().flat_map(|&a| bodies.iter().map(move |&b| (a, b)));
+        let accelerations: Vec<f64> = pairs.map(|(a, b)| inverse[a * n + b]).collect();
+        if is_p_matrix(&accelerations, bodies.len()) {
+            return Ok(());
+        }
+        Err(Error::Structure {
+            what: "bodies with friction hand each other so much of their accelerations that a force on one moves it \
+                   against the force"
+                .into(),
+            remedy: "make the coefficients of each other's accelerations smaller, as those of inertias are".into(),
+        })
+    }
+
+    /// Terms of each equation with a simulated output as signal.
+    pub(super) fn links(&self) -> Vec<Vec<Link>> {
+        let of = |(i, Equation { structure, coefficients }): (usize, &Equation)| {
+            (structure.terms.iter().zip(coefficients))
+                .filter_map(|(term, &coefficient)| {
+                    let (order, integration) = (term.order, structure.order - term.order);
+                    self.output_index(i, term.signal).map(|output| Link { output, order, integration, coefficient })
+                })
+                .collect()
+        };
+        self.equations.iter().enumerate().map(of).collect()
+    }
+
+    /// Whether an output enters the end velocities of another one by its means, as an input does: an output of an order
+    /// up to 1, such as that of an actuator, has no velocity at an edge.
+    pub(super) fn enters_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
+        let order = self.equations[output].structure.order;
+        output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER && integration > 1.0 + MAX_FEEDTHROUGH_ORDER
+    }
+
+    /// State channels: the outputs, then the derivatives that expressions, friction and coupled terms need.
+    pub(super) fn state_channels(&self) -> Vec<StateChannel> {
+        let mut states: Vec<StateChannel> =
+            (0..self.equations.len()).map(|equation| StateChannel::Mean { equation, order: 0.0 }).collect();
+        let add = |states: &mut Vec<StateChannel>, channel: StateChannel| {
+            if !states.iter().any(|state| state.is_same(channel)) {
+                states.push(channel);
+            }
+        };
+        for (i, equation) in self.equations.iter().enumerate() {
+            for term in equation.structure.terms.iter().filter(|term| term.signal >= self.recorded) {
+                for &(signal, order) in &self.derived[term.signal - self.recorded].channels {
+                    if let Some(equation) = self.output_index(i, signal) {
+                        add(&mut states, StateChannel::Mean { equation, order });
+                    }
+                }
+            }
+        }
+        self.frictions.iter().for_each(|&(equation, _)| add(&mut states, StateChannel::EndVelocity { equation }));
+        // A derivative of an output has terms with the same derivative of the outputs coupled to it, except for those that
+        // enter its end velocity by their means.
+        let mut done = 0;
+        while done < states.len() {
+            let channel = states[done];
+            for term in &self.equations[channel.equation()].structure.terms {
+                let eta = self.equations[channel.equation()].structure.order - term.order;
+                match self.output_index(channel.equation(), term.signal) {
+                    Some(l) if !(channel.is_at_ends() && self.enters_by_means(channel.equation(), l, eta)) => {
+                        add(&mut states, channel.with_equation(l));
+                    }
+                    _ => {}
+                }
+            }
+            done += 1;
+        }
+        states
+    }
+}
+
+/// Error for non-linear terms beside something else.
+pub(crate) fn refuse_beside(what: &str, remedy: &str) -> Error {
+    Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
+}
