@@ -8,8 +8,8 @@
 //! 3. [`equation`]: terms, orders, order laws, sensor filters; solvability of coupled equations;
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
 //! 5. [`estimation`]: coefficients at fixed orders by least squares, multi-innovation least squares and instrumental
-//!    variables; orders and coefficients together by joint output error; [`friction`]: simulation and output error
-//!    with dry friction; [`expression`], [`nonlinear`]: the same with non-linear terms;
+//!    variables; orders and coefficients together by joint output error; [`friction`]: dry friction in one pulse;
+//!    [`expression`], [`nonlinear`]: simulation and output error with friction and non-linear terms;
 //! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, limits and sensor filters, sampled on any grid;
 //! 7. [`order_search`]: orders by exhaustive search over an order grid;
 //! 8. [`simulate`], [`state_space`], [`output_samples`], [`signal::metrics`]: simulation by pulse means, exactly, and at

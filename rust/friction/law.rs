@@ -207,36 +207,40 @@ impl FrictionLaw {
 
     /// Derivatives of the friction and of the end velocity of a pulse.
     #[must_use]
-    pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, moves: &PulseDerivatives) -> (f64, f64) {
-        let of = |mean: &Mean| mean.law.iter().zip(&moves.law).map(|(a, b)| a * b).sum::<f64>();
+    pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, derivatives: &PulseDerivatives) -> (f64, f64) {
+        let of = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();
         match at.phase {
-            Phase::Stick if g > 0.0 && self.breakaway() > 0.0 => ((moves.free - at.force * moves.first) / g, 0.0),
+            Phase::Stick if g > 0.0 && self.breakaway() > 0.0 => {
+                ((derivatives.free - at.force * derivatives.first) / g, 0.0)
+            }
             Phase::Stick => (0.0, 0.0),
             Phase::Slip => {
                 let side = if v == 0.0 { at.end.signum() } else { v.signum() };
                 let mean = self.mean_with_slopes(side * v, (side * at.end).max(0.0));
-                let by_law = of(&mean) + mean.from * side * moves.start;
-                let end = (side * (moves.free - at.force * moves.first) - g * by_law) / (1.0 + g * mean.to);
+                let by_law = of(&mean) + mean.from * side * derivatives.start;
+                let end = (side * (derivatives.free - at.force * derivatives.first) - g * by_law) / (1.0 + g * mean.to);
                 (side * (by_law + mean.to * end), side * end)
             }
             Phase::Turn => {
                 let side = v.signum();
                 let (speed, push) = (side * v, side * (v - p));
-                let (speed_moves, push_moves) = (side * moves.start, side * (moves.start - moves.free));
+                let (speed_derivative, push_derivative) =
+                    (side * derivatives.start, side * (derivatives.start - derivatives.free));
                 let before = self.mean_with_slopes(0.0, speed);
-                let before_moves = of(&before) + before.to * speed_moves;
+                let before_derivative = of(&before) + before.to * speed_derivative;
                 let whole = g * before.value + push;
                 let until = speed / whole;
-                let whole_moves = moves.first * before.value + g * before_moves + push_moves;
-                let until_moves = (speed_moves - until * whole_moves) / whole;
+                let whole_derivative = derivatives.first * before.value + g * before_derivative + push_derivative;
+                let until_derivative = (speed_derivative - until * whole_derivative) / whole;
                 let left = 1.0 - until;
                 let after = self.mean_with_slopes(0.0, at.end.abs());
                 let by_law = of(&after);
-                let back = (left * (push_moves - moves.first * after.value - g * by_law)
-                    - until_moves * (push - g * after.value))
+                let back = (left * (push_derivative - derivatives.first * after.value - g * by_law)
+                    - until_derivative * (push - g * after.value))
                     / (1.0 + left * g * after.to);
-                let after_moves = by_law + after.to * back;
-                let force = until_moves * (before.value + after.value) + until * before_moves - left * after_moves;
+                let after_derivative = by_law + after.to * back;
+                let force = until_derivative * (before.value + after.value) + until * before_derivative
+                    - left * after_derivative;
                 (side * force, -side * back)
             }
         }

@@ -92,7 +92,7 @@ pub(super) struct ForcingTerms {
 }
 
 /// Derivatives of a system with respect to one parameter.
-pub(super) struct Moves {
+pub(super) struct SystemDerivatives {
     /// Derivatives of coefficient and integration order of each term of each equation, and of its friction.
     pub(super) terms: Vec<Vec<(f64, f64)>>,
     /// Derivatives of the forcing by initial terms.
@@ -104,7 +104,7 @@ pub(super) struct Moves {
 }
 
 /// Why a pulse has no solution.
-pub(super) enum Failure {
+pub(super) enum PulseFailure {
     /// A value left the range of numbers.
     Overflow,
     /// A function has no value for this argument.

@@ -3,7 +3,7 @@
 //! The end velocity of a body is V = P − G φ. P is the end velocity without the friction φ, G the linear response within
 //! the pulse. Non-linear terms change P little within a pulse, so that the iteration for φ converges in a few steps.
 
-use super::channels::{Failure, ForcingTerms, Moves};
+use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
 use crate::error::Result;
 use crate::friction::contact::{ContactLaw, VELOCITY_ROUNDING_RATIO};
 use crate::friction::law::{FrictionLaw, Phase, Pulse as FrictionPulse, PulseDerivatives};
@@ -19,7 +19,7 @@ const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
 /// Equations of a pulse at given friction.
 pub(super) trait PulseEquations {
     /// Solve the equations for the state channels at these frictions.
-    fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), Failure>;
+    fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), PulseFailure>;
 
     /// Value of a state channel.
     fn channel(&mut self, state: usize) -> &mut f64;
@@ -65,7 +65,7 @@ pub(super) struct PulseContact {
 }
 
 /// Derivatives of the bodies with respect to a parameter.
-pub(super) struct BodyMoves {
+pub(super) struct BodyDerivatives {
     /// Initial output and velocity of each body.
     pub(super) starts: Vec<(f64, f64)>,
     /// Derivative of the own gain of each body.
@@ -163,7 +163,12 @@ impl ContactOperators {
     }
 
     /// Derivatives of the bodies from those of the weights of sources, row by row.
-    pub(super) fn moves(&self, gains: &[f64], gain_moves: &[f64], moves: &Moves) -> Result<BodyMoves> {
+    pub(super) fn derivatives(
+        &self,
+        gains: &[f64],
+        gain_derivatives: &[f64],
+        derivatives: &SystemDerivatives,
+    ) -> Result<BodyDerivatives> {
         let (states, n) = (self.states, self.count());
         let count = gains.len() / states;
         let of = |a: usize| -> f64 {
@@ -172,23 +177,23 @@ impl ContactOperators {
                 .map(|s| (0..states).map(|r| self.inverse[s * states + r] * gains[r * count + friction]).sum())
                 .collect();
             let moved = (0..states).map(|s| {
-                let row = &gain_moves[s * count..(s + 1) * count];
+                let row = &gain_derivatives[s * count..(s + 1) * count];
                 row[friction] + row[..states].iter().zip(&response).map(|(g, x)| g * x).sum::<f64>()
             });
             moved.enumerate().map(|(s, v)| -self.inverse[self.velocities[a] * states + s] * v).sum()
         };
-        let mut starts = moves.forcing.starts.clone();
+        let mut starts = derivatives.forcing.starts.clone();
         starts.resize(n, (0.0, 0.0));
-        let mut laws = moves.laws.clone();
+        let mut laws = derivatives.laws.clone();
         laws.resize(n, [0.0; 3]);
-        Ok(BodyMoves { starts, gains: (0..n).map(of).collect(), laws })
+        Ok(BodyDerivatives { starts, gains: (0..n).map(of).collect(), laws })
     }
 
     /// Add the derivatives of the frictions of a pulse to those of the sources; update those of outputs and velocities.
     pub(super) fn add_friction_derivatives(
         &self,
         at: &[PulseContact],
-        moves: &BodyMoves,
+        derivatives: &BodyDerivatives,
         motion: &mut [(f64, f64)],
         (gains, inverse): (&[f64], &[f64]),
         x: &mut [f64],
@@ -211,12 +216,12 @@ impl ContactOperators {
                 let direct = if a == b { 1.0 - rise * own } else { 0.0 };
                 matrix[a * n + b] = direct - rise * responses[b][self.velocities[a]];
             }
-            let end = moves.starts[a].1 + x[self.velocities[a]];
+            let end = derivatives.starts[a].1 + x[self.velocities[a]];
             let moved = PulseDerivatives {
                 start: motion[a].1,
-                free: end + pulse.force * moves.gains[a],
-                first: moves.gains[a],
-                law: moves.laws[a],
+                free: end + pulse.force * derivatives.gains[a],
+                first: derivatives.gains[a],
+                law: derivatives.laws[a],
             };
             right[a] = self.law.law(a).slope(start, free, own, &pulse, &moved).0;
         }
@@ -227,7 +232,7 @@ impl ContactOperators {
             x[count - n + b] = force;
         }
         for (a, motion) in motion.iter_mut().enumerate() {
-            *motion = (x[self.outputs[a]], moves.starts[a].1 + x[self.velocities[a]]);
+            *motion = (x[self.outputs[a]], derivatives.starts[a].1 + x[self.velocities[a]]);
         }
         Ok(())
     }
@@ -245,7 +250,7 @@ impl ContactSolver<'_> {
     ///
     /// A constant friction cannot balance a force that varies within the pulse. The mean output of a resting body would
     /// drift with the square of the step, so the solver fixes it.
-    pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), Failure> {
+    pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), PulseFailure> {
         for (rests, (before, now)) in self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities)) {
             *rests = before.1 && *now == 0.0;
         }
@@ -266,7 +271,7 @@ impl ContactSolver<'_> {
         }
     }
 
-    fn solve_friction(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), Failure> {
+    fn solve_friction(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), PulseFailure> {
         let (contact, n) = (self.contact, self.contact.count());
         let mut miss = f64::INFINITY;
         let mut size: f64 = 0.0;
@@ -288,14 +293,14 @@ impl ContactSolver<'_> {
                 self.forces[a] = found.force;
             }
             if self.at.iter().any(|(_, found)| found.end.is_nan()) {
-                return Err(Failure::Overflow);
+                return Err(PulseFailure::Overflow);
             }
             if miss <= FRICTION_ROUNDING_RATIO * size {
                 break;
             }
         }
         if miss > MAX_FRICTION_ERROR_RATIO * size {
-            return Err(Failure::Contact);
+            return Err(PulseFailure::Contact);
         }
         for (a, (_, found)) in self.at.iter().enumerate() {
             *pulse.channel(contact.velocities[a]) = found.end - self.initial_velocities[a];

@@ -6,8 +6,8 @@
 //! an unstable linear part loses no digits. The mean of a pulse enters its own equation; Newton iterations that start
 //! at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
 
-use super::channels::{Failure, ForcingTerms, IntegralKernel, Moves, StateChannel};
-use super::contact::{BodyMotion, BodyMoves, ContactOperators, PulseContact, PulseEquations};
+use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
+use super::contact::{BodyDerivatives, BodyMotion, ContactOperators, PulseContact, PulseEquations};
 use super::convolution::{average_neighbors, product, ConvolutionKernel, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
 use super::initial_state::{channel_powers, means_of, EndForcing, Link};
 use super::system::{NonlinearSystem, MIN_INTEGRATION_ORDER};
@@ -27,8 +27,8 @@ const MAX_STEP_HALVINGS: usize = 12;
 /// Newton step, relative to the terms of the channel, that ends the iteration. Convergence is quadratic, so the next one is below
 /// rounding, and the linearization before it is that of the solution to this relative error.
 const NEWTON_TOLERANCE: f64 = 1e-8;
-/// Residual, relative to the terms of the channel, that no step reduces reliably.
-const RESIDUAL_ROUNDING_RATIO: f64 = 8.0 * f64::EPSILON;
+/// Residual of a channel, relative to its terms, that is rounding.
+const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
 
 /// Channel of an expression: a state channel, or a known signal or derivative.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -355,11 +355,11 @@ impl Operators {
             };
             if let Err(failure) = solved {
                 let (why, is_overflow) = match failure {
-                    Failure::Overflow => (String::new(), true),
-                    Failure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
+                    PulseFailure::Overflow => (String::new(), true),
+                    PulseFailure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
                     // Integrals of short pulses are small, so that only growth within a pulse has no solution.
-                    Failure::Contact => ("no friction agrees with the motion".into(), false),
-                    Failure::Newton(why) => (why.into(), !self.algebraic),
+                    PulseFailure::Contact => ("no friction agrees with the motion".into(), false),
+                    PulseFailure::Newton(why) => (why.into(), !self.algebraic),
                 };
                 return (run, Some(End { index: k, why, is_overflow }));
             }
@@ -545,7 +545,7 @@ impl<'a> Pulse<'a> {
     }
 
     /// Solve the pulse from the current z, with the present frictions.
-    fn solve(&mut self) -> std::result::Result<(), Failure> {
+    fn solve(&mut self) -> std::result::Result<(), PulseFailure> {
         let states = self.z.len();
         let mut norm = self.evaluate();
         if !norm.is_finite() && self.free.iter().all(|v| v.is_finite()) {
@@ -558,18 +558,16 @@ impl<'a> Pulse<'a> {
                 return Err(self.describe_fault());
             }
             if !self.linearize() {
-                return Err(Failure::Newton("its linearization is singular"));
-            }
-            // Rounding of a large channel may exceed the tolerance of a small one that it enters.
-            let is_rounding = |(residual, size): (&f64, &f64)| residual.abs() <= RESIDUAL_ROUNDING_RATIO * size;
-            if self.residual.iter().zip(&self.sizes).all(is_rounding) {
-                return Ok(());
+                return Err(PulseFailure::Newton("its linearization is singular"));
             }
             let mut is_small = true;
             for a in 0..states {
                 let row = &self.inverse[a * states..(a + 1) * states];
                 self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
-                is_small &= self.step[a].abs() <= NEWTON_TOLERANCE * self.sizes[a];
+                // A channel of small terms receives the rounding of large ones.
+                let rounding: f64 = row.iter().zip(&self.sizes).map(|(v, size)| (v * size).abs()).sum();
+                let tolerance = NEWTON_TOLERANCE * self.sizes[a] + ROUNDING_RATIO * rounding;
+                is_small &= self.step[a].abs() <= tolerance;
             }
             self.before.clone_from(&self.z);
             let (mut share, mut left) = (1.0, MAX_STEP_HALVINGS);
@@ -593,16 +591,16 @@ impl<'a> Pulse<'a> {
         Err(NO_DESCENT)
     }
 
-    fn describe_fault(&self) -> Failure {
+    fn describe_fault(&self) -> PulseFailure {
         match self.fault {
-            Some((name, argument)) if argument.abs() < OVERFLOW_SIZE => Failure::Domain(name, argument),
-            _ => Failure::Overflow,
+            Some((name, argument)) if argument.abs() < OVERFLOW_SIZE => PulseFailure::Domain(name, argument),
+            _ => PulseFailure::Overflow,
         }
     }
 }
 
 impl PulseEquations for Pulse<'_> {
-    fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), Failure> {
+    fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), PulseFailure> {
         let terms = self.operators.terms.len();
         self.values[terms..].copy_from_slice(frictions);
         self.solve()
@@ -619,7 +617,7 @@ impl PulseEquations for Pulse<'_> {
 
 /// Size beyond which a value without a result is an overflow, not outside of a function's domain.
 const OVERFLOW_SIZE: f64 = 1e60;
-const NO_DESCENT: Failure = Failure::Newton("no Newton step reduces its residual");
+const NO_DESCENT: PulseFailure = PulseFailure::Newton("no Newton step reduces its residual");
 
 /// Products of sources with kernels and with their derivatives, computed when first needed.
 pub(super) struct FrozenProducts<'a> {
@@ -674,17 +672,17 @@ impl Operators {
         record: &Record,
         run: &LinearizedRun,
         frozen: &mut FrozenProducts<'_>,
-        moves: &Moves,
+        derivatives: &SystemDerivatives,
     ) -> Result<Vec<Vec<f64>>> {
         let states = self.states.len();
-        let mut forcing = moves.forcing.channels.clone();
+        let mut forcing = derivatives.forcing.channels.clone();
         forcing.resize(states, vec![0.0; self.m]);
         let add = |row: &mut Vec<f64>, weight: f64, part: &[f64]| {
             row.iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
         };
         for lane in &self.lanes {
             for part in &lane.contributions {
-                let (coefficient, order) = moves.terms[part.at.0][part.at.1];
+                let (coefficient, order) = derivatives.terms[part.at.0][part.at.1];
                 if coefficient != 0.0 {
                     add(&mut forcing[lane.state], coefficient, frozen.of(lane.kernel, part.source, false));
                 }
@@ -694,10 +692,10 @@ impl Operators {
             }
         }
         for (signal, lanes) in self.inputs_by_signal() {
-            let moved = moves.inputs.iter().find(|(of, _)| *of == signal).map(|(_, slope)| Kernel::new(slope));
+            let moved = derivatives.inputs.iter().find(|(of, _)| *of == signal).map(|(_, slope)| Kernel::new(slope));
             let mut spectrum = None;
             for lane in lanes {
-                let (coefficient, order) = moves.terms[lane.at.0][lane.at.1];
+                let (coefficient, order) = derivatives.terms[lane.at.0][lane.at.1];
                 let weight = system.equations[lane.at.0].coefficients[lane.at.1];
                 if coefficient != 0.0 || order != 0.0 {
                     let spectrum = spectrum.get_or_insert_with(|| Kernel::new(record.signal(signal)));
@@ -718,14 +716,14 @@ impl Operators {
         }
         let mut known = Vec::new();
         for (at, ((signal, order), _)) in self.known.iter().enumerate() {
-            if let Some((_, slope)) = moves.inputs.iter().find(|(of, _)| of == signal) {
+            if let Some((_, slope)) = derivatives.inputs.iter().find(|(of, _)| of == signal) {
                 known.push((at, derivative(slope, *order, self.step)?));
             }
         }
         let bodies = match &self.contact {
             Some(contact) => {
-                let gain_moves = self.gain_moves(moves, frozen);
-                Some((contact, contact.moves(&self.gains, &gain_moves, moves)?))
+                let gain_derivatives = self.gain_derivatives(derivatives, frozen);
+                Some((contact, contact.derivatives(&self.gains, &gain_derivatives, derivatives)?))
             }
             None => None,
         };
@@ -733,13 +731,13 @@ impl Operators {
     }
 
     /// Derivatives of the weights of sources within a pulse, row by row.
-    fn gain_moves(&self, moves: &Moves, frozen: &mut FrozenProducts<'_>) -> Vec<f64> {
+    fn gain_derivatives(&self, derivatives: &SystemDerivatives, frozen: &mut FrozenProducts<'_>) -> Vec<f64> {
         let count = self.sources();
         let mut out = vec![0.0; self.gains.len()];
         for lane in &self.lanes {
             let first = self.kernels[lane.kernel].values().first().copied().unwrap_or(0.0);
             for part in &lane.contributions {
-                let (coefficient, order) = moves.terms[part.at.0][part.at.1];
+                let (coefficient, order) = derivatives.terms[part.at.0][part.at.1];
                 let slope = if order == 0.0 { 0.0 } else { frozen.kernel_slope(lane.kernel)[0] };
                 out[lane.state * count + part.source] += coefficient * first + part.weight * order * slope;
             }
@@ -753,7 +751,7 @@ impl Operators {
         run: &LinearizedRun,
         forcing: &[Vec<f64>],
         known: &[(usize, Vec<f64>)],
-        bodies: Option<(&ContactOperators, BodyMoves)>,
+        bodies: Option<(&ContactOperators, BodyDerivatives)>,
     ) -> Result<Vec<Vec<f64>>> {
         let (states, terms, values, count) = (self.states.len(), self.terms.len(), self.values(), self.sources());
         let width = states + self.known.len();
@@ -761,7 +759,7 @@ impl Operators {
         let mut lanes: Vec<OnlineConvolution<'_>> =
             self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
         let (mut free, mut x) = (vec![0.0; states], vec![0.0; count]);
-        let mut bodies = bodies.map(|(contact, moves)| (contact, moves.starts.clone(), moves));
+        let mut bodies = bodies.map(|(contact, derivatives)| (contact, derivatives.starts.clone(), derivatives));
         for k in 0..self.m {
             free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
@@ -788,9 +786,9 @@ impl Operators {
             for a in 0..states {
                 x[a] = (0..states).map(|b| inverse[a * states + b] * free[b]).sum();
             }
-            if let Some((contact, motion, moves)) = &mut bodies {
+            if let Some((contact, motion, derivatives)) = &mut bodies {
                 let at = &run.contacts[k * contact.count()..(k + 1) * contact.count()];
-                contact.add_friction_derivatives(at, moves, motion, (&self.gains, inverse), &mut x)?;
+                contact.add_friction_derivatives(at, derivatives, motion, (&self.gains, inverse), &mut x)?;
             }
             for q in 0..terms {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();

@@ -1,6 +1,6 @@
 //! Parameters of equations with non-linear terms: residuals of all experiments and their derivatives.
 
-use super::channels::{ForcingTerms, Moves};
+use super::channels::{ForcingTerms, SystemDerivatives};
 use super::initial_state::{merge_powers, State};
 use super::march::{FrozenProducts, LinearizedRun, Operators};
 use super::system::{refuse_beside, NonlinearSystem};
@@ -155,13 +155,13 @@ impl NonlinearModel {
     }
 
     fn states(&self, orders: &[f64]) -> (Vec<State>, Vec<Equation>) {
-        let moves = |i: usize, term: usize| {
+        let is_order_free = |i: usize, term: usize| {
             let alpha = &self.model.equations[i].order.weights;
             let own = &self.model.equations[i].terms[term].1.weights;
             alpha.iter().zip(own).any(|(a, w)| (a - w).abs() > 0.0)
         };
         let equations = self.system(orders, &vec![0.0; self.model.coordinates.len()], 0).equations;
-        (State::all(&equations, &self.model.initial, &self.filtered, moves), equations)
+        (State::all(&equations, &self.model.initial, &self.filtered, is_order_free), equations)
     }
 
     /// Forcing by the initial states of a run.
@@ -175,9 +175,9 @@ impl NonlinearModel {
     }
 
     /// Derivatives of the system with respect to a parameter.
-    fn moves(&self, point: &Point, run: usize, part: &Part, moved: &Parameter) -> Result<Moves> {
+    fn derivatives(&self, point: &Point, run: usize, part: &Part, moved: &Parameter) -> Result<SystemDerivatives> {
         let (values, equations) = (&point.states[run], &self.model.equations);
-        let mut moves = Moves {
+        let mut derivatives = SystemDerivatives {
             terms: equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len() + 1]).collect(),
             forcing: ForcingTerms::default(),
             laws: Vec::new(),
@@ -203,7 +203,7 @@ impl NonlinearModel {
         match *moved {
             Parameter::Order(j) => {
                 let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
-                for (terms, equation) in moves.terms.iter_mut().zip(equations) {
+                for (terms, equation) in derivatives.terms.iter_mut().zip(equations) {
                     let alpha = of(&equation.order.weights);
                     let orders = equation.terms.iter().map(|t| alpha - of(&t.1.weights)).chain([alpha]);
                     *terms = orders.map(|order| (0.0, order)).collect();
@@ -214,15 +214,15 @@ impl NonlinearModel {
                         orders[j] += by;
                         (orders, point.coefficients.clone())
                     };
-                    moves.forcing = difference(&shifted, DIFFERENCE_STEP)?;
+                    derivatives.forcing = difference(&shifted, DIFFERENCE_STEP)?;
                 }
             }
             Parameter::Coefficient(j) => {
-                for (terms, equation) in moves.terms.iter_mut().zip(equations) {
+                for (terms, equation) in derivatives.terms.iter_mut().zip(equations) {
                     let coefficients = equation.terms.iter().map(|t| t.2.slope(&point.coefficients, j)).chain([0.0]);
                     *terms = coefficients.map(|coefficient| (coefficient, 0.0)).collect();
                 }
-                moves.laws = self.frictions.iter().map(|(_, law)| law.slope(&point.coefficients, j)).collect();
+                derivatives.laws = self.frictions.iter().map(|(_, law)| law.slope(&point.coefficients, j)).collect();
                 if !idle {
                     let by = DIFFERENCE_STEP * point.coefficients[j].abs().max(1.0);
                     let shifted = |by: f64| {
@@ -230,17 +230,17 @@ impl NonlinearModel {
                         coefficients[j] += by;
                         (point.orders.clone(), coefficients)
                     };
-                    moves.forcing = difference(&shifted, by)?;
+                    derivatives.forcing = difference(&shifted, by)?;
                 }
             }
             Parameter::State(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
                 let at = (point.orders.as_slice(), point.coefficients.as_slice(), unit.as_slice());
-                moves.forcing = self.initial_forcing(&part.operators, at)?;
+                derivatives.forcing = self.initial_forcing(&part.operators, at)?;
             }
-            Parameter::Input(k) => moves.inputs.push((self.model.inputs[k].signal, part.input_slopes[k].clone())),
+            Parameter::Input(k) => derivatives.inputs.push((self.model.inputs[k].signal, part.input_slopes[k].clone())),
         }
-        Ok(moves)
+        Ok(derivatives)
     }
 
     /// Record with transformed inputs, and their derivatives in the free parameters. None without free inputs.
@@ -400,8 +400,8 @@ impl NonlinearModel {
                         slopes
                     }
                     _ => {
-                        let moves = self.moves(point, index, part, moved)?;
-                        part.operators.sensitivity(&part.system, record, &part.run, &mut frozen, &moves)?
+                        let derivatives = self.derivatives(point, index, part, moved)?;
+                        part.operators.sensitivity(&part.system, record, &part.run, &mut frozen, &derivatives)?
                     }
                 };
                 // Residuals are measurement minus response.

@@ -266,6 +266,17 @@ def test_what_a_march_does_not_know_is_refused(options, said: str) -> None:
         ftlm.equation(BLOCK, **options)
 
 
+def test_an_unstable_body_is_recovered() -> None:
+    words, truth = "D^2 y = k y + b u - fc*sign(D y)", {"k": 1.0, "b": 1.0, "fc": 0.3}
+    times, rng = np.arange(401) * 0.01, np.random.default_rng(0)
+    force = 1.5 * np.sin(2.2 * times) + 0.8 * np.sin(5.1 * times + 1.0)
+    y = ftlm.Model(ftlm.equation(words, fixed=truth)).simulate(run_of(force, 0.01))["y"]
+    y = y + 0.005 * np.std(y) * rng.standard_normal(y.size)
+    found = ftlm.identify(run_of(force, 0.01, y), ftlm.equation(words, initial="rest"), threads=1)
+    for name, value in truth.items():
+        assert abs(found.coefficients[name] - value) < 4.0 * found.standard_errors[name] < 0.02, name
+
+
 @pytest.mark.parametrize("delay", [0.053, 0.06])
 def test_a_free_delay_is_estimated_beside_friction(delay: float) -> None:
     """A delay within a row and one of whole rows, from bounds far from both."""
