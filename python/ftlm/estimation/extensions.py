@@ -25,7 +25,7 @@ from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.model_checks import enumerate_names
-from ftlm.estimation.nuisance_parameters import output_sensitivities
+from ftlm.estimation.nuisance_parameters import output_sensitivities, screen_initial_conditions
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
@@ -547,6 +547,9 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
         return []
+    if joint.unstable_optimum is not None and joint.unstable_optimum.is_accepted:
+        # An unstable model has no steady state.
+        return []
     if all(rest_evidence(run, structure) is not None for run in runs):
         # Another finding states the evidence of rest, or that rest is assumed.
         return []
@@ -556,11 +559,14 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
     for initial, offset in ALTERNATIVE_INITIAL_CONDITIONS if own else ():
         if (initial, offset) == taken:
             continue
+        asked = replace(structure, initial=initial, offset=offset)
         try:
-            other = fit_output_error(runs, replace(structure, initial=initial, offset=offset), near=joint, refine=False)
+            if not _squares_ratio(screen_initial_conditions(joint, runs, asked), joint) <= MAX_SQUARES_RATIO:
+                continue
+            other = fit_output_error(runs, asked, near=joint, refine=False)
         except FtlmError:
             continue
-        ratio = max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
+        ratio = _squares_ratio(other, joint)
         if not ratio <= MAX_SQUARES_RATIO or other.unstable_optimum is not None:
             continue
         for pair, (gain, error) in _gains(other, structure).items():
@@ -573,6 +579,11 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
                 worst = distance, make_finding("start_not_told", **about, **numbers, **words)
     return [worst[1]] if worst else []
+
+
+def _squares_ratio(other: JointFit, joint: JointFit) -> float:
+    """Return the largest ratio over outputs of the sums of squares of two fits."""
+    return max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:

@@ -46,6 +46,7 @@ from ftlm.estimation.nuisance_parameters import (
     has_white_residuals,
     offset_test,
     output_sensitivities,
+    screen_initial_conditions,
     unrequested_offset_findings,
 )
 from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
@@ -88,6 +89,8 @@ LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
 MOTION_OFFSETS: tuple[Literal["none"], Literal["level"]] = ("none", "level")
 #: Mean of an output, in its standard deviations, from which on it shows a level.
 LEVEL_DEVIATIONS = 3.0
+#: Residuals of an output, in its standard deviations, from which on a fit has failed.
+MAX_RESIDUAL_SHARE = 0.5
 #: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
@@ -143,17 +146,23 @@ class Hypotheses:
         """Return the complete fit of a structure."""
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
-    def refit(self, structure: Structure, fit: Fit) -> Fit:
-        """Return the fit of a structure from the optimum of another one that differs only in initial conditions."""
-        joint = fit.joint
+    def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
+        """Return the fit of a structure from the optimum of another one that differs only in initial conditions.
+
+        None if it is not accepted, where a screening shows this without a fit.
+        """
+        joint, runs = fit.joint, fit.task.runs
         if joint is None or self.complete is None:
-            return self.fit(structure)
+            refit = self.fit(structure)
+            return refit if refit.joint is not None and accepts(refit.joint) else None
+        asked = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
+        if not accepts(screen_initial_conditions(joint, runs, asked)):
+            return None
         loss: Loss = "squares" if joint.robust is None else "huber"
-        known = {n: v[0] for n, v in structure.order_values.items() if len(v) == 1}
         # The refinement of a fit is that of the finer of its two last grids.
         coarser = replace(joint, refinement=max(joint.refinement // 2, 1))
-        near = fit_output_error(fit.task.runs, structure.with_orders(known), near=coarser, loss=loss)
-        return replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
+        near = fit_output_error(runs, asked, near=coarser, loss=loss)
+        return replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin)) if accepts(near) else None
 
 
 def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
@@ -199,16 +208,19 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
     least, chosen = fit_score(joint, joint) - START_SETTINGS.history_margin, None
     for offset in MOTION_OFFSETS:
         asked = replace(structure, initial="caputo", offset=offset)
+        levels = len(runs) * len(fit.model.outputs) * (offset == "level")
+
+        def is_better(found: JointFit, *, most: float = least, levels: int = levels) -> bool:
+            return fit_score(found, joint, levels) < most
+
         try:
-            other = hypotheses.refit(asked, fit)
+            other = hypotheses.refit(asked, fit, is_better)
         except FtlmError:
             continue
-        levels = len(runs) * len(fit.model.outputs) * (offset == "level")
-        if other.joint is None or other.joint.unstable_optimum is not None:
+        if other is None or other.joint is None or other.joint.unstable_optimum is not None:
             continue
-        score = fit_score(other.joint, joint, levels)
-        if score < least and (slow or has_white_residuals(other.joint)):
-            least, chosen = score, (asked, other)
+        if slow or has_white_residuals(other.joint):
+            least, chosen = fit_score(other.joint, joint, levels), (asked, other)
     if chosen is None:
         return None
     whole = hypotheses.take(*chosen)
@@ -222,21 +234,28 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, s
     Two fits are compared with the noise color of the fit with the larger residuals. If the means of the outputs show a
     level, the optimum moves far and the fit is new; otherwise it starts from the optimum without a level.
     """
-    best, chosen, numbers = fit.joint, None, 0
-    margin = START_SETTINGS.history_margin if best is not None and isinstance(best.initial, History) else 0.0
+    if fit.joint is None:
+        return None
+    best, numbers = fit.joint, 0
+    chosen: tuple[Structure, Fit] | None = None
+    margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
+    more = len(fit.task.runs) * len(fit.model.outputs)
+
+    def is_preferred(joint: JointFit) -> bool:
+        worse = max((best, joint), key=lambda found: math.prod(found.noise.values()))
+        return fit_score(joint, worse, more) < fit_score(best, worse, numbers) + margin
+
     for initial in LEVEL_STARTS:
         asked = replace(structure, initial=initial, offset="level")
         try:
-            level = hypotheses.fit(asked) if shown else hypotheses.refit(asked, fit)
+            fresh = shown and chosen is None
+            near = fit if chosen is None else chosen[1]
+            level = hypotheses.fit(asked) if fresh else hypotheses.refit(asked, near, is_preferred)
         except FtlmError:
             continue
-        if best is None or level.joint is None:
-            continue
-        more = len(fit.task.runs) * len(fit.model.outputs)
-        worse = max((best, level.joint), key=lambda joint: math.prod(joint.noise.values()))
-        if fit_score(level.joint, worse, more) < fit_score(best, worse, numbers) + margin:
+        if level is not None and level.joint is not None and is_preferred(level.joint):
             best, chosen, numbers, margin = level.joint, (asked, level), more, 0.0
-    if chosen is None or best is None:
+    if chosen is None:
         return None
     whole = hypotheses.take(*chosen)
     was = "rested" if best.initial == "rest" else "moved"
@@ -247,11 +266,20 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, s
 
 
 def _shows_level(fit: Fit) -> bool:
-    """Whether a fit chose nonzero initial conditions for outputs whose mean is large against their deviation."""
-    if fit.joint is None or fit.joint.initial == "rest" or fit.task.structure.initial != "auto":
+    """Whether a fit with nonzero initial conditions, which rest at a level may have caused, is to be tried with one.
+
+    The mean of an output is large against its deviation, or the residuals are: such an optimum is near no other one.
+    """
+    joint = fit.joint
+    if joint is None or joint.initial == "rest" or fit.task.structure.initial != "auto":
         return False
-    values = [drop_missing(run[o]) for run in fit.task.runs for o in fit.model.outputs]
-    return any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values)
+    for output, noise in joint.noise.items():
+        values = [drop_missing(run[output]) for run in fit.task.runs]
+        if any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values):
+            return True
+        if noise > MAX_RESIDUAL_SHARE * max(float(np.std(y)) for y in values):
+            return True
+    return False
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:

@@ -15,7 +15,7 @@ from ftlm.data.sampling import MAX_SAMPLE_VALUE, drop_missing
 from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance
-from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, run_multistart
+from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, run_multistart, start_from_values
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.initial_conditions import (
     START_SETTINGS,
@@ -38,6 +38,7 @@ from ftlm.utils.statistics import (
     autoregression,
     chi_squared,
     is_white,
+    robust_deviation,
     variance_inflation,
 )
 from ftlm.utils.validation import Floats
@@ -53,6 +54,11 @@ MIN_OFFSET_SIZE_RATIO = 1e-3
 UNREQUESTED_OFFSET_LEVEL = 1e-4
 #: Maximum number of evaluations from the grid point to the nearby optimum.
 MAX_REFINEMENT_EVALUATIONS = 40
+#: Maximum number of evaluations that screen initial conditions from an optimum under others. Those that explain a run
+#: as well converge in two to four.
+MAX_SCREENING_EVALUATIONS = 12
+#: Share of the residuals of a screening that a fit to the end could leave.
+SCREENING_RESIDUAL_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -346,12 +352,41 @@ def _simplify_initial_terms(
     joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool
 ) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
+    asked = replace(structure, initial="caputo")
     try:
-        few = refit_from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
+        if _fit_needs_history(screen_initial_conditions(joint, runs, asked), joint, runs, structure):
+            return joint
+        few = refit_from(joint, runs, asked, loss, refine=refine)
     except FtlmError:
         # From here it has no finite simulation, so it is not enough.
         return joint
     return joint if _fit_needs_history(few, joint, runs, structure) else few
+
+
+def screen_initial_conditions(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit:
+    """Return what a fit of a linear structure that differs in initial conditions or offsets would leave at least.
+
+    It is the result of a few evaluations from an optimum under other initial conditions, with a share of its residuals.
+    If it is refused, the structure need not be fitted.
+
+    Raises
+    ------
+    ConvergenceError
+        The simulation is not finite.
+    """
+    problem = FreeProblem.of(structure)
+    weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
+    grid = Objective(problem, runs, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
+    there = grid.minimize(start_from_values(problem, joint.values_by_name), MAX_SCREENING_EVALUATIONS, plain=True)
+    levels = grid.rms_residuals(there)
+    if joint.robust is not None:
+        levels = {o: robust_deviation(e) for o, e in grid.pooled_residuals(there).items()}
+    return replace(
+        joint,
+        noise={o: SCREENING_RESIDUAL_SHARE * level * joint.noise[o] for o, level in levels.items()},
+        residuals=[{o: e / max(levels[o], 1e-300) for o, e in part.items()} for part in grid.residuals(there)],
+        initial_terms=sum(len(terms) for run in there.outcome["initial"] for terms in run),
+    )
 
 
 def refit_from(
@@ -367,7 +402,10 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
     asked = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
-        few = refit_from(joint, runs, replace(asked, initial="caputo"), loss)
+        begun = replace(asked, initial="caputo")
+        if _fit_needs_history(screen_initial_conditions(joint, runs, begun), joint, runs, asked):
+            return None
+        few = refit_from(joint, runs, begun, loss)
         # On the same kind of grid: what a coarse one leaves is not a history.
         many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
