@@ -57,6 +57,9 @@ def with_intervals(
     # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
     if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * fitted):
         return joint, []
+    if intervals == "auto" and joint.unstable_optimum is not None and joint.unstable_optimum.at_stability_limit:
+        # The cost has no minimum at the limit. A profile would lead to the unstable optimum that was discarded.
+        return joint, []
     findings: list[Finding] = []
     spent = 0
     for turn in range(MAX_RESTARTS + 1):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
+from ftlm.data.sampling import drop_missing
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
 from ftlm.simulation.initial_conditions import deviations, resolve_initial_conditions, resolve_start, start_score
@@ -27,6 +28,7 @@ from ftlm.simulation.output_samples import (
 from ftlm.simulation.past_inputs import LONG_RECORD_INTERVALS, fit_history
 from ftlm.structure.structure import History
 from ftlm.utils.resources import memory_limit, stop_flag
+from ftlm.utils.statistics import is_white
 from ftlm.utils.validation import Floats
 
 
@@ -60,21 +62,34 @@ def simulate_refined(
     if model.structure.offset != "level":
         return _simulate_refined(model, run, None, tolerance, max_m, on_grid)
     moved, levels = deviations(run, model.structure)
-    free = _simulate_refined(model, moved, None, tolerance, max_m, on_grid)
+    found = None
     if model.structure.initial == "auto":
         # A run that may have been in motion may as well have rested at its level.
         rest = replace(model, structure=replace(model.structure, initial="rest"))
-        still = _simulate_refined(rest, moved, None, tolerance, max_m, on_grid)
-        free = still if _explains_as_well(model, moved, still, free) else free
-    outputs, terms = add_levels(model, levels, free.outputs, free.initial)
-    return replace(free, outputs=outputs, initial=terms)
+        found = _simulate_refined(rest, moved, None, tolerance, max_m, on_grid)
+    if found is None or not _has_white_residuals(model, moved, found):
+        free = _simulate_refined(model, moved, None, tolerance, max_m, on_grid)
+        found = free if found is None or not _explains_as_well(model, moved, found, free) else found
+    outputs, terms = add_levels(model, levels, found.outputs, found.initial)
+    return replace(found, outputs=outputs, initial=terms)
+
+
+def _residuals(model: Model, run: Run, simulated: OutputSamples) -> list[Floats]:
+    """Return measured minus simulated samples of each output."""
+    return [*(measured_samples(model, run, simulated.refinement) - simulated.outputs)]
+
+
+def _has_white_residuals(model: Model, run: Run, simulated: OutputSamples) -> bool:
+    """Whether a simulation leaves nothing that initial terms could explain."""
+    residuals = [drop_missing(e) for e in _residuals(model, run, simulated)]
+    return all(bool(np.all(np.isfinite(e))) and is_white(e) for e in residuals)
 
 
 def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSamples) -> bool:
     """Whether a simulation with few initial terms is preferred to one with more by :func:`start_score`."""
     if not (np.all(np.isfinite(few.outputs)) and np.all(np.isfinite(many.outputs))):
         return False
-    residuals = [[*(measured_samples(model, run, s.refinement) - s.outputs)] for s in (few, many)]
+    residuals = [_residuals(model, run, s) for s in (few, many)]
     scores = [
         start_score(own, sum(map(len, s.initial.values())), residuals[0])
         for own, s in zip(residuals, (few, many), strict=True)
