@@ -213,10 +213,17 @@ impl<'a> Optimum<'a> {
         let robust = grid.weights.robust_weights.is_some();
         let levels = if robust { grid.residual_scales(&attempt) } else { grid.residual_root_mean_squares(&attempt) };
         let inside = |(value, (low, high)): (f64, (f64, f64))| value.clamp(low, high);
+        let mut residuals = grid.residuals(&attempt);
+        for run in &mut residuals {
+            // The weights have converged to the noise levels within a tolerance only.
+            for (series, &level) in run.iter_mut().zip(&levels).filter(|(_, level)| **level > 0.0) {
+                series.iter_mut().for_each(|e| *e /= level);
+            }
+        }
         OptimumStatistics {
             estimate: estimate.into_iter().zip(grid.problem.bounds()).map(inside).collect(),
             noise: levels.iter().zip(&grid.weights.outputs).map(|(level, weight)| level / weight).collect(),
-            residuals: grid.residuals(&attempt),
+            residuals,
             robust: robust.then(|| RobustSummary::from_result(&grid, &attempt)),
             weights: grid.weights,
             pulses_per_sample: grid.sampling.pulses_per_sample,
