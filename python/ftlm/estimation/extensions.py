@@ -25,7 +25,7 @@ from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.model_checks import enumerate_names
-from ftlm.estimation.nuisance_parameters import output_sensitivities, screen_initial_conditions
+from ftlm.estimation.nuisance_parameters import output_sensitivities, refit_if_accepted
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
@@ -554,36 +554,31 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
         # Another finding states the evidence of rest, or that rest is assumed.
         return []
     taken = joint.initial if joint.initial == "rest" else "caputo", structure.offset
+
+    def squares_ratio(other: JointFit) -> float:
+        return max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
+
     own = _gains(joint, structure)
     worst: tuple[float, Finding] | None = None
     for initial, offset in ALTERNATIVE_INITIAL_CONDITIONS if own else ():
         if (initial, offset) == taken:
             continue
         asked = replace(structure, initial=initial, offset=offset)
-        try:
-            if not _squares_ratio(screen_initial_conditions(joint, runs, asked), joint) <= MAX_SQUARES_RATIO:
-                continue
-            other = fit_output_error(runs, asked, near=joint, refine=False)
-        except FtlmError:
-            continue
-        ratio = _squares_ratio(other, joint)
-        if not ratio <= MAX_SQUARES_RATIO or other.unstable_optimum is not None:
+        refit = partial(fit_output_error, near=joint, refine=False)
+        other = refit_if_accepted(joint, runs, asked, lambda found: squares_ratio(found) <= MAX_SQUARES_RATIO, refit)
+        if other is None or other.unstable_optimum is not None:
             continue
         for pair, (gain, error) in _gains(other, structure).items():
             known, own_error = own.get(pair, (math.nan, math.nan))
             distance = abs(gain - known) / max(math.hypot(error, own_error), 1e-300)
             far = abs(gain - known) > MIN_GAIN_CHANGE * max(abs(gain), abs(known))
             if far and distance > max(MIN_GAIN_CHANGE_SIGMAS, worst[0] if worst else 0.0):
+                ratio = squares_ratio(other)
                 numbers = {"gain": known, "error": own_error, "other_gain": gain, "other_error": error}
                 words = {"taken": _name_start(*taken), "other": _name_start(initial, offset), "ratio": ratio}
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
                 worst = distance, make_finding("start_not_told", **about, **numbers, **words)
     return [worst[1]] if worst else []
-
-
-def _squares_ratio(other: JointFit, joint: JointFit) -> float:
-    """Return the largest ratio over outputs of the sums of squares of two fits."""
-    return max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:

@@ -46,7 +46,7 @@ from ftlm.estimation.nuisance_parameters import (
     has_white_residuals,
     offset_test,
     output_sensitivities,
-    screen_initial_conditions,
+    refit_if_accepted,
     unrequested_offset_findings,
 )
 from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
@@ -147,22 +147,17 @@ class Hypotheses:
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
-        """Return the fit of a structure from the optimum of another one that differs only in initial conditions.
-
-        None if it is not accepted, where a screening shows this without a fit.
-        """
+        """Return the fit of a structure from an optimum under other initial conditions; None if it is not accepted."""
         joint, runs = fit.joint, fit.task.runs
         if joint is None or self.complete is None:
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
         asked = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
-        if not accepts(screen_initial_conditions(joint, runs, asked)):
-            return None
         loss: Loss = "squares" if joint.robust is None else "huber"
         # The refinement of a fit is that of the finer of its two last grids.
         coarser = replace(joint, refinement=max(joint.refinement // 2, 1))
-        near = fit_output_error(runs, asked, near=coarser, loss=loss)
-        return replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin)) if accepts(near) else None
+        near = refit_if_accepted(joint, runs, asked, accepts, partial(fit_output_error, near=coarser, loss=loss))
+        return None if near is None else replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
 
 
 def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:

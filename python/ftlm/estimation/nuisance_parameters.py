@@ -352,41 +352,47 @@ def _simplify_initial_terms(
     joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool
 ) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
-    asked = replace(structure, initial="caputo")
-    try:
-        if _fit_needs_history(screen_initial_conditions(joint, runs, asked), joint, runs, structure):
-            return joint
-        few = refit_from(joint, runs, asked, loss, refine=refine)
-    except FtlmError:
-        # From here it has no finite simulation, so it is not enough.
-        return joint
-    return joint if _fit_needs_history(few, joint, runs, structure) else few
+    asked, begin = replace(structure, initial="caputo"), joint.values_by_name
+    few = refit_if_accepted(
+        joint,
+        runs,
+        asked,
+        lambda few: not _fit_needs_history(few, joint, runs, structure),
+        partial(fit_output_error, start=begin, loss=loss, refine=refine),
+    )
+    return few or joint
 
 
-def screen_initial_conditions(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit:
-    """Return what a fit of a linear structure that differs in initial conditions or offsets would leave at least.
+def refit_if_accepted(
+    joint: JointFit,
+    runs: Sequence[Run],
+    structure: Structure,
+    accepts: Callable[[JointFit], bool],
+    refit: Callable[[Sequence[Run], Structure], JointFit],
+) -> JointFit | None:
+    """Refit a linear structure with other initial conditions or offsets; None if it is not accepted or not finite.
 
-    It is the result of a few evaluations from an optimum under other initial conditions, with a share of its residuals.
-    If it is refused, the structure need not be fitted.
-
-    Raises
-    ------
-    ConvergenceError
-        The simulation is not finite.
+    It is fitted only if a few evaluations from the optimum are accepted, with a share of the residuals that they leave.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
     grid = Objective(problem, runs, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
-    there = grid.minimize(start_from_values(problem, joint.values_by_name), MAX_SCREENING_EVALUATIONS, plain=True)
-    levels = grid.rms_residuals(there)
-    if joint.robust is not None:
-        levels = {o: robust_deviation(e) for o, e in grid.pooled_residuals(there).items()}
-    return replace(
-        joint,
-        noise={o: SCREENING_RESIDUAL_SHARE * level * joint.noise[o] for o, level in levels.items()},
-        residuals=[{o: e / max(levels[o], 1e-300) for o, e in part.items()} for part in grid.residuals(there)],
-        initial_terms=sum(len(terms) for run in there.outcome["initial"] for terms in run),
-    )
+    begin = start_from_values(problem, joint.values_by_name)
+    try:
+        there = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True)
+        deviation = grid.rms_residuals(there)
+        if joint.robust is not None:
+            deviation = {o: robust_deviation(e) for o, e in grid.pooled_residuals(there).items()}
+        screened = replace(
+            joint,
+            noise={o: SCREENING_RESIDUAL_SHARE * v * joint.noise[o] for o, v in deviation.items()},
+            residuals=[{o: e / max(deviation[o], 1e-300) for o, e in part.items()} for part in grid.residuals(there)],
+            initial_terms=sum(len(terms) for run in there.outcome["initial"] for terms in run),
+        )
+        found = refit(runs, structure) if accepts(screened) else None
+    except FtlmError:
+        return None
+    return found if found is not None and accepts(found) else None
 
 
 def refit_from(
@@ -402,10 +408,7 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
     asked = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
-        begun = replace(asked, initial="caputo")
-        if _fit_needs_history(screen_initial_conditions(joint, runs, begun), joint, runs, asked):
-            return None
-        few = refit_from(joint, runs, begun, loss)
+        few = refit_from(joint, runs, replace(asked, initial="caputo"), loss)
         # On the same kind of grid: what a coarse one leaves is not a history.
         many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
