@@ -1,6 +1,7 @@
 """The first rows of a run: at rest, at its own level, in motion; held against SciPy's recursion and least squares."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.signal import cont2discrete, lfilter
 from scipy.stats import beta
 
 import ftlm
+from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.initial_conditions import rest_evidence
 
 H = 0.5
@@ -479,3 +481,26 @@ def test_a_level_is_found_on_a_record_that_is_too_long_for_the_offset_test(monke
     found = ftlm.identify(run_of(u, y, 0.05), ftlm.equation(WORDS))
     assert "level_estimated" in codes(found)
     assert gain_of(found) == pytest.approx(1.2, rel=0.01)
+
+
+def test_a_level_is_found_where_a_fit_without_it_fails():
+    # Its mean is below three deviations of the output, which alone would show a level.
+    g = np.random.default_rng(1)
+    u = np.repeat(g.choice([-1.0, 1.0], 75), 20)
+    num, den, _ = cont2discrete(([8.0, 144.0], [1.0, 1.2, 144.0]), 0.01)[:3]
+    y = 9.0 + lfilter(np.ravel(num), den, u) + 0.02 * g.standard_normal(u.size)
+    assert np.mean(y) < 3.0 * np.std(y)
+    found = ftlm.identify(run_of(u, y, 0.01), ftlm.equation("D^2 y = a1 D y + a0 y + b1 D u + b0 u"))
+    assert "level_estimated" in codes(found)
+    assert found.fit["y"] > 99.0
+
+
+def test_residuals_of_a_warm_start_are_in_units_of_its_noise():
+    g = np.random.default_rng(3)
+    u = np.repeat(g.choice([-1.0, 1.0], 40), 25)
+    y = plant([1.2], [0.5, 1.0], u, 0.05) + 0.01 * g.standard_normal(u.size)
+    run, structure = run_of(u, y, 0.05), ftlm.equation(WORDS)
+    joint = ftlm.identify(run, structure).joint
+    noisy = {**joint.noise, "y": 1.009 * joint.noise["y"]}
+    near = fit_output_error([run], replace(structure, initial="rest"), near=replace(joint, noise=noisy))
+    assert np.sqrt(np.mean(near.residuals[0]["y"] ** 2)) == pytest.approx(1.0, rel=1e-9)
