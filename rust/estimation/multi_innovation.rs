@@ -140,12 +140,13 @@ pub fn closed_form(
 /// Solution of the weighted rows with those of the prior, of these inverse covariances, and the dependent columns. The
 /// first `needed` must not be.
 fn weighted_solution(
-    (columns, target, starts): (&[Vec<f64>], &[f64], &[usize]),
+    (columns, target, starts): (&[impl AsRef<[f64]>], &[f64], &[usize]),
     length: usize,
     prior: &[f64],
     needed: usize,
 ) -> Result<(Vec<f64>, Vec<usize>)> {
-    let (columns, target) = weighted_rows(columns.to_vec(), target.to_vec(), starts, length, prior);
+    let columns = columns.iter().map(|column| column.as_ref().to_vec()).collect();
+    let (columns, target) = weighted_rows(columns, target.to_vec(), starts, length, prior);
     // With a prior no column but a zero one under a relative prior is linearly dependent in exact arithmetic.
     let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
     match dropped.iter().find(|&&column| column < needed) {
@@ -191,69 +192,79 @@ fn weighted_rows(
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
-/// let (q, m) = (vec![1.0, 2.0, 3.0], vec![2.0, 4.0, 6.0]);
+/// let (q, m) = ([1.0, 2.0, 3.0], [2.0, 4.0, 6.0]);
 /// let found = ftlm::estimation::multi_innovation::estimate(&[q], &m, 2, &[1e9])?;
 /// assert!((found[0] - 2.0).abs() < 1e-8);
 /// # Ok(())
 /// # }
 /// ```
-pub fn estimate(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<Vec<f64>> {
+pub fn estimate(
+    columns: &[impl AsRef<[f64]>],
+    target: &[f64],
+    length: usize,
+    prior_covariance: &[f64],
+) -> Result<Vec<f64>> {
     let prior = check_problem(columns, target, length, prior_covariance)?;
     let starts = [0, target.len()];
     Ok(weighted_solution((columns, target, &starts), length, &prior, columns.len())?.0)
 }
 
-/// Coefficients after every step of the recursion (44) on m = Q X, as in [`estimate`]. O(M k³).
+/// Coefficients after every step of the recursion (44) on m = Q X, as in [`estimate`], step by step. O(M k³).
 ///
 /// # Errors
 /// As [`estimate`], and [`Error::Diverged`] if rounding makes the covariance indefinite.
 pub fn path(
-    columns: &[Vec<f64>],
+    columns: &[impl AsRef<[f64]>],
     target: &[f64],
     length: usize,
     prior_covariance: &[f64],
     stop: &Stop,
-) -> Result<Vec<Vec<f64>>> {
+) -> Result<Vec<f64>> {
     let prior = check_problem(columns, target, length, prior_covariance)?;
     run_recursion((columns, target, &[0, target.len()]), length, &prior, stop)
 }
 
-/// Coefficients after every step of the recursion through records that begin at `starts`.
+/// Coefficients after every step of the recursion through records that begin at `starts`, step by step.
 fn run_recursion(
-    (columns, target, starts): (&[Vec<f64>], &[f64], &[usize]),
+    (columns, target, starts): (&[impl AsRef<[f64]>], &[f64], &[usize]),
     length: usize,
     prior: &[f64],
     stop: &Stop,
-) -> Result<Vec<Vec<f64>>> {
+) -> Result<Vec<f64>> {
     let mut state = Recursion::new(prior)?;
     let mut window = SlidingGram::new(columns.len(), length);
     let mut row = vec![0.0; columns.len()];
-    let mut trace = Vec::with_capacity(target.len());
+    let mut trace = Vec::with_capacity(target.len() * columns.len());
     for pair in starts.windows(2) {
         window.clear();
         for newest in pair[0]..pair[1] {
             stop.check()?;
-            row.iter_mut().zip(columns).for_each(|(value, column)| *value = column[newest]);
+            row.iter_mut().zip(columns).for_each(|(value, column)| *value = column.as_ref()[newest]);
             window.push(&row, target[newest])?;
             state
                 .step(&window)
                 .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;
-            trace.push(state.coefficients().to_vec());
+            trace.extend_from_slice(state.coefficients());
         }
     }
     Ok(trace)
 }
 
 /// Inverse prior covariances of a checked problem.
-fn check_problem(columns: &[Vec<f64>], target: &[f64], length: usize, prior_covariance: &[f64]) -> Result<Vec<f64>> {
+fn check_problem(
+    columns: &[impl AsRef<[f64]>],
+    target: &[f64],
+    length: usize,
+    prior_covariance: &[f64],
+) -> Result<Vec<f64>> {
     check_length("prior covariances", columns.len(), prior_covariance.len())?;
     for &covariance in prior_covariance {
         Innovation { length, prior: Prior::Absolute(covariance), row_basis: RowBasis::Time }.check()?;
     }
     check_finite("m", target)?;
     columns.iter().try_for_each(|column| {
-        check_length("column of Q", target.len(), column.len())?;
-        check_finite("Q", column)
+        check_length("column of Q", target.len(), column.as_ref().len())?;
+        check_finite("Q", column.as_ref())
     })?;
     Ok(prior_covariance.iter().map(|covariance| 1.0 / covariance).collect())
 }
@@ -274,11 +285,12 @@ pub fn recursion(
     let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let Regression { columns, target, starts, .. } = &regression;
     let prior = innovation.prior.precisions(columns);
-    let steps = run_recursion((columns, target, starts), innovation.length, &prior, &Stop::default())?;
+    let trace = run_recursion((columns, target, starts), innovation.length, &prior, &Stop::default())?;
+    let steps = (0..target.len()).map(|step| &trace[step * columns.len()..][..columns.len()]);
     let zeros = vec![0.0; columns.len()];
-    let last = regression.estimate(steps.last().unwrap_or(&zeros), &[])?;
-    let coefficients = |step: &Vec<f64>| Ok(regression.estimate(step, &[])?.coefficients);
-    Ok((last, steps.iter().map(coefficients).collect::<Result<_>>()?))
+    let last = regression.estimate(steps.clone().next_back().unwrap_or(&zeros), &[])?;
+    let coefficients = |step: &[f64]| Ok(regression.estimate(step, &[])?.coefficients);
+    Ok((last, steps.map(coefficients).collect::<Result<_>>()?))
 }
 
 fn regression_in_basis(

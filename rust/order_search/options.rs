@@ -11,6 +11,7 @@ use crate::estimation::instrumental_variables::InstrumentalSettings;
 use crate::estimation::multi_innovation::Innovation;
 use crate::fft::{fast_length, Bin};
 use crate::regressors::{Bank, Index, Record, BANK_LIMIT};
+use crate::simd::LANE_COUNT;
 
 /// Error that ranks the candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,10 +35,9 @@ impl Norm {
     /// Add |e| or e² of a block to a raw sum.
     #[inline]
     pub(crate) fn add(self, raw: f64, measured: &[f64], response: &[f64]) -> f64 {
-        let pairs = measured.iter().zip(response);
         raw + match self {
-            Self::L1 => pairs.map(|(y, v)| (y - v).abs()).sum::<f64>(),
-            Self::L2 => pairs.map(|(y, v)| (y - v) * (y - v)).sum::<f64>(),
+            Self::L1 => sum_side_by_side(measured, response, |y, v| (y - v).abs()),
+            Self::L2 => sum_side_by_side(measured, response, |y, v| (y - v) * (y - v)),
         }
     }
 
@@ -55,6 +55,20 @@ impl Norm {
             Self::L2 => (raw / samples as f64).sqrt(),
         }
     }
+}
+
+/// Sum over pairs of values in [`LANE_COUNT`] partial sums, which do not wait for each other.
+#[inline(always)]
+fn sum_side_by_side(a: &[f64], b: &[f64], term: impl Fn(f64, f64) -> f64) -> f64 {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANE_COUNT>(), b.as_chunks::<LANE_COUNT>());
+    let mut sums = [0.0; LANE_COUNT];
+    for (a, b) in a.iter().zip(b) {
+        for l in 0..LANE_COUNT {
+            sums[l] += term(a[l], b[l]);
+        }
+    }
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(&a, &b)| term(a, b)).sum();
+    sums.iter().sum::<f64>() + rest
 }
 
 /// Estimator of a candidate's coefficients.

@@ -206,13 +206,14 @@ pub fn multi_innovation_rows<'py>(
         let mut found = Vec::new();
         for (rows, target) in batch.values.chunks(count.max(1) * width.max(1)).zip(target.chunks(count.max(1))) {
             stop.check()?;
-            let wide: Vec<Vec<f64>> =
-                (0..width).map(|j| rows.iter().skip(j).step_by(width).copied().collect()).collect();
-            if path {
-                found.extend(multi_innovation::path(&wide, target, length, &prior_covariance, stop)?.concat());
+            // One column after another.
+            let flat: Vec<f64> = (0..width).flat_map(|j| rows.iter().skip(j).step_by(width).copied()).collect();
+            let columns: Vec<&[f64]> = flat.chunks_exact(target.len()).collect();
+            found.extend(if path {
+                multi_innovation::path(&columns, target, length, &prior_covariance, stop)?
             } else {
-                found.extend(multi_innovation::estimate(&wide, target, length, &prior_covariance)?);
-            }
+                multi_innovation::estimate(&columns, target, length, &prior_covariance)?
+            });
         }
         Ok(found)
     })?;

@@ -1,37 +1,38 @@
 //! Division of series by forward substitution in blocks that are joined by FFT products, O(m log² m).
 //!
 //! Blocks of 64 terms, of 2048 and so on each form a level. Within it the spectra of solved blocks and of the divisor's
-//! pieces are computed once, and only their products are summed for each later block.
+//! pieces are computed once, and only their products are summed for each later block. The many short transforms have
+//! their own code ([`block_transform`]).
 //!
 //! Exact for every divisor with a nonzero leading coefficient, stable or not. [`Division`] returns the quotient block
 //! by block, so that a search can drop a candidate early.
 
 use std::borrow::Cow;
 
+use super::block_transform::{self, Tile};
 use super::product::Kernel;
 use crate::error::{check_length, Error, Result};
 use crate::fft::{self, Bin, Plan, Workspace};
 use crate::linalg::small;
 use crate::simd::{self, LANE_COUNT};
 
-/// Length of a block of forward substitution, the shortest that is joined to others by transforms.
-pub const BLOCK_TERMS: usize = 64;
+pub use super::block_transform::BLOCK_TERMS;
 
 /// Terms whose sums stay in registers while the products with a tile are subtracted.
 const TILE_TERMS: usize = 8;
 
-/// `open[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`, with the same operations for every term.
+/// `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`, with the same operations for every term.
 #[inline(always)]
-fn take_off(open: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
+fn subtract_product(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     let mut at = TILE_TERMS;
-    let mut pairs = open.chunks_exact_mut(2 * TILE_TERMS);
+    let mut pairs = remainder.chunks_exact_mut(2 * TILE_TERMS);
     for pair in &mut pairs {
-        take_off_tile::<{ 2 * TILE_TERMS }>(pair, &series[at - TILE_TERMS..], solved);
+        subtract_tile_product::<{ 2 * TILE_TERMS }>(pair, &series[at - TILE_TERMS..], solved);
         at += 2 * TILE_TERMS;
     }
     let mut tiles = pairs.into_remainder().chunks_exact_mut(TILE_TERMS);
     for tile in &mut tiles {
-        take_off_tile::<TILE_TERMS>(tile, &series[at - TILE_TERMS..], solved);
+        subtract_tile_product::<TILE_TERMS>(tile, &series[at - TILE_TERMS..], solved);
         at += TILE_TERMS;
     }
     let rest = tiles.into_remainder();
@@ -42,18 +43,18 @@ fn take_off(open: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     }
 }
 
-/// [`take_off`] of L terms, whose sums stay in registers.
+/// [`subtract_product`] of L terms, whose sums stay in registers.
 #[inline(always)]
-fn take_off_tile<const L: usize>(open: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
+fn subtract_tile_product<const L: usize>(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     let mut sums = [0.0; L];
-    sums.copy_from_slice(open);
+    sums.copy_from_slice(remainder);
     for (s, &y) in solved.iter().enumerate() {
         let part = &series[TILE_TERMS - s..][..L];
         for i in 0..L {
             sums[i] -= part[i] * y;
         }
     }
-    open.copy_from_slice(&sums);
+    remainder.copy_from_slice(&sums);
 }
 
 /// Forward substitution within a block of one unknown, in place, tile by tile.
@@ -71,26 +72,28 @@ impl simd::SimdKernel for Substitution<'_> {
         let mut head = [0.0; TILE_TERMS];
         let known = self.divisor.len().min(TILE_TERMS);
         head[..known].copy_from_slice(&self.divisor[..known]);
-        let mut open = self.block;
-        while open.len() >= TILE_TERMS {
-            let (tile, later) = open.split_at_mut(TILE_TERMS);
+        head.iter_mut().for_each(|v| *v *= self.inverse);
+        let mut remainder = self.block;
+        while remainder.len() >= TILE_TERMS {
+            let (tile, later) = remainder.split_at_mut(TILE_TERMS);
             // With a constant length the loop is unrolled and its values stay in registers.
             let mut solved = [0.0; TILE_TERMS];
-            solved.copy_from_slice(tile);
             for k in 0..TILE_TERMS {
-                solved[k] *= self.inverse;
+                solved[k] = tile[k] * self.inverse;
+            }
+            for k in 0..TILE_TERMS {
                 for i in k + 1..TILE_TERMS {
                     solved[i] -= head[i - k] * solved[k];
                 }
             }
             tile.copy_from_slice(&solved);
-            take_off(later, self.divisor, &solved);
-            open = later;
+            subtract_product(later, self.divisor, &solved);
+            remainder = later;
         }
-        for k in 0..open.len() {
-            open[k] *= self.inverse;
-            let y = open[k];
-            for (rest, &v) in open[k + 1..].iter_mut().zip(&self.divisor[1..]) {
+        for k in 0..remainder.len() {
+            remainder[k] *= self.inverse;
+            let y = remainder[k];
+            for (rest, &v) in remainder[k + 1..].iter_mut().zip(&self.divisor[1..]) {
                 *rest -= v * y;
             }
         }
@@ -101,30 +104,57 @@ impl simd::SimdKernel for Substitution<'_> {
 /// 16 and 32 at m = 2048.
 const MAX_LEVEL_BLOCKS: usize = 32;
 
-/// Values of one tile of a spectrum: [`LANE_COUNT`] real parts, then as many imaginary ones.
-const TILE_PARTS: usize = 2 * LANE_COUNT;
-
 /// Spectra of the solved blocks of one length, and of the pieces of the n² series that join them to later blocks.
 ///
-/// Piece d holds the terms d·len to (d + 2)·len of a series. The second half of its cyclic product with a block is what
-/// the block contributes to the one d + 1 further on. Contributions of several blocks are summed as spectra, tile by
-/// tile, so the spectra of one tile are stored side by side: blocks forwards, pieces backwards.
+/// Piece d holds the terms d·len to (d + 2)·len of a series. The second half of its product with a block is what the
+/// block contributes to the one d + 1 further on. Contributions of several blocks are summed as spectra, tile by tile,
+/// so the spectra of one tile are stored side by side: blocks forwards, pieces backwards, per equation.
 struct Level {
-    plan: Plan,
+    transform: Transform,
     len: usize,
     /// Number of blocks that there is memory for.
     capacity: usize,
-    blocks: Vec<f64>,
-    pieces: Vec<f64>,
+    blocks: Vec<Tile>,
+    pieces: Vec<Tile>,
     known_pieces: usize,
+    /// Spectrum of a contribution.
+    sum: Vec<Tile>,
+}
+
+/// Transform whose products give the contributions of a block.
+enum Transform {
+    /// Of the shortest blocks.
+    Block,
+    /// Cyclic, of twice the length of a block. Terms that wrap around fall on the first half, which is not read.
+    Cyclic(Plan),
+}
+
+impl Transform {
+    /// Number of tiles of a spectrum.
+    fn tiles(&self) -> usize {
+        match self {
+            Self::Block => LANE_COUNT,
+            Self::Cyclic(plan) => plan.bins().div_ceil(LANE_COUNT),
+        }
+    }
 }
 
 impl Level {
     fn new(len: usize, n: usize, m: usize) -> Self {
-        let plan = fft::plan(2 * len);
+        let transform = if len == BLOCK_TERMS { Transform::Block } else { Transform::Cyclic(fft::plan(2 * len)) };
         let capacity = m.div_ceil(len).min(MAX_LEVEL_BLOCKS);
-        let size = plan.bins().div_ceil(LANE_COUNT) * TILE_PARTS * capacity * n;
-        Self { plan, len, capacity, blocks: vec![0.0; size], pieces: vec![0.0; size * n], known_pieces: 0 }
+        let tiles = transform.tiles();
+        let size = tiles * capacity * n;
+        let zeros = |size: usize| vec![[[0.0; LANE_COUNT]; 2]; size];
+        Self {
+            transform,
+            len,
+            capacity,
+            blocks: zeros(size),
+            pieces: zeros(size * n),
+            known_pieces: 0,
+            sum: zeros(tiles),
+        }
     }
 }
 
@@ -133,45 +163,47 @@ impl Level {
 struct LevelBuffers {
     time: Vec<f64>,
     spectrum: Vec<Bin>,
-    /// Tiles of a sum of spectra.
-    sum: Vec<f64>,
     workspace: Workspace,
 }
 
 impl LevelBuffers {
-    fn fit(&mut self, plan: &Plan) {
+    /// Write the spectrum of the values, followed by zeros, to every `stride`-th tile.
+    fn transform(&mut self, transform: &Transform, values: &[f64], tiles: &mut [Tile], stride: usize) {
+        let plan = match transform {
+            Transform::Block => return block_transform::transform(values, tiles, stride),
+            Transform::Cyclic(plan) => plan,
+        };
         self.time.resize(plan.len(), 0.0);
         self.spectrum.resize(plan.bins(), Bin::new(0.0, 0.0));
-        self.sum.resize(plan.bins().div_ceil(LANE_COUNT) * TILE_PARTS, 0.0);
-    }
-
-    /// Spectrum of the values followed by zeros.
-    fn transform(&mut self, plan: &Plan, values: &[f64]) {
         self.time[..values.len()].copy_from_slice(values);
         self.time[values.len()..].fill(0.0);
         plan.transform(&mut self.time, &mut self.spectrum, &mut self.workspace);
-    }
-
-    /// Write the spectrum into its place among `count` spectra of [`Level`].
-    fn store_spectrum(&self, place: usize, count: usize, parts: &mut [f64]) {
-        for (bins, tiles) in self.spectrum.chunks(LANE_COUNT).zip(parts.chunks_exact_mut(count * TILE_PARTS)) {
-            let (re, im) = tiles[place * TILE_PARTS..][..TILE_PARTS].split_at_mut(LANE_COUNT);
-            for ((bin, re), im) in bins.iter().zip(re).zip(im) {
-                (*re, *im) = (bin.re, bin.im);
+        for (bins, tile) in self.spectrum.chunks(LANE_COUNT).zip(tiles.iter_mut().step_by(stride)) {
+            for (l, bin) in bins.iter().enumerate() {
+                (tile[0][l], tile[1][l]) = (bin.re, bin.im);
             }
         }
     }
 
-    /// Cyclic product whose spectrum is the sum.
-    fn invert_sum(&mut self, plan: &Plan) -> &[f64] {
-        for (bins, tile) in self.spectrum.chunks_mut(LANE_COUNT).zip(self.sum.chunks_exact(TILE_PARTS)) {
-            let (re, im) = tile.split_at(LANE_COUNT);
-            for ((bin, &re), &im) in bins.iter_mut().zip(re).zip(im) {
-                *bin = Bin::new(re, im);
+    /// Contribution of which the sum is the spectrum.
+    fn invert(&mut self, transform: &Transform, tiles: &[Tile]) -> &[f64] {
+        let plan = match transform {
+            Transform::Block => {
+                self.time.clear();
+                self.time.extend(block_transform::middle_product(tiles));
+                return &self.time;
+            }
+            Transform::Cyclic(plan) => plan,
+        };
+        self.time.resize(plan.len(), 0.0);
+        self.spectrum.resize(plan.bins(), Bin::new(0.0, 0.0));
+        for (bins, tile) in self.spectrum.chunks_mut(LANE_COUNT).zip(tiles) {
+            for (l, bin) in bins.iter_mut().enumerate() {
+                *bin = Bin::new(tile[0][l], tile[1][l]);
             }
         }
         plan.inverse(&mut self.spectrum, &mut self.time, &mut self.workspace);
-        &self.time
+        &self.time[plan.len() / 2..]
     }
 }
 
@@ -181,7 +213,7 @@ struct Contributions<'a> {
     i: usize,
     count: usize,
     level: &'a Level,
-    sum: &'a mut [f64],
+    sum: &'a mut [Tile],
 }
 
 impl simd::SimdKernel for Contributions<'_> {
@@ -190,23 +222,19 @@ impl simd::SimdKernel for Contributions<'_> {
     #[inline(always)]
     fn run(self) {
         let Self { n, i, count, level: Level { capacity, blocks, pieces, .. }, sum } = self;
-        let (block, piece) = (n * TILE_PARTS, n * n * TILE_PARTS);
-        let blocks = blocks.chunks_exact(capacity * block);
-        let pieces = pieces.chunks_exact(capacity * piece);
-        for ((parts, blocks), pieces) in sum.chunks_exact_mut(TILE_PARTS).zip(blocks).zip(pieces) {
-            let (mut re, mut im) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
-            let pieces = pieces[(capacity - count) * piece..].chunks_exact(piece);
-            for (block, piece) in blocks.chunks_exact(block).zip(pieces) {
-                let factors = piece[i * block.len()..].chunks_exact(TILE_PARTS);
-                for (x, k) in block.chunks_exact(TILE_PARTS).zip(factors) {
-                    for l in 0..LANE_COUNT {
-                        re[l] += x[l] * k[l] - x[LANE_COUNT + l] * k[LANE_COUNT + l];
-                        im[l] += x[l] * k[LANE_COUNT + l] + x[LANE_COUNT + l] * k[l];
-                    }
+        let terms = count * n;
+        for t in 0..sum.len() {
+            let blocks = &blocks[t * capacity * n..][..terms];
+            let pieces = &pieces[((t * n + i + 1) * capacity - count) * n..][..terms];
+            let [mut re, mut im] = [[0.0; LANE_COUNT]; 2];
+            for k in 0..terms {
+                let ([x_re, x_im], [k_re, k_im]) = (&blocks[k], &pieces[k]);
+                for l in 0..LANE_COUNT {
+                    re[l] += x_re[l] * k_re[l] - x_im[l] * k_im[l];
+                    im[l] += x_re[l] * k_im[l] + x_im[l] * k_re[l];
                 }
             }
-            parts[..LANE_COUNT].copy_from_slice(&re);
-            parts[LANE_COUNT..].copy_from_slice(&im);
+            sum[t] = [re, im];
         }
     }
 }
@@ -339,28 +367,30 @@ impl Division {
         }
         let Self { rest, levels, buffers, m, .. } = self;
         let level = &mut levels[level];
-        buffers.fit(&level.plan);
+        let stride = level.capacity * n;
         for piece in level.known_pieces..place {
             for k in 0..n * n {
+                let (i, j) = (k / n, k % n);
                 let terms = ((piece + 2) * len).min(*m);
-                buffers.transform(&level.plan, &series(k / n, k % n, terms)[piece * len..]);
-                let at = (level.capacity - 1 - piece) * n * n + k;
-                buffers.store_spectrum(at, level.capacity * n * n, &mut level.pieces);
+                let at = (i * level.capacity + level.capacity - 1 - piece) * n + j;
+                let values = &series(i, j, terms)[piece * len..];
+                buffers.transform(&level.transform, values, &mut level.pieces[at..], n * stride);
             }
         }
         level.known_pieces = level.known_pieces.max(place);
         for (j, rest) in rest.iter().enumerate() {
-            buffers.transform(&level.plan, &rest[hi - len..hi]);
-            buffers.store_spectrum((place - 1) * n + j, level.capacity * n, &mut level.blocks);
+            let at = (place - 1) * n + j;
+            buffers.transform(&level.transform, &rest[hi - len..hi], &mut level.blocks[at..], stride);
         }
+        let mut sum = std::mem::take(&mut level.sum);
         for (i, rest) in rest.iter_mut().enumerate() {
-            simd::dispatch_simd(Contributions { n, i, count: place, level, sum: &mut buffers.sum });
-            // Wrapped-around terms of the cyclic product fall on the first half, which is not read.
-            let product = buffers.invert_sum(&level.plan);
-            for (rest, &v) in rest[hi..end].iter_mut().zip(&product[len..]) {
+            simd::dispatch_simd(Contributions { n, i, count: place, level, sum: &mut sum });
+            let contribution = buffers.invert(&level.transform, &sum);
+            for (rest, &v) in rest[hi..end].iter_mut().zip(contribution) {
                 *rest -= v;
             }
         }
+        level.sum = sum;
     }
 
     fn substitute<'a>(

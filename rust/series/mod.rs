@@ -16,6 +16,7 @@
 //! # }
 //! ```
 
+mod block_transform;
 pub mod division;
 #[cfg(feature = "oracles")]
 pub mod naive;
