@@ -20,8 +20,8 @@ from results import heading, save
 from search import plant_a_run
 
 M, STEP, ORDER, SIGNALS = 2048, 10.0 / 2048, 0.85, 256
-#: Candidates that are scored without a limit.
-SCORED = 512
+#: Candidates that are scored without a limit, and the increment of their orders.
+SCORED, INCREMENT = 512, 0.05
 #: Samples of a recursion with four terms and p = 7.
 SAMPLES = 20_000
 
@@ -91,9 +91,10 @@ def main() -> None:
     run = plant_a_run()
     means = np.stack([kernels.pulse_means(run[name], M, hold=name == "I1") for name in ("theta12", "theta11", "I1")])
     plan = kernels.Candidates(means, [0, 1, 0, 2], output=0, step=STEP)
-    alpha = random.uniform(1.05, 2.0, SCORED)
-    shares = np.sort(random.uniform(0.0, 0.95, (SCORED, 2)))
-    orders = np.column_stack([alpha, alpha * shares[:, 1], alpha * shares[:, 0], alpha * shares[:, 0] * 0.5, 0 * alpha])
+    # Tuples of an order grid, whose integrals are shared, as in a search.
+    alpha = random.integers(21, 41, SCORED)
+    own = np.sort(random.integers(0, alpha[:, None], (SCORED, 2)))
+    orders = np.column_stack([alpha, own[:, 1], random.integers(0, alpha), own[:, 0], 0 * alpha]) * INCREMENT
     plan.score(orders)
     ours = shortest(lambda: plan.score(orders))
     say(f"P19, Candidates.score without a limit, four terms: {ours / SCORED * 1e6:.1f} us a candidate (promised 40)")

@@ -237,10 +237,10 @@ fn run_recursion(
     let mut trace = Vec::with_capacity(target.len() * columns.len());
     for pair in starts.windows(2) {
         window.clear();
-        for newest in pair[0]..pair[1] {
+        for (newest, &measured) in target.iter().enumerate().take(pair[1]).skip(pair[0]) {
             stop.check()?;
             row.iter_mut().zip(columns).for_each(|(value, column)| *value = column.as_ref()[newest]);
-            window.push(&row, target[newest])?;
+            window.push(&row, measured)?;
             state
                 .step(&window)
                 .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;

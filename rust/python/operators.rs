@@ -1,6 +1,6 @@
 //! Bindings of operators: kernels, transforms, operational matrices, fractional integrals, means, dense factors.
 
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use super::convert::{check_size, columns, copy_vector, matrix, rows, stack_rows, vector, List};
@@ -36,17 +36,23 @@ fn map_rows<'py>(
     x: &PyReadonlyArray2<'py, f64>,
     work: fn(&mut [f64]) -> crate::error::Result<()>,
 ) -> PyResult<Matrix<'py>> {
-    let mut all = rows(x)?;
-    let points = all.iter().map(Vec::len).sum();
-    let all = run_interruptible(py, points, None, move |stop| {
-        for row in &mut all {
+    let (count, width, mut values) = flat(x)?;
+    let values = run_interruptible(py, values.len(), None, move |stop| {
+        for row in 0..count {
             stop.check()?;
+            let row = &mut values[row * width..][..width];
             check_finite("x", row)?;
             work(row)?;
         }
-        Ok(all)
+        Ok(values)
     })?;
-    join_rows(py, all, columns(x))
+    PyArray1::from_vec(py, values).reshape([count, width])
+}
+
+/// Number of rows of a matrix, their length, and their values one after another.
+fn flat(x: &PyReadonlyArray2<'_, f64>) -> PyResult<(usize, usize, Vec<f64>)> {
+    check_size(x)?;
+    Ok((x.as_array().nrows(), columns(x), x.as_array().iter().copied().collect()))
 }
 
 #[pyfunction]
@@ -132,9 +138,7 @@ pub fn fractional_integral<'py>(
         "grunwald-letnikov" => IntegralRule::GrunwaldLetnikov,
         other => return Err(choice("rule", other, "block-pulse, trapezoidal, grunwald-letnikov").into()),
     };
-    check_size(&x)?;
-    let (count, width) = (x.as_array().nrows(), columns(&x));
-    let mut values: Vec<f64> = x.as_array().iter().copied().collect();
+    let (count, width, mut values) = flat(&x)?;
     let values = run_interruptible(py, values.len(), None, move |stop| {
         let rows_at_once = (MAX_BLOCK_POINTS / width.max(1)).max(1);
         for block in values.chunks_mut(rows_at_once * width.max(1)) {
@@ -143,7 +147,6 @@ pub fn fractional_integral<'py>(
         }
         Ok(values)
     })?;
-    use numpy::PyArrayMethods;
     PyArray1::from_vec(py, values).reshape([count, width])
 }
 
@@ -165,22 +168,18 @@ pub fn fractional_derivative<'py>(
         "caputo" => Derivative::Caputo,
         other => return Err(choice("definition", other, "grunwald-letnikov, riemann-liouville, caputo").into()),
     };
-    let (all, starts) = (rows(&x)?, rows(&initial)?);
-    let points = all.iter().map(Vec::len).sum();
-    let out = run_interruptible(py, points, None, move |stop| {
-        check_length("initial", all.len(), starts.len())?;
-        let derivative = |(row, start): (&Vec<f64>, &Vec<f64>)| {
+    let ((count, width, values), (starts, terms, initial)) = (flat(&x)?, flat(&initial)?);
+    let values = run_interruptible(py, values.len(), None, move |stop| {
+        check_length("initial", count, starts)?;
+        let mut derivatives = Vec::with_capacity(values.len());
+        for row in 0..count {
             stop.check()?;
-            integral::fractional_derivative(row, order, step, definition, start)
-        };
-        all.iter().zip(&starts).map(derivative).collect()
+            let (row, start) = (&values[row * width..][..width], &initial[row * terms..][..terms]);
+            derivatives.extend(integral::fractional_derivative(row, order, step, definition, start)?);
+        }
+        Ok(derivatives)
     })?;
-    join_rows(py, out, columns(&x))
-}
-
-fn join_rows(py: Python<'_>, all: Vec<Vec<f64>>, width: usize) -> PyResult<Matrix<'_>> {
-    use numpy::PyArrayMethods;
-    PyArray1::from_vec(py, all.concat()).reshape([all.len(), width])
+    PyArray1::from_vec(py, values).reshape([count, width])
 }
 
 #[pyfunction]

@@ -52,6 +52,7 @@ impl Factors {
 thread_local!(static FACTORS: Factors = Factors::new());
 
 /// Sums Σ_j x_j e^{2πi jk/8} of the rows in each lane. With real and imaginary parts exchanged, e^{−2πi jk/8}.
+#[allow(clippy::needless_range_loop)]
 #[inline(always)]
 fn sum_rows<const RE: usize, const IM: usize>(x: &mut Square) {
     for l in 0..LANE_COUNT {

@@ -321,12 +321,12 @@ impl Division {
 
     /// Number of terms of each series that the next [`Division::advance`] reads.
     #[must_use]
-    pub fn reads(&self) -> usize {
+    pub fn required_terms(&self) -> usize {
         let hi = (self.solved + BLOCK_TERMS).min(self.m);
         if hi == self.m {
             return hi - self.solved;
         }
-        let (_, len, place) = level_of(hi);
+        let (_, len, place) = level_at(hi);
         ((place + 1) * len).min(self.m)
     }
 
@@ -339,7 +339,7 @@ impl Division {
     /// Solve the next block and join it to the rest.
     ///
     /// `inverse` is the row-major inverse of the leading matrix. `series(i, j, len)` returns the first `len` terms of
-    /// A_ij (fewer if m is smaller), never more than [`Division::reads`].
+    /// A_ij (fewer if m is smaller), never more than [`Division::required_terms`].
     pub fn advance<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         self.solve_block(inverse, &series);
         self.join(&series);
@@ -359,7 +359,7 @@ impl Division {
         if hi == self.m {
             return;
         }
-        let (level, len, place) = level_of(hi);
+        let (level, len, place) = level_at(hi);
         let end = (hi + len).min(self.m);
         while self.levels.len() <= level {
             let len = self.levels.last().map_or(BLOCK_TERMS, |level| level.len * MAX_LEVEL_BLOCKS);
@@ -428,7 +428,7 @@ impl Division {
 
 /// Index of the longest level with a block that ends at term `solved`, the length of its blocks, and the number of them
 /// that the next one must be joined to.
-fn level_of(solved: usize) -> (usize, usize, usize) {
+fn level_at(solved: usize) -> (usize, usize, usize) {
     let (mut level, mut len, mut count) = (0, BLOCK_TERMS, solved / BLOCK_TERMS);
     while count != 0 && count.is_multiple_of(MAX_LEVEL_BLOCKS) {
         (level, len, count) = (level + 1, len * MAX_LEVEL_BLOCKS, count / MAX_LEVEL_BLOCKS);

@@ -53,7 +53,7 @@ impl BlockSimulation {
             let lo = division.solved_terms();
             let hi = (lo + BLOCK_TERMS).min(m);
             let from = divisor.len();
-            let needed = division.reads().max(from);
+            let needed = division.required_terms().max(from);
             divisor.resize(needed, 0.0);
             for (kernel, c) in own.clone() {
                 divisor[from..].iter_mut().zip(&kernel[from..needed]).for_each(|(d, v)| *d -= c * v);

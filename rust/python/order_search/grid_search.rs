@@ -11,7 +11,7 @@ use super::arguments::{
     SettingsArg,
 };
 use super::watch::{run_checkpointed, run_watched};
-use crate::error::{check_length, Error};
+use crate::error::check_length;
 use crate::order_search::batches;
 use crate::order_search::certificate::{self, CertificateOptions, Range, Region};
 use crate::order_search::control::mismatch_error;
@@ -20,7 +20,7 @@ use crate::order_search::grid::independent::OrderGrid;
 use crate::order_search::options::Norm;
 use crate::order_search::result::{Counts, Outcome, Part, Row};
 use crate::parallel::pool;
-use crate::python::convert::{records, rows, InitialArg, List, RecordArg};
+use crate::python::convert::{check_size, columns, records, InitialArg, List, RecordArg};
 use crate::python::errors::run_detached;
 
 #[pyfunction]
@@ -282,14 +282,17 @@ impl Points {
         limit: f64,
         threads: usize,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        let (rows, Self { inner, width }) = (rows(&candidates)?, self);
+        let Self { inner, width } = self;
+        let size = 1 + 2 * *width;
+        check_size(&candidates)?;
+        check_length("a candidate", size, columns(&candidates))?;
+        let values: Vec<f64> = candidates.as_array().iter().copied().collect();
         let found = run_watched(py, None, |control| {
-            let point = |row: Vec<f64>| {
-                check_length("a candidate", 1 + 2 * *width, row.len())?;
+            let point = |row: &[f64]| {
                 let (orders, coefficients) = row[1..].split_at(*width);
-                Ok(Point { order: row[0], orders: orders.to_vec(), coefficients: coefficients.to_vec() })
+                Point { order: row[0], orders: orders.to_vec(), coefficients: coefficients.to_vec() }
             };
-            let points = rows.into_iter().map(point).collect::<Result<Vec<_>, Error>>()?;
+            let points: Vec<Point> = values.chunks_exact(size).map(point).collect();
             inner.scores(&points, limit, threads, control)
         })?;
         Ok(PyArray1::from_vec(py, found))
