@@ -375,7 +375,7 @@ fn a_division_under_way_gives_the_quotient_block_by_block() {
                 division.add(0, 0, &n);
             }
             while division.solved_terms() < m {
-                let (start, reads) = (division.solved_terms(), division.reads());
+                let (start, reads) = (division.solved_terms(), division.required_terms());
                 let end = (start + BLOCK_TERMS).min(m);
                 let series = |_: usize, _: usize, len: usize| {
                     assert!(len <= reads, "{len} terms read, {reads} announced");
