@@ -17,7 +17,7 @@ from ftlm import DataError
 from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.checks import _order_check, checks, table_3_coefficients
+from ftlm.reproduction.checks import checks, fractional_orders, make_check, table_3_coefficients
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
 from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
@@ -260,7 +260,7 @@ def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
     assert whole.earns("y") is False
     assert replace(whole, gains={"y": 3.0}).earns("y") is None
     data = SimpleNamespace(panel=Panel((), (), (replace(better, is_degenerate=True),)), simulated=False)
-    claim = _order_check(data)
+    claim = make_check(fractional_orders, data)
     assert claim.verdict == "cannot be told"
     assert "Not told in 1 cases" in claim.computed
 

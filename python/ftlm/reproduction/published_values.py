@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import csv
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -67,6 +69,12 @@ def read_paper_table(name: str) -> list[dict[str, str]]:
     """Return the rows of a csv file beside this module, by column."""
     with Path(__file__).with_name(name).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+@cache
+def read_texts(name: str) -> dict[str, Any]:
+    """Return the texts of a toml file beside this module."""
+    return tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
 
 
 def _read_rows() -> dict[tuple[str, str, str], PublishedRow]:
