@@ -21,7 +21,7 @@ from ftlm.plot.comparison_charts import compared_bars, error_chart, residual_cha
 from ftlm.plot.model_charts import bode_charts, pole_charts
 from ftlm.report.html_report import settings_table
 from ftlm.report.typesetting import equation_html, parameter_table
-from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
+from ftlm.reproduction.demo import PaperRow, paper_row, paper_table, paper_table_text
 from ftlm.svg import figure as axes
 from ftlm.svg.bar_chart import bar_chart, histogram
 from ftlm.svg.complex_plane import plane_chart

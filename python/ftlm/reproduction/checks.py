@@ -547,7 +547,7 @@ _RULE_NUMBERS = {
 
 
 #: Checks in the order of the page; their texts are in claims.toml, by the names of the functions.
-CHECKS: tuple[Callable[[Reproduction], Outcome], ...] = (
+CLAIM_CHECKS: tuple[Callable[[Reproduction], Outcome], ...] = (
     movement,
     stability,
     returned_coefficients,
@@ -580,4 +580,4 @@ def make_check(check: Callable[[Reproduction], Outcome], found: Reproduction) ->
 
 def checks(found: Reproduction) -> list[Check]:
     """Compare the claims of the paper, and its errors, with computed numbers."""
-    return [made for check in CHECKS if (made := make_check(check, found)) is not None]
+    return [made for check in CLAIM_CHECKS if (made := make_check(check, found)) is not None]

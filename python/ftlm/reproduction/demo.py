@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ from ftlm.data.run import Run
 from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
+from ftlm.model.model import Model
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import compared_bars, comparison_charts
 from ftlm.plot.model_charts import pole_charts
@@ -23,16 +24,16 @@ from ftlm.progress import ShareTracker
 from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
 from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 from ftlm.reproduction.figures import convergence_chart, derivative_chart
-from ftlm.reproduction.published_values import INNOVATION_LENGTHS
-from ftlm.reproduction.report import fits_text, joint_equations
+from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, INNOVATION_LENGTHS, ORDER_LETTERS
+from ftlm.reproduction.report import criteria_cells, fits_text, joint_equations, letters_of, make_table, number_cells
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage_models import Preset, StageWork
 from ftlm.reproduction.stage_result import GRID_ALPHA, Candidate, DroppedDerivative
-from ftlm.reproduction.tables import PaperRow, paper_row, paper_table, paper_table_text
 from ftlm.structure.order_grid import OrderGrid
-from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, write_page
 from ftlm.utils.files import check_folder
-from ftlm.utils.formatting import Cell, json_value, symbol, wrap_text
+from ftlm.utils.formatting import DIVERGED_TEXT, SIGNIFICANT_DIGITS, Cell, json_value, symbol, truncate_text, wrap_text
+from ftlm.validation.comparison import Comparison, Metrics
 
 #: Candidates that the result of an order search keeps.
 TOP_CANDIDATES = 20
@@ -51,6 +52,104 @@ TABLE_NOTE = (
     "current. Integer order, p and least squares have the paper's (22)–(25), in which a derivative of the current is "
     "missing. p weighs the data against the prior K0 = 1 with coefficients near zero; least squares has no prior."
 )
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """Row of a table in the form of the paper's Tables 4 and 5.
+
+    Parameters
+    ----------
+    label
+        Label, such as "integer order" or "p = 7".
+    output
+        Output of the equation.
+    orders
+        ``alpha``, ``beta``, ``gamma``, ``mu``; orders of absent terms are missing.
+    coefficients
+        ``a``, ``b``, ``d``, ``g``, likewise.
+    equation_error, output_error, validation
+        Errors on the estimation run, and output error on another run; None if they were not computed.
+    """
+
+    label: str
+    output: str
+    orders: Mapping[str, float]
+    coefficients: Mapping[str, float]
+    equation_error: Metrics | None
+    output_error: Metrics | None
+    validation: Metrics | None = None
+
+
+def paper_row(
+    label: str, model: Model, comparison: Comparison, output: str, validation: Comparison | None = None
+) -> PaperRow:
+    """Return the row of one equation of an arm's model with coefficients a, b, d, g and an index.
+
+    Raises
+    ------
+    ModelError
+        No such output.
+    """
+    errors = comparison.equation_error.get(output), comparison.output_error.get(output)
+    prediction = None if validation is None else validation.output_error[output]
+    return PaperRow(label, output, *letters_of(model, output), *errors, prediction)
+
+
+def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -> Table:
+    """Return a table in the form of the paper's Tables 4 and 5, with both errors.
+
+    Parameters
+    ----------
+    rows
+        For each output the integer-order model, then one row for each p; rows of one output are adjacent.
+    title
+        Caption.
+    """
+
+    def cells(row: PaperRow) -> list[Cell]:
+        errors = [*criteria_cells(row.equation_error), *criteria_cells(row.output_error)]
+        return [row.label, *number_cells(row.orders, row.coefficients), *errors]
+
+    by_output = {output: [cells(r) for r in rows if r.output == output] for output in [r.output for r in rows]}
+    return make_table("both_errors", by_output, title=title)
+
+
+#: Column widths of the text: label, four orders, four coefficients, twice error, RMSE, NR. Together 119 of 120.
+_LABEL_WIDTH, _TEXT_WIDTHS = 17, (5,) * 4 + (9,) * 4 + (8, 8, 7) * 2
+
+
+def paper_table_text(rows: Sequence[PaperRow]) -> str:
+    """Return the same table as text of 120 columns; numbers lose digits in narrow columns."""
+    heads = [*map(symbol, (*ORDER_LETTERS, *COEFFICIENT_LETTERS)), *("error", "RMSE", "NR") * 2]
+    left, right = sum(_TEXT_WIDTHS[:8]) + _LABEL_WIDTH, sum(_TEXT_WIDTHS[8:11])
+    groups = (f" {words} ".center(right - 1, "-").rjust(right) for words in ("equation error", "free run"))
+    lines = [
+        " " * left + "".join(groups),
+        "model".ljust(_LABEL_WIDTH) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
+    ]
+    table, infinite = paper_table(rows), False
+    for i, (label, *cells) in enumerate(table.rows):
+        if i in table.headings:
+            lines.append(symbol(rows[i].output))
+        numbers = "".join(
+            _fit_to_width(v, width - 1).rjust(width) for v, width in zip(cells, _TEXT_WIDTHS, strict=True)
+        )
+        lines.append(f"  {truncate_text(str(label), _LABEL_WIDTH - 3)}".ljust(_LABEL_WIDTH) + numbers)
+        infinite = infinite or any(isinstance(v, float) and not math.isfinite(v) for v in cells)
+    if infinite:
+        lines.append(f"∞: {DIVERGED_TEXT}, the response leaves the range of numbers")
+    return "\n".join(lines)
+
+
+def _fit_to_width(value: Cell, width: int) -> str:
+    """Format a number with as many of its five digits as fit."""
+    if value is None or isinstance(value, str):
+        return NOT_IN_MODEL
+    if not math.isfinite(value):
+        return "?" if math.isnan(value) else "∞"
+    texts = [f"{value:.{n}g}".replace("e-0", "e-").replace("e+0", "e") for n in range(SIGNIFICANT_DIGITS, 0, -1)]
+    return next((t for t in texts if len(t) <= width), texts[-1])
 
 
 @dataclass(frozen=True)

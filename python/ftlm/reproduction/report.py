@@ -1,30 +1,48 @@
-"""HTML page and terminal summary of the reproduction, both made from its checks and tables."""
+"""HTML page and terminal summary of the reproduction: tables with computed values beside the printed ones, sections.
+
+Their texts are in page.toml.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
 
+from ftlm.arm.flexible_link import PARAMETER_SETS
+from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.plot.model_charts import bode_charts, response_frequencies
 from ftlm.report.html_report import estimates_table, grouped_findings
 from ftlm.report.typesetting import equation_html
-from ftlm.reproduction import figures, tables
-from ftlm.reproduction.checks import deviation_text
+from ftlm.reproduction import figures
+from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.checks import deviation_text, table_3_coefficients
+from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, parameter_name, read_texts
+from ftlm.reproduction.simulated_arm import letter_of
 from ftlm.reproduction.stage_models import COARSE_INCREMENT, REFINED_CANDIDATES
-from ftlm.reproduction.stage_result import TRACE_EVERY, Candidate, Stage
+from ftlm.reproduction.stage_result import (
+    MULTI_INNOVATION_LABELS,
+    PRIOR_COVARIANCES,
+    RIVAL_ALPHA,
+    TRACE_EVERY,
+    WEAK_PRIOR,
+    Candidate,
+    Stage,
+    prior_text,
+)
 from ftlm.structure.equation import format_equation
 from ftlm.svg.heat_map import heat_map
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Cell, Exact, number, symbol
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Cell, Exact, number, symbol, symbol_html
+from ftlm.validation.comparison import Metrics
 
 if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
@@ -33,6 +51,280 @@ PAPER_REFERENCE = (
     "Wang, Li, Li, Liang, Gao: Establishment and Identification of Fractional-Order Model for Structurally Symmetric "
     "Flexible Two-Link Manipulator System, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072"
 )
+PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
+OPTIMIZER_LABELS = {"genetic": "genetic algorithm", "differential evolution": "differential evolution"}
+_STRONG_PRIOR, _WEAK_PRIOR = (Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in PRIOR_COVARIANCES)
+#: Heads of columns that page.toml names by @.
+COLUMN_HEADS: Mapping[str, Sequence[str]] = {
+    "@numbers": tuple(map(symbol_html, (*ORDER_LETTERS, *COEFFICIENT_LETTERS))),
+    "@coefficients": tuple(map(symbol_html, COEFFICIENT_LETTERS)),
+    "@criteria": ("error (45)", "RMSE", "NR"),
+    "@strong_prior": (_STRONG_PRIOR,),
+    "@weak_prior": (_WEAK_PRIOR,),
+    "@curve": (Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)"),),
+}
+
+
+def make_table(
+    key: str,
+    rows: Iterable[Sequence[Any]] | Mapping[str, Iterable[Sequence[Any]]],
+    heads: Mapping[str, Sequence[str]] | None = None,
+    **fields: Any,
+) -> Table:
+    """Return a table of page.toml.
+
+    Parameters
+    ----------
+    key
+        Its key there.
+    rows
+        Rows, or the rows of every angle by name.
+    heads
+        Heads of columns besides `COLUMN_HEADS`.
+    **fields
+        Fields of its title and note.
+    """
+    texts = read_texts("page")["tables"][key]
+    known = {**COLUMN_HEADS, **(heads or {})}
+    columns = [head for name in texts["columns"] for head in known.get(name, (name,))]
+    title, note = (texts.get(name, "").format(printed_note=PRINTED_NOTE, **fields) for name in ("title", "note"))
+    options = {name: texts[name] for name in ("groups", "wrap", "stacked") if name in texts}
+    if isinstance(rows, Mapping):
+        groups: dict[str, list[Any]] = {symbol_html(name): list(each) for name, each in rows.items()}
+        return Table.from_groups(title, columns, groups, note=note, **options)
+    return Table(title, columns, list(rows), note=note, **options)
+
+
+def make_section(key: str, *paragraphs: str, fields: Mapping[str, Any] | None = None, **content: Any) -> Section:
+    """Return a section of page.toml with these fields; further paragraphs follow its own, `content` is a section's."""
+    texts = read_texts("page")["sections"][key]
+    if fields is not None:
+        texts = {
+            n: v.format(**fields) if isinstance(v, str) else [p.format(**fields) for p in v] for n, v in texts.items()
+        }
+    given = {"fold": texts["fold"]} if "fold" in texts else {}
+    return Section(texts["heading"], [*texts.get("paragraphs", ()), *paragraphs], **given, **content)
+
+
+def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Orders and coefficients of the equation of one angle by letter.
+
+    Raises
+    ------
+    ModelError
+        No such output.
+    """
+    item = next((e for e in model.equations if e.output == output), None)
+    if item is None:
+        raise ModelError(f"the model has no output {output!r}; it has {', '.join(model.outputs)}")
+    orders, coefficients = {"alpha": item.order.constant}, {}
+    for term in item.terms:
+        letter = letter_of(term.name or "")
+        if letter in COEFFICIENT_LETTERS:
+            coefficients[letter] = float(term.coefficient) + 0.0
+        if letter in printed.ORDER_OF:
+            orders[printed.ORDER_OF[letter]] = term.order.constant
+    return orders, coefficients
+
+
+def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
+    """Cells under `NUMBER_HEADS`: orders to the four decimals of the paper's Table 6, coefficients as estimates."""
+    cells = [Exact(round(orders[n], 4) + 0.0) if n in orders else None for n in ORDER_LETTERS]
+    return [*cells, *map(coefficients.get, COEFFICIENT_LETTERS)]
+
+
+def criteria_cells(figures: Metrics | None) -> list[Cell]:
+    """Cells under `CRITERION_HEADS`."""
+    return [None] * 3 if figures is None else [figures.error, figures.rmse, figures.nr]
+
+
+def printed_head(words: str) -> Markup:
+    """Return the head of a row of printed values."""
+    return Markup("<em>printed: {}</em>").format(words)
+
+
+def printed_cells(words: str, row: printed.PublishedRow, *, criteria: bool = True) -> list[Cell]:
+    """Cells of a printed row."""
+    cells = [printed_head(words), *number_cells(row.orders, row.coefficients)]
+    return [*cells, *row.criteria] if criteria else cells
+
+
+def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
+    """Orders, and coefficients at least as large as their standard errors, of one equation."""
+    orders, coefficients = letters_of(candidate.model, output)
+    errors = {} if candidate.result is None else candidate.result.standard_errors
+    known = {n: v for n, v in coefficients.items() if not errors.get(parameter_name(n, output), 0.0) > abs(v)}
+    return number_cells(orders, known)
+
+
+def model_table(stage: Stage) -> Table:
+    """Table 4 or 5, with computed and printed rows."""
+
+    def rows(output: str) -> Iterator[list[Cell]]:
+        beside = {"integer, Euler": printed.INTEGER_ROWS[output]}
+        beside |= {f"p = {p}": row for p, row in printed.FRACTIONAL_ROWS[output].items()}
+        for label, c in stage.candidates.items():
+            yield [label, *computed_cells(c, output), *criteria_cells(c.estimation.output_error.get(output))]
+            if label in beside:
+                yield printed_cells(label.partition(",")[0], beside[label])
+
+    return make_table("models", {o: rows(o) for o in stage.outputs}, table=3 + stage.number, stage=stage.number)
+
+
+def fits_table(stage: Stage) -> Table:
+    """Table of both errors of every model, and its fits on both runs by the method's inputs and by the current."""
+
+    def rows(output: str) -> Iterator[list[Cell]]:
+        for label, c in stage.candidates.items():
+            errors = c.estimation.equation_error[output].nr, c.estimation.output_error[output].nr
+            driven = [None if part is None else part.output_error[output].fit for part in (c.estimation, c.validation)]
+            alone = [figures[output].fit for figures in c.input_driven.values()]
+            yield [label, *errors, *driven, *alone, *[None] * (2 - len(alone))]
+
+    return make_table("fits", {o: rows(o) for o in stage.outputs}, stage=stage.number)
+
+
+def description_tables() -> list[Table]:
+    """Tables 1 and 2: symbols, and every step with its function."""
+    steps = [
+        [
+            f"{k}. {each['step']}",
+            Markup(", ").join(Markup("<code>{}</code>").format(f) for f in each["functions"].split(", ")),
+            each["how"],
+        ]
+        for k, each in enumerate(printed.read_paper_table("paper_procedure.csv"), 1)
+    ]
+    symbols = [list(each.values()) for each in printed.read_paper_table("paper_symbols.csv")]
+    return [make_table("symbols", symbols), make_table("steps", steps)]
+
+
+def parameter_tables() -> list[Table]:
+    """Table 3 beside the manufacturer's effective parameters, and the coefficients that follow from both."""
+    fields = {
+        "J": ("hub_inertia", "link_inertia"),
+        "B": ("hub_friction", "link_friction"),
+        "K_s": ("stiffness",),
+        "K_τ": ("torque_constant",),
+    }
+    rows: list[list[Cell]] = []
+    for name, (value, unit) in printed.TABLE_3.items():
+        stem = letter_of(name)
+        stage, *place = map(int, name[len(stem) :])
+        effective = None
+        if (known := fields.get(stem.rstrip("_"))) is not None:
+            effective = Exact(getattr(PARAMETER_SETS["effective"][stage], known[place[0] - 1 if place else 0]))
+        shown = Markup("<i>{}</i><sub>{}</sub>").format(name[0], name.partition("_")[2])
+        rows.append([shown, Exact(value), unit, effective, value / effective if effective else None])
+    coefficients = table_3_coefficients().items()
+    ratios = ([symbol_html(n), t + 0.0, e + 0.0, p, t / p, e / p] for n, (t, e, p) in coefficients)
+    return [make_table("parameters", rows), make_table("coefficients", ratios)]
+
+
+def saturation_table(found: Reproduction) -> Table:
+    """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
+
+    def rows(stage: Stage, output: str) -> Iterator[list[Cell]]:
+        name = parameter_name("a", output)
+        of_p = {p: stage.candidates[f"p = {p}"].model for p in printed.INNOVATION_LENGTHS}
+        last = letters_of(of_p[printed.INNOVATION_LENGTHS[-1]], output)[0]
+        x, c, _ = printed.printed_saturation(output)
+        for p, model in of_p.items():
+            alike = "yes" if letters_of(model, output)[0] == last else "no"
+            weak = stage.weak[output][p][name] if stage.weak else None
+            stated = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
+            yield [f"p = {p}", model.coefficients[name], alike, weak, stated, x * p / (p + c)]
+
+    return make_table("saturation", {output: rows(stage, output) for stage, output in found.angles})
+
+
+def optimizer_tables(found: Reproduction) -> list[Table]:
+    """Tables 6 and 7 at equal budgets, and the error (45) of each optimizer and seed."""
+    rivals = found.rivals
+    seeds = list(dict.fromkeys(seed for rival in rivals.values() for seed in rival.optimizers["genetic"].errors))
+    best: list[list[Cell]] = []
+    for output, rival in rivals.items():
+        head = Markup("{}, best of {} seeds").format(symbol_html(output), len(rival.optimizers["genetic"].errors))
+        best.append([head, *computed_cells(rival.models["genetic"], output)])
+        best.append(printed_cells(symbol_html(output), printed.GENETIC_ROWS[output], criteria=False))
+    labels = OPTIMIZER_LABELS | {
+        n: f"p = 7, K₀ = {prior_text(k)}" for n, k in zip(MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, strict=True)
+    }
+
+    def errors(output: str) -> Iterator[list[Cell]]:
+        for label, candidate in rivals[output].models.items():
+            own, other = candidate.estimation, candidate.validation
+            prediction = criteria_cells(None if other is None else other.output_error[output])
+            spread = float(np.std(own.measured[output][0]))
+            yield [labels.get(label, label), *criteria_cells(own.output_error[output]), *prediction, spread]
+        for k, label in enumerate(("genetic algorithm", "multi-innovation")):
+            criteria, implied = map(Exact, printed.TABLE_7_CRITERIA[output][k]), printed.implied_spreads()[output][k]
+            yield [printed_head(label), *criteria, None, None, None, implied]
+
+    def errors_by_seed(output: str) -> Iterator[list[Cell]]:
+        for name, run in rivals[output].optimizers.items():
+            each = max(run.evaluations.values())
+            yield [OPTIMIZER_LABELS[name], rivals[output].candidates, each, *map(run.errors.get, seeds)]
+
+    return [
+        make_table("genetic", best),
+        make_table("optimizers", {o: errors(o) for o in rivals}, alpha=RIVAL_ALPHA),
+        make_table("seeds", {o: errors_by_seed(o) for o in rivals}, {"@seeds": [f"seed {s}" for s in seeds]}),
+    ]
+
+
+def printed_reading_table(found: Reproduction, stage: Stage) -> Table:
+    """Table 4 or 5 as the paper computed it: recomputed, printed, and their ratio."""
+
+    def rows(output: str) -> Iterator[list[Cell]]:
+        for p, row in found.as_printed[output].rows.items():
+            stated = printed.FRACTIONAL_ROWS[output][p]
+            ours = [*map(row.coefficients.get, COEFFICIENT_LETTERS), *criteria_cells(row.equation)]
+            theirs = [*map(stated.coefficients.get, COEFFICIENT_LETTERS), *stated.criteria]
+            pairs = zip(ours, theirs, strict=True)
+            ratios = [number(float(a) / b, 3) if a is not None and b else None for a, b in pairs]
+            yield [f"p = {p}", *ours]
+            yield [printed_head(f"p = {p}"), *theirs]
+            yield ["ours / printed", *ratios]
+
+    made = {symbol(o): found.as_printed[o] for o in stage.outputs}
+    return make_table(
+        "as_printed",
+        {o: rows(o) for o in stage.outputs},
+        table=3 + stage.number,
+        settings="; ".join(
+            f"{o}: {t.reading} ({printed.TERM_INTERPRETATIONS[t.reading.terms]})" for o, t in made.items()
+        ),
+        scales=", ".join(f"{o} by {t.scale:.3g}" for o, t in made.items()),
+    )
+
+
+def printed_runs_table(found: Reproduction) -> Table:
+    """Table of the printed models under the paper's own current."""
+
+    def rows(output: str) -> Iterator[list[Cell]]:
+        for r in found.ran:
+            if r.output == output:
+                back = [r.returned_coefficients.get(k, {}).get(parameter_name("a", output)) for k in PRIOR_COVARIANCES]
+                deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
+                stated = printed.FRACTIONAL_ROWS[output][r.p].coefficients["a"]
+                yield [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, stated, *back]
+
+    return make_table("printed_models", {o: rows(o) for o in dict.fromkeys(r.output for r in found.ran)})
+
+
+def case_tables(found: Reproduction) -> list[Table]:
+    """Tables of error and steps by p, arm, K0 and angle, first record of each arm, and of integer and free orders."""
+    rows: dict[tuple[str, str, float], list[Cell]] = {}
+    for t in found.panel.trials:
+        steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
+        head = f"{t.arm}, {symbol(t.output)}, K₀ = {prior_text(t.prior)}"
+        rows.setdefault((t.arm, t.output, t.prior), [head, *t.errors.values(), *steps, t.nr, t.manual])
+    orders = (
+        [f"{f.arm}, {symbol(o)}", f.integer_nr[o], f.free_nr[o], f.fractional_text]
+        for f in found.panel.order_comparisons
+        for o in f.free_nr
+    )
+    return [make_table("trials", rows.values(), weak_prior=WEAK_PRIOR), make_table("order_comparisons", orders)]
 
 
 def typeset(words: str) -> str:
@@ -58,40 +350,28 @@ def _verdict_section(found: Reproduction) -> Section:
         ]
         for c in found.checks
     ]
-    numbers = [[typeset(text) for text in (c.claim, c.computed, c.printed, c.rule)] for c in found.checks]
-    behind = Table("Numbers", ("the paper's claim", "computed", "printed", "rule of a case"), numbers, wrap=True)
-    heads = "the paper's claim", "verdict", "cases", "computed"
-    note = (
-        "A verdict is computed from all its cases: arms, records, angles, both ends of K₀. A claim holds, or does not, "
-        "if all cases agree, and turns with each factor whose change alone changes the outcome. Bars show the share of "
-        "cases in which a claim holds, one bar for each level of the deciding factor."
-    )
+    numbers = ([typeset(text) for text in (c.claim, c.computed, c.printed, c.rule)] for c in found.checks)
     missing = "No second run was given: nothing is validated, Figure 10 is left out."
-    return Section(
-        "What holds and what does not",
-        tables=[Table("Verdicts", heads, rows, note=note, wrap=True, stacked=True)],
+    return make_section(
+        "verdicts",
+        tables=[make_table("verdicts", rows)],
         warnings=[missing] * (found.sine is None),
-        fold="All numbers, rules and cases",
-        folded_tables=[behind, *tables.case_tables(found)],
+        folded_tables=[make_table("claims", numbers), *case_tables(found)],
     )
 
 
 def _stage_section(found: Reproduction, stage: Stage) -> Section:
     number, joint = stage.number, stage.candidates["output error"]
-    shown = [
-        tables.model_table(stage, f"Table {3 + number}. Identified models of stage {number}, square input"),
-        estimates_table(joint.result, found.truth.get(number, {})),
-        tables.fits_table(stage),
-    ]
+    shown = [model_table(stage), estimates_table(joint.result, found.truth.get(number, {})), fits_table(stage)]
     warned = [w.partition(": ") for w in grouped_findings({label: c.result for label, c in stage.candidates.items()})]
     if warned:
-        rows = [[Markup("{}").format(models), typeset(words)] for models, _, words in warned]
-        shown.append(Table(f"Warnings of the fits of stage {number}", ("model", "warning"), rows, wrap=True))
-    return Section(
-        f"As it should be, stage {number} (Table {3 + number})",
-        joint_equations(joint.model),
+        rows = ([Markup("{}").format(models), typeset(words)] for models, _, words in warned)
+        shown.append(make_table("warnings", rows, stage=number))
+    return make_section(
+        "stage",
+        *joint_equations(joint.model),
+        fields={"stage": number, "table": 3 + number, "warnings": ", warnings" if warned else ""},
         figures=figures.stage_figures(stage, simulated=found.simulated),
-        fold=f"Table {3 + number}, estimates with intervals, fits" + (", warnings" if warned else ""),
         folded_tables=shown,
     )
 
@@ -121,91 +401,33 @@ def _sections(found: Reproduction) -> list[Section]:
     ]
     joint = [s.candidates["output error"].model for s in stages]
     bode = [c for m in joint for c in bode_charts(m, response_frequencies(m, found.square.step, found.square.duration))]
-    ran = (
-        [f"Standard deviations implied by RMSE / NR over those of the models: {deviation_text(found)}."]
-        if found.ran
-        else []
-    )
+    ran = [f"Standard deviations implied by RMSE / NR over those of the models: {deviation_text(found)}."]
     every = [
         _verdict_section(found),
-        Section(
-            "The printed models, run",
-            ["The paper describes its errors as those of the models' responses.", *ran],
+        make_section(
+            "printed_models",
+            *(ran if found.ran else ()),
             figures=figures.printed_model_charts(found),
-            fold="All printed models",
-            folded_tables=[tables.printed_runs_table(found)],
+            folded_tables=[printed_runs_table(found)],
         ),
-        Section(
-            "As printed (Tables 4 and 5)",
-            [
-                "Tables 4 and 5 are approached with the printed orders, multi-innovation and the error of the equation "
-                "in place of the free run. Four choices are not in the paper: K₀ for each angle, own terms on the "
-                "left-hand side, the stock filter on the deflections, and which of (22)–(25) and (26) is meant."
-            ],
-            fold="Ours beside printed",
-            folded_tables=[tables.printed_reading_table(found, stage) for stage in stages],
-        ),
+        make_section("as_printed", folded_tables=[printed_reading_table(found, stage) for stage in stages]),
         *(_stage_section(found, stage) for stage in stages),
     ]
     if found.sine is not None:
-        every.append(Section("The other input (Figure 10)", figures=figures.sine_figures(found)))
+        every.append(make_section("sine", figures=figures.sine_figures(found)))
     if found.rivals:
-        every.append(
-            Section(
-                "The genetic algorithm (Tables 6 and 7, Figure 11)",
-                [
-                    "All optimizers search the same record by criterion (45) of the free run. Each evaluates as many "
-                    "candidates as the order grid has. The rivals vary orders and coefficients. Multi-innovation takes "
-                    "the coefficients of the equation error, with a prior near 0 if K₀ is small."
-                ],
-                figures=figures.rival_figures(found),
-                fold="Tables 6 and 7, seeds",
-                folded_tables=tables.optimizer_tables(found),
-            )
-        )
+        shown = figures.rival_figures(found)
+        every.append(make_section("optimizers", figures=shown, folded_tables=optimizer_tables(found)))
+    derived = [figures.derivative_chart(s.derived, simulated=simulated) for s in stages]
     return [
         *every,
-        Section(
-            "What p does",
-            [
-                "Recursion (44) is weighted least squares: row i has the weight min(p, M − i + 1), against a prior "
-                "with covariance K0 around 0. So p weighs the data against the prior. With a weak prior every p gives "
-                "the least-squares estimate at every step."
-            ],
-            figures=weak,
-            small=True,
-            fold="Coefficient a by p",
-            folded_tables=[tables.saturation_table(found)],
-        ),
-        Section(
-            "Orders close to one another",
-            [
-                "If α − ν is small, I^(α−ν) y is nearly y itself. A few such terms on the right-hand side reproduce "
-                "any smooth signal. Only the free run shows whether the equation describes the machine."
-            ],
-            figures=near,
-        ),
-        Section(
-            "The dropped derivative",
-            [
-                "Eliminating the hub angle's highest derivative from (15) by (17) differentiates the current by the "
-                "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for integer orders. Without it a "
-                "fractional link bends with the current, whereas a real one bends against it: Figures 6(b), 9(b), "
-                "10(b) and 10(d). Rows of p, least squares, instrumental variables and the rivals have (22)–(25), as "
-                "in the paper. Output error and integer orders identified have (14)–(15)."
-            ],
-            figures=[figures.derivative_chart(s.derived, simulated=simulated) for s in stages],
-        ),
-        Section("Order landscape", correlated, figures=[*map(heat_map, landscapes.values())], small=True),
-        Section("Frequency response", ["Of the joint output-error models, with 95 % bands."], figures=bode, small=True),
-        Section("Parameters (Table 3)", fold="Table 3 and its coefficients", folded_tables=tables.parameter_tables()),
-        Section(
-            "Symbols and steps",
-            ["Figures 1 and 3 are pictures of the authors' arm and are not shown."],
-            figures=[figures.flow_chart()],
-            fold="Tables 1 and 2",
-            folded_tables=tables.description_tables(),
-        ),
+        make_section("innovation_length", figures=weak, small=True, folded_tables=[saturation_table(found)]),
+        make_section("close_orders", figures=near),
+        make_section("dropped_derivative", figures=derived),
+        make_section("landscape", *correlated, figures=[*map(heat_map, landscapes.values())], small=True),
+        make_section("frequency_response", figures=bode, small=True),
+        make_section("parameters", folded_tables=parameter_tables()),
+        make_section("description", figures=[figures.flow_chart()], folded_tables=description_tables()),
         _runs_section(found),
     ]
 
@@ -215,19 +437,15 @@ def _runs_section(found: Reproduction) -> Section:
     for run in found.runs:
         currents = (f"{symbol(n)} ±{np.max(np.abs(run[n])):.3g} {run.units[n]}" for n in run.inputs)
         rows.append([run.name, run.length, Exact(run.step), run.duration, ", ".join(currents)])
-    grid, m = found.order_grid, next(iter(found.stages.values())).candidates["p = 7"].estimation.m
-    notes = [
-        f"M = {m} block pulses, increment of the order grid {grid.increment:g}, α from {grid.alpha[0]:g} to "
-        f"{grid.alpha[1]:g}, K₀ = 1, rows in Haar coordinates from coarse to fine. Convergence is computed at every "
-        f"{TRACE_EVERY}nd step. Instrumental variables are searched two increments around the orders of least squares. "
-        "With K₀ = 1 deflections hardly move, and no bound excludes a candidate: grids finer than "
-        f"{COARSE_INCREMENT:g} are searched in increments of that, then around the {REFINED_CANDIDATES} best. "
-        "Equations (22)–(25) are fitted by output error from the parameters of (14)–(15).",
-        "Explicit Euler steps at the step of the run, 0.002 s on the virtual rig, as in the paper.",
-        *found.notes,
-    ]
-    runs = Table("Runs", ("run", "rows", "step [s]", "length [s]", "currents"), rows)
-    return Section("Runs and settings", notes, tables=[runs])
+    fields = {
+        "m": next(iter(found.stages.values())).candidates["p = 7"].estimation.m,
+        "increment": found.order_grid.increment,
+        "alpha": found.order_grid.alpha,
+        "trace_every": TRACE_EVERY,
+        "coarse_increment": COARSE_INCREMENT,
+        "refined_candidates": REFINED_CANDIDATES,
+    }
+    return make_section("runs", *found.notes, fields=fields, tables=[make_table("runs", rows)])
 
 
 def reproduction_page(found: Reproduction, path: str | os.PathLike[str], *, force: bool = False) -> Path:
