@@ -21,7 +21,7 @@ from ftlm.reproduction.checks import checks, fractional_orders, make_check, tabl
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
 from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
-from ftlm.reproduction.stage_result import OrderComparison, Panel, compare_optimizers
+from ftlm.reproduction.stage import OrderComparison, Panel, compare_optimizers
 from ftlm.validation.comparison import compare_means
 from lagrange import truth
 from test_derivation import STIFFNESS_PAIRS, TABLE_3
@@ -483,8 +483,8 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     own = ["I2", "theta21", "theta22"]
     moving = reproduction.square.select(own).window(1.3, 4.3)
     other = reproduction.sine.select(own).window(0.7, 3.7)
-    monkeypatch.setattr("ftlm.reproduction.stage_models.MOST_ROWS", 1000)
-    monkeypatch.setattr("ftlm.reproduction.stage_models.JOINT_ROWS", 500)
+    monkeypatch.setattr("ftlm.reproduction.stage.MOST_ROWS", 1000)
+    monkeypatch.setattr("ftlm.reproduction.stage.JOINT_ROWS", 500)
     told = []
     found = ftlm.reproduce(moving, other, increment=0.5, progress=lambda *share: told.append(share))
     # One share of the whole, which never falls.
@@ -580,8 +580,8 @@ def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reprod
     def stage_without_searches(work, genetic):
         return replace(reproduction.stages[work.number], rivals=work.rivals(genetic))
 
-    monkeypatch.setattr("ftlm.reproduction.stage_models.StageWork.compute_stage", stage_without_searches)
-    monkeypatch.setattr("ftlm.reproduction.stage_result.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.reproduction.stage.StageWork.compute_stage", stage_without_searches)
+    monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
     monkeypatch.setitem(sys.modules, absent, None)
     lines = []
     found = ftlm.reproduce(increment=0.25, arms=["whole orders"], records=1, log=lines.append)

@@ -25,15 +25,16 @@ from ftlm.reproduction.published_values import (
     run_printed_models,
 )
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, demo_run
-from ftlm.reproduction.stage_models import Preset, StageWork, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
-from ftlm.reproduction.stage_result import (
+from ftlm.reproduction.stage import (
+    Preset,
+    StageWork,
     compare_optimizers,
     compare_orders,
     convergence_step,
     rivals_order_grid,
-    seeds_for,
     simulated_panel,
 )
+from ftlm.reproduction.workload import TotalProgress, WorkerProgress, seconds_of, seconds_of_all, seeds_for
 from ftlm.simulation.discretization import prepare
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -302,9 +303,9 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         given.append((lattice, asked))
         raise ftlm.ModelError("enough")
 
-    monkeypatch.setattr("ftlm.reproduction.stage_result.compare_optimizers", like)
-    monkeypatch.setattr("ftlm.reproduction.stage_models.compare_optimizers", like)
-    monkeypatch.setattr("ftlm.reproduction.stage_result.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.reproduction.stage.compare_optimizers", like)
+    monkeypatch.setattr("ftlm.reproduction.stage.compare_optimizers", like)
+    monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
         simulated_panel(1, "whole orders", [1], 0.0, 1, order_grid=rivals_order_grid(step))
     preset = Preset(ftlm.OrderGrid(increment=step), 1, 2, common_pulses=True)
@@ -326,13 +327,13 @@ def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
 
 
 def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
-    monkeypatch.setattr("ftlm.reproduction.stage_models.COARSE_INCREMENT", 0.4)
+    monkeypatch.setattr("ftlm.reproduction.stage.COARSE_INCREMENT", 0.4)
     run, lattice = demo_run("square"), ftlm.OrderGrid(increment=0.2)
     work = StageWork(1, run, None, Preset(lattice, 1, 2, common_pulses=True), 1, lambda _: None, None)
     options = {"coefficients": "multi-innovation", "innovation_length": 3}
     seen = []
     monkeypatch.setattr(
-        "ftlm.reproduction.stage_models.rank_orders",
+        "ftlm.reproduction.stage.rank_orders",
         lambda *a, **k: seen.append(a[2].increment) or rank_orders(*a, **k),
     )
     found = work.search_candidate("p = 3", lattice, **options)
@@ -355,7 +356,7 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
         seen.append(structure.initial)
         raise ftlm.ConvergenceError("enough")
 
-    monkeypatch.setattr("ftlm.reproduction.stage_result.identify", identify)
+    monkeypatch.setattr("ftlm.reproduction.stage.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
         compare_orders(1, demo_run("square"), "fractional", 1, validation=demo_run("sine"))
     preset = Preset(ftlm.OrderGrid(increment=0.25), 1, 2, common_pulses=True)

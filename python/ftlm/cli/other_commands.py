@@ -16,7 +16,7 @@ from ftlm.reproduction.cross_validation import cross_validate_orders, cross_vali
 from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import ALWAYS_SAVED
-from ftlm.reproduction.stage_result import CONTEST_STEP
+from ftlm.reproduction.workload import CONTEST_STEP
 from ftlm.utils.files import check_folder
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads

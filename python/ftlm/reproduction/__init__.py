@@ -10,7 +10,7 @@ from ftlm.reproduction.cross_validation import (
 )
 from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads, printed_saturation
 from ftlm.reproduction.simulated_arm import demo_plant, demo_run
-from ftlm.reproduction.stage_result import Candidate, Rival, Stage
+from ftlm.reproduction.stage import Candidate, Rival, Stage
 
 __all__ = [
     "AsPrinted",

@@ -13,9 +13,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.published_values import ANGLE_NAMES, INNOVATION_LENGTHS, PrintedModelRun, read_texts
+from ftlm.reproduction.published_values import (
+    ANGLE_NAMES,
+    INNOVATION_LENGTHS,
+    PRIOR_COVARIANCES,
+    WEAK_PRIOR,
+    PrintedModelRun,
+    prior_text,
+    read_texts,
+)
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS
-from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, TRACE_EVERY, WEAK_PRIOR, Trial, are_usable, prior_text
+from ftlm.reproduction.stage import TRACE_EVERY, Trial, are_usable
 from ftlm.utils.formatting import symbol
 from ftlm.validation.comparison import metrics
 

@@ -27,8 +27,7 @@ from ftlm.reproduction.figures import convergence_chart, derivative_chart
 from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, INNOVATION_LENGTHS, ORDER_LETTERS
 from ftlm.reproduction.report import criteria_cells, fits_text, joint_equations, letters_of, make_table, number_cells
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
-from ftlm.reproduction.stage_models import Preset, StageWork
-from ftlm.reproduction.stage_result import GRID_ALPHA, Candidate, DroppedDerivative
+from ftlm.reproduction.stage import GRID_ALPHA, Candidate, DroppedDerivative, Preset, StageWork
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, write_page
 from ftlm.utils.files import check_folder

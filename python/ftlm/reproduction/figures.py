@@ -14,7 +14,7 @@ from ftlm.estimation.linear import MultiInnovationTrace, trace_chart
 from ftlm.plot.comparison_charts import error_chart, pulse_times
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import ClaimVerdict
-from ftlm.reproduction.stage_result import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
+from ftlm.reproduction.stage import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import line_chart
 from ftlm.utils.formatting import symbol

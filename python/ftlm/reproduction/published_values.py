@@ -27,15 +27,16 @@ from ftlm.fractional_calculus import haar_transform
 from ftlm.kernels import block_pulse_kernel, pulse_means
 from ftlm.model.model import Model
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
+from ftlm.order_search.result import SearchResult
+from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
 from ftlm.reproduction.simulated_arm import PAPERS_ARM, StageNumber, demo_run
-from ftlm.reproduction.stage_result import PRIOR_COVARIANCES, best_orders, neighboring_values
 from ftlm.simulation.discretization import record, sensor_series
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
-from ftlm.utils.formatting import Exact, attributes, finite
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Exact, attributes, finite
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Metrics, compare_means, metrics
 
@@ -47,6 +48,12 @@ ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 ORDER_LETTERS, COEFFICIENT_LETTERS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
 #: Order of each coefficient's term in the paper's equations (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
+#: Prior covariance so large that the data alone decide.
+WEAK_PRIOR = 1e10
+#: Both values of K0: the paper's identity, and a weak prior.
+PRIOR_COVARIANCES = (1.0, WEAK_PRIOR)
+#: Options of every order search, named so that no default changes a table.
+SEARCH_OPTIONS = {"criterion": "output-error", "norm": "l1", "row_basis": "haar"}
 
 
 @dataclass(frozen=True)
@@ -142,6 +149,22 @@ def printed_saturation(output: str) -> tuple[float, float, float]:
     x = 1 / (1 / first[1] - slope / first[0])
     c = slope * x
     return x, c, max(abs(x * p / (p + c) / a - 1) for p, a in between)
+
+
+def neighboring_values(value: float, increment: float, steps: int) -> list[float]:
+    """Return the values of an order grid around one of them."""
+    return [round(value + k * increment, 9) for k in range(-steps, steps + 1)]
+
+
+def best_orders(run: Run, single: Structure, grid: OrderGrid, p: int, prior: float, **work: Any) -> SearchResult:
+    """Return the best candidate of multi-innovation on an order grid."""
+    options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, **SEARCH_OPTIONS, **work}
+    return rank_orders(run, single, grid, top=1, coefficients="multi-innovation", **options)
+
+
+def prior_text(prior: float) -> str:
+    """Format K0 as 1 or 10¹⁰."""
+    return "1" if prior == PRIOR_COVARIANCES[0] else f"10{str(round(math.log10(prior))).translate(SUPERSCRIPT_DIGITS)}"
 
 
 #: Angles in the terms a, b and d of an equation: its own angle, or the other one of its stage.

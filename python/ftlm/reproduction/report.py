@@ -24,18 +24,24 @@ from ftlm.report.typesetting import equation_html
 from ftlm.reproduction import figures
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import deviation_text, table_3_coefficients
-from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, parameter_name, read_texts
-from ftlm.reproduction.simulated_arm import letter_of
-from ftlm.reproduction.stage_models import COARSE_INCREMENT, REFINED_CANDIDATES
-from ftlm.reproduction.stage_result import (
-    MULTI_INNOVATION_LABELS,
+from ftlm.reproduction.published_values import (
+    COEFFICIENT_LETTERS,
+    ORDER_LETTERS,
     PRIOR_COVARIANCES,
+    WEAK_PRIOR,
+    parameter_name,
+    prior_text,
+    read_texts,
+)
+from ftlm.reproduction.simulated_arm import letter_of
+from ftlm.reproduction.stage import (
+    COARSE_INCREMENT,
+    MULTI_INNOVATION_LABELS,
+    REFINED_CANDIDATES,
     RIVAL_ALPHA,
     TRACE_EVERY,
-    WEAK_PRIOR,
     Candidate,
     Stage,
-    prior_text,
 )
 from ftlm.structure.equation import format_equation
 from ftlm.svg.heat_map import heat_map

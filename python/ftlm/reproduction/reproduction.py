@@ -20,27 +20,21 @@ from ftlm.reproduction.checks import Check, checks
 from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, run_printed_models
 from ftlm.reproduction.report import reproduction_page
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
-from ftlm.reproduction.stage_models import (
-    RIVALS_OMITTED,
-    Preset,
-    StageWork,
-    TotalProgress,
-    WorkerProgress,
-    seconds_of,
-    seconds_of_all,
-)
-from ftlm.reproduction.stage_result import (
-    CONTEST_STEP,
+from ftlm.reproduction.stage import (
     GRID_ALPHA,
+    RIVALS_OMITTED,
     TRACE_EVERY,
     Panel,
+    Preset,
     Rival,
     Stage,
+    StageWork,
     panel_of,
     published_structure,
     rivals_order_grid,
     simulated_panel,
 )
+from ftlm.reproduction.workload import CONTEST_STEP, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.formatting import attributes, json_value

@@ -1,4 +1,4 @@
-"""Results of one stage: models on both runs, optimizer comparisons, convergence; cases behind the verdicts."""
+"""Results of one stage: models by every method of section 5, optimizer comparisons, cases behind the verdicts."""
 
 from __future__ import annotations
 
@@ -9,47 +9,51 @@ from typing import Any
 
 import numpy as np
 
-from ftlm.arm.flexible_link import flexible_link, integer_order, link_model
+from ftlm.arm.flexible_link import Law, flexible_link, integer_order, link_model, order_law
 from ftlm.data.run import Run
+from ftlm.errors import ConvergenceError, ModelError
+from ftlm.estimation.cost_surface import output_error_landscape
+from ftlm.estimation.estimators import estimate_output_error
+from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_evolution_search, genetic_search
-from ftlm.estimation.identify import identify
+from ftlm.estimation.identify import assess_fit, identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
-from ftlm.estimation.methods import OutputError
-from ftlm.estimation.result import Identification
+from ftlm.estimation.methods import EstimationMethod, InstrumentalVariables, OutputError, method_with_options
+from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import improves_prediction, is_degenerate
 from ftlm.kernels import pulse_means
 from ftlm.model.model import Model
-from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS as INNOVATION_LENGTHS
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
+from ftlm.plot.comparison_charts import pulse_times
+from ftlm.reproduction.published_values import (
+    INNOVATION_LENGTHS,
+    PRIOR_COVARIANCES,
+    SEARCH_OPTIONS,
+    WEAK_PRIOR,
+    best_orders,
+    last_orders,
+    neighboring_values,
+)
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
+from ftlm.reproduction.workload import CONTEST_STEP, WorkerProgress, seconds_of, seeds_for
 from ftlm.simulation.discretization import default_m, prepare
+from ftlm.simulation.initial_conditions import starts_at_rest
 from ftlm.simulation.simulate import explicit_euler
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.svg.heat_map import Landscape
-from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, attributes, json_value, symbol
-from ftlm.utils.validation import Floats
+from ftlm.utils.formatting import attributes, json_value, symbol
+from ftlm.utils.validation import Floats, check_threads
 from ftlm.validation.comparison import Comparison, Metrics, compare_means, metrics
 
 #: Steps between two points of a convergence curve; the effect of p is limited to the first steps.
 TRACE_EVERY = 2
-#: Prior covariance so large that the data alone decide.
-WEAK_PRIOR = 1e10
-#: Both values of K0: the paper's identity, and a weak prior.
-PRIOR_COVARIANCES = (1.0, WEAK_PRIOR)
 #: Labels of multi-innovation in the optimizer comparison, by K0.
 MULTI_INNOVATION_LABELS = ("p = 7", "p = 7, weak prior")
 #: Highest orders of the paper's grid, and those of the optimizer comparison, which contain the orders printed for both
 #: methods and leave so few candidates that all can be evaluated.
 GRID_ALPHA, RIVAL_ALPHA = (1.05, 2.0), (1.95, 2.0)
-#: Options of every order search, named so that no default changes a table.
-SEARCH_OPTIONS = {"criterion": "output-error", "norm": "l1", "row_basis": "haar"}
-#: Largest and smallest number of seeds, and most evaluations of one optimizer on one angle over all seeds.
-MAX_SEEDS, MIN_SEEDS, MAX_EVALUATIONS = 10, 3, 40_000
-#: Default smallest increment of the order grid, on every arm: the paper's grid has 60 000 candidates per angle, as many
-#: evaluations per seed, and takes minutes.
-CONTEST_STEP = 0.1
 #: An error has converged if it stays below the final error of p = 1 plus this share.
 CONVERGENCE_MARGIN = 0.02
 #: Joint fits use every fourth sample: 8 ms on the virtual rig, a fifteenth of the fastest link mode's period.
@@ -58,6 +62,19 @@ ROW_STRIDE = 4
 JOINT_METHOD = OutputError(loss="squares", intervals="auto", noise="white")
 #: Increment of the order grids of trials.
 PANEL_STEP = 0.25
+#: Radius [increments] of the search by instrumental variables around the orders of least squares; every candidate needs
+#: several simulations.
+INSTRUMENTAL_RADIUS_STEPS = 2
+#: Runs with more samples than the first number are decimated to at most the second for joint fits, whose cost grows
+#: with the samples. The arm's modes are two decades below the reduced rate.
+MOST_ROWS, JOINT_ROWS = 6000, 2500
+#: Increment of a first search on finer grids, among orders of multi-innovation that no bound excludes, and number of
+#: the best candidates around which the grid's own increment follows.
+COARSE_INCREMENT, REFINED_CANDIDATES = 0.1, 10
+#: Samples of fits with integer orders, whose systematic residuals do not shrink with more samples.
+WHOLE_ROWS = 1250
+#: Note on a reproduction without the optimizer comparison, with a placeholder for the reason.
+RIVALS_OMITTED = "Tables 6 and 7 and Figure 11 are left out: {}"
 
 
 def published_structure(stage: StageNumber, **changes: Any) -> Structure:
@@ -71,22 +88,6 @@ def published_structure(stage: StageNumber, **changes: Any) -> Structure:
 def integer_orders(structure: Structure) -> Structure:
     """Return a structure of the arm with integer orders."""
     return structure.with_orders({n: integer_order(n) for n in structure.order_names})
-
-
-def neighboring_values(value: float, increment: float, steps: int) -> list[float]:
-    """Return the values of an order grid around one of them."""
-    return [round(value + k * increment, 9) for k in range(-steps, steps + 1)]
-
-
-def best_orders(run: Run, single: Structure, grid: OrderGrid, p: int, prior: float, **work: Any) -> SearchResult:
-    """Return the best candidate of multi-innovation on an order grid."""
-    options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, **SEARCH_OPTIONS, **work}
-    return rank_orders(run, single, grid, top=1, coefficients="multi-innovation", **options)
-
-
-def prior_text(prior: float) -> str:
-    """Format K0 as 1 or 10¹⁰."""
-    return "1" if prior == PRIOR_COVARIANCES[0] else f"10{str(round(math.log10(prior))).translate(SUPERSCRIPT_DIGITS)}"
 
 
 def are_usable(*candidates: Candidate) -> bool:
@@ -244,11 +245,6 @@ class Stage:
 def rivals_order_grid(increment: float, smallest: float = CONTEST_STEP) -> OrderGrid:
     """Return the order grid of the comparison, given the increment of the main grid."""
     return OrderGrid(increment=max(increment, smallest), alpha=RIVAL_ALPHA)
-
-
-def seeds_for(candidates: int) -> tuple[int, ...]:
-    """Return ten seeds, or as many as the budget of evaluations allows."""
-    return tuple(range(min(MAX_SEEDS, max(MIN_SEEDS, MAX_EVALUATIONS // max(candidates, 1)))))
 
 
 def compare_optimizers(
@@ -542,7 +538,7 @@ def simulated_panel(
     """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
 
     Without an order grid there are neither; with ``has_contests=False`` there are no contests. Before each step `begin`
-    is called with its name, a key of `ftlm.reproduction.stage_models.STEP_COSTS`.
+    is called with its name, a key of `ftlm.reproduction.workload.STEP_COSTS`.
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
@@ -565,3 +561,310 @@ def simulated_panel(
         begin("freed")
         freed.append(compare_orders(stage, run, arm, **work, validation=validation))
     return Panel(tuple(trials), tuple(contests), tuple(freed))
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings that differ between the reproduction and the demonstration."""
+
+    order_grid: OrderGrid
+    top: int  # rows of an order search
+    trace_every: int  # steps between two points of a convergence curve
+    # Whether all models are compared on the paper's pulses (a sum over other pulses is another number) and from the
+    # currents alone as well, or each with the pulses of its method.
+    common_pulses: bool
+    # Of the order grid of the optimizer comparison; None without PyGAD or SciPy.
+    rivals_increment: float | None = CONTEST_STEP
+
+
+@dataclass
+class StageWork:
+    """Computation of one stage: runs, settings, progress receivers, and notes about omitted parts."""
+
+    number: StageNumber
+    square: Run
+    sine: Run | None
+    preset: Preset
+    threads: int | None
+    log: Callable[[str], None]
+    progress: Callable[[int, int], None] | None
+    notes: list[str] = field(default_factory=list)
+    # Whether the runs are simulated from rest, so that initial conditions are known.
+    simulated: bool = False
+
+    def __post_init__(self) -> None:
+        # Structures of the paper, under its laws, and of the simulated arm.
+        self.measured = published_structure(self.number)
+        laws: tuple[Law, ...] = ("orders", "coefficients")
+        self.published = flexible_link(stage=self.number, form="published", coupling="simulated", laws=laws)
+        self.coupled = flexible_link(stage=self.number, form="lagrange", coupling="simulated", laws=laws)
+        own = list(self.measured.signals)
+        self.on = self.square.select(own)
+        self.off = None if self.sine is None else self.sine.select(own)
+        if self.simulated:
+            self.published, self.coupled = (replace(s, initial="rest") for s in (self.published, self.coupled))
+        elif not starts_at_rest(self.on, self.measured):
+            # The paper's equation errors have few terms; ten powers of t more would be combinations of them.
+            self.measured, self.published, self.coupled = (
+                replace(s, initial="caputo") for s in (self.measured, self.published, self.coupled)
+            )
+
+    def begin(self, words: str, step: str) -> None:
+        """Announce the next step and its share of the whole."""
+        self.log(f"stage {self.number}: {words}")
+        if isinstance(self.progress, WorkerProgress):
+            self.progress.begin(seconds_of(step, self.preset.order_grid.increment, self.preset.rivals_increment))
+
+    def compute_stage(self, genetic: GeneticAlgorithm | None) -> Stage:
+        """Compute all results of section 5 for a stage."""
+        exact = self.manual("integer, exact")
+        candidates = {"integer, Euler": self.euler_candidate("integer, Euler", exact), "integer, exact": exact}
+        whole = integer_orders(self.coupled)
+        candidates["integer, identified"] = self.best("integer, identified", whole, "whole orders", "whole orders")
+        candidates |= self.searches()
+        candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
+        joint = candidates["output error"] = self.best("output error", self.coupled, "free orders")
+        label = "published, output error"
+        candidates[label] = self.best(label, self.published, "free orders, (22)–(25)", "published", joint.model)
+        self.begin("convergence", "traces")
+        traces: dict[str, dict[int, MultiInnovationTrace]] = {}
+        weak: dict[str, dict[int, MultiInnovationTrace]] = {}
+        if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
+            models = {p: candidates[f"p = {p}"].model for p in INNOVATION_LENGTHS}
+            traces = self.traces(models)
+            weak = self.traces(dict.fromkeys(models, models[INNOVATION_LENGTHS[-1]]), WEAK_PRIOR)
+        else:
+            self.notes.append(
+                f"run {self.on.name} does not start at rest: every model is fitted and compared with initial terms; "
+                "explicit Euler, which steps from rest as in the paper, is not, and its errors hold that; convergence "
+                "of the recursion, and with it Figures 4(b) to 8(b), and the weak prior are left out"
+            )
+        rivals = self.rivals(genetic)
+        axes = {n: [v] for output in self.measured.outputs for n, v in last_orders(output).items()}
+        near = self.search_candidate(
+            "printed orders", replace(self.preset.order_grid, orders=axes), coefficients="least-squares"
+        )
+        self.begin("orders by the equation error", "equation")
+        options = {"coefficients": "least-squares", "criterion": "equation-error", "norm": "l2"}
+        by_equation = self.search_candidate("smallest equation error", self.preset.order_grid, **options)
+        derived = self.dropped_derivative(joint.model)
+        self.begin("the landscape of its orders", "landscape")
+        landscape = None
+        if joint.result is not None and joint.result.joint is not None:
+            landscape = output_error_landscape(joint.result)
+        return Stage(self.number, candidates, traces, weak, rivals, near, by_equation, derived, landscape)
+
+    def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
+        """Return a model with both errors on both runs, and its simulation from the currents alone."""
+        alike = self.preset.common_pulses
+        m = default_m([self.on], power_of_two=True) if alike else model.m
+        model = model if model.m == m else replace(model, m=m)
+        runs = [run for run in (self.on, self.off) if run is not None]
+        on, *off = (compare_means(model, run) for run in runs)
+        alone = {}
+        if alike and len(model.equations) > 1:
+            coupled = replace(model, structure=replace(model.structure, coupling="simulated"))
+            alone = {run.name: compare_means(coupled, run).output_error for run in runs}
+        return Candidate(label, model, on, off[0] if off else None, alone, result)
+
+    def identify_candidate(
+        self, label: str, run: Run, structure: Structure, method: EstimationMethod = JOINT_METHOD
+    ) -> Candidate:
+        """Identify a candidate, by default by output error."""
+        result = identify(run, structure, method=method, threads=self.threads, progress=self.progress)
+        return self.candidate(label, result.model, result)
+
+    def manual(self, label: str) -> Candidate:
+        """Return the integer-order model of the manufacturer's manual."""
+        return self.candidate(label, link_model(stage=self.number, form="published"))
+
+    def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
+        """Return the same model simulated by explicit Euler, as in the paper."""
+
+        def by_euler(run: Run, known: Comparison) -> Comparison:
+            means = euler_means(exact.model, run, known.m)
+            if self.preset.common_pulses:
+                errors = {n: metrics(known.measured[n][0], mean) for n, mean in means.items()}
+            else:
+                errors = {n: metrics(run[n], samples) for n, samples in explicit_euler(exact.model, run).items()}
+            simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, known.equation_error, errors)]
+            return replace(known, simulated=simulated, output_error=errors, per_run=parts, findings=())
+
+        on, off = by_euler(self.on, exact.estimation), None
+        alone = {self.on.name: on.output_error}
+        if self.off is not None and exact.validation is not None:
+            off = by_euler(self.off, exact.validation)
+            alone[self.off.name] = off.output_error
+        return replace(exact, label=label, estimation=on, validation=off, input_driven=alone)
+
+    def searches(self) -> dict[str, Candidate]:
+        """Search the whole order grid by multi-innovation with the paper's p, and by least squares."""
+        kinds: dict[str, tuple[str, dict[str, Any]]] = {
+            f"p = {p}": ("multi-innovation", {"innovation_length": p, "prior_covariance": PRIOR_COVARIANCES[0]})
+            for p in INNOVATION_LENGTHS
+        }
+        found, grid = {}, self.preset.order_grid
+        for label, (coefficients, options) in (kinds | {"least squares": ("least-squares", {})}).items():
+            self.begin(f"orders on the lattice, {label}", "search")
+            if self.preset.common_pulses:
+                found[label] = self.search_candidate(label, grid, coefficients=coefficients, **options)
+            else:
+                method = method_with_options(coefficients, {"order_grid": grid, "top": self.preset.top, **options})
+                found[label] = self.identify_candidate(label, self.on, self.measured, method)
+        return found
+
+    def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
+        """Return the best orders of each equation by itself, without the statistics of an identification."""
+        orders: dict[str, float] = {}
+        coefficients: dict[str, float] = {}
+        for output in self.measured.outputs:
+            single = self.measured.equation(output)
+            own = replace(order_grid, orders={n: v for n, v in order_grid.orders.items() if n in single.order_names})
+            best = self._best_orders(single, own, {**SEARCH_OPTIONS, **options})
+            orders |= best.orders
+            coefficients |= best.coefficients
+        known = self.measured.with_orders(orders).with_coefficients(coefficients)
+        units = {n: u for n, u in self.on.units.items() if n in known.signals}
+        about = {"origin": label, "run": self.on.name}
+        return self.candidate(label, Model(known, orders=orders, units=units, about=about))
+
+    def _best_orders(self, single: Structure, own: OrderGrid, options: Mapping[str, Any]) -> SearchResult:
+        """Return the best candidate of an order grid.
+
+        With K0 = 1 a deflection hardly moves. The errors of all candidates are close to those of a zero output, so no
+        bound excludes any, and each would have to be simulated completely.
+        """
+        work: dict[str, Any] = {"threads": self.threads, "progress": self.progress, **options}
+        own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
+        heavy = own_terms > 1 and options.get("coefficients") == "multi-innovation"
+        if not (heavy and own.increment < COARSE_INCREMENT and not own.orders):
+            return rank_orders(self.on, single, own, top=1, **work)
+        values, coarse = own.values(single), replace(own, increment=COARSE_INCREMENT)
+        ends = []
+        for row in rank_orders(self.on, single, coarse, top=REFINED_CANDIDATES, **work).table:
+            near = {
+                n: [v for v in values[n] if abs(v - at) < 2 * COARSE_INCREMENT - 1e-9] for n, at in row.orders.items()
+            }
+            ends.append(rank_orders(self.on, single, replace(own, orders=near), top=1, **work))
+        return min(ends, key=lambda end: end.score)
+
+    def instrumental(self, start: Candidate) -> Candidate:
+        """Search by instrumental variables on the part of the grid around the orders of another model."""
+        self.begin("orders by instrumental variables", "instrumental")
+        grid = self.preset.order_grid
+        axes = {}
+        for name, value in start.model.orders.items():
+            steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
+            axes[name] = [v for v in neighboring_values(value, grid.increment, steps) if 0 <= v <= grid.alpha[1]]
+        method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=self.preset.top)
+        return self.identify_candidate("instrumental variables", self.on, self.measured, method)
+
+    def joint(
+        self, label: str, structure: Structure, words: str, step: str = "output error", near: Model | None = None
+    ) -> Candidate:
+        """Fit by joint output error, to the whole run or to a decimated one."""
+        self.begin(words, step)
+        run = self.on
+        if step == "whole orders" and run.length >= 2 * WHOLE_ROWS:
+            run = decimate_run(run, run.length // WHOLE_ROWS)
+        elif run.length > MOST_ROWS:
+            every = -(-run.length // JOINT_ROWS)
+            self.notes.append(
+                f"run {run.name} has {run.length} rows: joint fits by output error take one of {every} rows, "
+                f"{every * run.step:.6g} s apart, with the means of held currents in between; all models are compared "
+                "on the same block pulses of the whole run"
+            )
+            run = decimate_run(run, every)
+        if near is None:
+            return self.identify_candidate(label, run, structure)
+        # Only standard errors of the published form are used. Its automatic initial guesses end in optima that rounding
+        # chooses between; the parameters of (14)-(15) lead to the one whose residuals are the noise.
+        begin = self.published_values(near)
+        if not self.simulated:
+            try:
+                return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic", start=begin))
+            except ModelError:
+                # Outside the bounds of (22)-(25).
+                return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic"))
+        task, options = Task((run,), structure), (None, check_threads(self.threads), self.progress)
+        result = assess_fit(estimate_output_error(task, *options, intervals="quadratic", begin=begin, alone=True))
+        return self.candidate(label, result.model, result)
+
+    def best(
+        self, label: str, structure: Structure, what: str, step: str = "output error", near: Model | None = None
+    ) -> Candidate:
+        """Fit by joint output error from the current alone, or with the measured other angle if that fails."""
+        words = f"{what}, by output error"
+        try:
+            return self.joint(label, structure, words, step, near)
+        except ConvergenceError as error:
+            self.notes.append(
+                f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
+                "other angle instead"
+            )
+        return self.joint(label, replace(structure, coupling="measured"), words, step, near)
+
+    def traces(
+        self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]
+    ) -> dict[str, dict[int, MultiInnovationTrace]]:
+        """Convergence of every equation with every p, at the orders of the model of that p."""
+        parts = {o: self.measured.equation(o) for o in self.measured.outputs}
+        return {o: traces_of(self.on, each, models, prior, self.preset.trace_every) for o, each in parts.items()}
+
+    def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
+        """Compare multi-innovation with other optimizers on each equation; empty if these are not installed."""
+        if self.preset.rivals_increment is None:
+            return {}
+        grid = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
+        found = {}
+        for output in self.measured.outputs:
+            single = self.measured.equation(output)
+            self.begin(f"the rivals on {output}", "rivals")
+            try:
+                made = compare_optimizers(self.on, single, grid, genetic, threads=self.threads, progress=self.progress)
+            except ModelError as error:
+                self.notes.append(RIVALS_OMITTED.format(error))
+                return {}
+            best = dict(zip(MULTI_INNOVATION_LABELS, made.order_grid.values(), strict=True))
+            ends: list[tuple[str, GeneticRun | SearchResult]] = [*made.optimizers.items(), *best.items()]
+            models = {
+                name: Model(single.with_orders(end.orders).with_coefficients(end.coefficients), orders=dict(end.orders))
+                for name, end in ends
+            }
+            found[output] = replace(made, models={n: self.candidate(n, model) for n, model in models.items()})
+        return found
+
+    def in_published_form(self, model: Model) -> Model:
+        """Insert the parameters of (14)-(15) into (22)-(25), which drop a derivative of the current."""
+        h, d = self.number * 2 - 1, self.number * 2
+        known = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
+        known |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
+        known |= {f"{c}{d}": -known[f"{c}{h}"] for c in "bg"}
+        known |= {f"{c}{d}": known[f"{c}{d}"] - known[f"{c}{h}"] for c in "ad"}
+        highest = {e.output: e.order.constant for e in model.equations}
+        other = link_model(
+            stage=self.number,
+            form="published",
+            orders={**model.orders, f"alpha{d}": highest[self.measured.outputs[1]]},
+            coefficients=known,
+            coupling=model.structure.coupling,
+        )
+        return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
+
+    def published_values(self, model: Model) -> dict[str, float]:
+        """Values of the free parameters of (22)-(25) under their laws for a model of (14)-(15)."""
+        other = self.in_published_form(model)
+        known = {**other.orders, **other.coefficients}
+        h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
+        free = FreeProblem.of(replace(self.published, initial="rest")).names
+        return {n: v for n, v in known.items() if n in free} | {f"r{self.number}": -known[d] / known[h]}
+
+    def dropped_derivative(self, model: Model) -> DroppedDerivative:
+        """Compare the deflection by (14)-(15) with that by (22)-(25) at equal parameters."""
+        output, other = self.measured.outputs[1], self.in_published_form(model)
+        whole, published = (compare_means(m, self.on) for m in (model, other))
+        drive = f"I{self.number}"
+        current = pulse_means(self.on[drive], whole.m, hold=self.on.intersample[drive] == "zoh")
+        order = order_law(self.number, "derived")["input"].at(other.orders)
+        responses = whole.measured[output][0], published.simulated[output][0], whole.simulated[output][0]
+        return DroppedDerivative(output, order, pulse_times(whole), current, *responses)
