@@ -50,8 +50,8 @@ from ftlm.validation.residual_tests import (
 #: Smallest decrease of the Schwarz criterion that is reported. A decrease of 10 is very strong evidence (Kass and
 #: Raftery, doi:10.1080/01621459.1995.10476572). Three times that is asked, because the best of several is chosen.
 MIN_CRITERION_DECREASE = 30.0
-#: Decrease of the criterion that an extension further down the list needs to replace one above it. An input that was
-#: logged one row late and feedthrough of a first-order plant, for example, give the same samples.
+#: Smallest further decrease of the criterion at which an extension replaces one above it in the list. Some give the
+#: same samples, for example feedthrough of a first-order plant and an input that was logged one row late.
 MIN_CRITERION_GAP = 10.0
 #: Total number of samples to which extensions are fitted, from the start of each run.
 MAX_EXTENSION_SAMPLES = 6000
@@ -108,7 +108,7 @@ class Extension:
         Runs with a load as an additional input, or with another intersample behavior; None for the given ones.
     load_time
         Time of the load step [s].
-    positive
+    positive_coefficient
         Name of a coefficient that must be positive, if there is one: negative friction would drive the motion.
     """
 
@@ -120,7 +120,7 @@ class Extension:
     term_text: str = ""
     runs: Runs | None = None
     load_time: float = 0.0
-    positive: str = ""
+    positive_coefficient: str = ""
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ def _extension_findings(
             "error": refit.standard_errors[load_name],
         }
     if extension.code == "friction_fits":
-        name = extension.positive
+        name = extension.positive_coefficient
         numbers = {"value": refit.coefficients[name], "error": refit.standard_errors[name]}
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
@@ -311,7 +311,7 @@ def _best_extension(fitted: Sequence[FittedExtension], own_criterion: float) -> 
     """
     best: FittedExtension | None = None
     for item in fitted:
-        positive = item.extension.positive
+        positive = item.extension.positive_coefficient
         if item.fit.unstable_optimum is not None or (positive and not item.fit.coefficients[positive] > 0.0):
             continue
         if item.criterion < (own_criterion if best is None else best.criterion - MIN_CRITERION_GAP):
@@ -388,7 +388,7 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
 def _friction(structure: Structure, runs: Runs) -> list[Extension]:
     """Return the structure with Coulomb friction −fc sign(D y), and with −fc tanh(s y), of an output that is a speed.
 
-    The second needs an output of both signs: it is a constant otherwise.
+    The second form needs an output of both signs. An output of one sign makes it a constant.
     """
     (item,) = structure.equations
     (name,) = _unused_names("fc", 1, structure, runs[0])
@@ -397,10 +397,10 @@ def _friction(structure: Structure, runs: Runs) -> list[Extension]:
     found = []
 
     def add(shown: str, **changes: Any) -> None:
-        # Not simulated are, for example, friction of an output of order 1 and friction behind a sensor filter.
+        # Some structures with friction cannot be simulated, such as one of order 1 or one behind a sensor filter.
         with contextlib.suppress(FtlmError):
             wider = replace(structure, equations=(replace(item, **changes),), initial=initial)
-            found.append(Extension("friction_fits", wider, 1, [], term_text=shown, positive=name))
+            found.append(Extension("friction_fits", wider, 1, [], term_text=shown, positive_coefficient=name))
 
     add(friction_term(item.output, name), coulomb=Friction(name))
     slope = sign_tanh_slope([run[item.output] for run in runs])

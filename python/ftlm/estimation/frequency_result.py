@@ -29,7 +29,7 @@ from ftlm.structure.order import MAX_IMPROPER_ORDER
 from ftlm.svg.complex_plane import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
-from ftlm.svg.line_chart import LineChart, line_chart
+from ftlm.svg.line_chart import LineChart, line_figure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
@@ -95,7 +95,7 @@ def frequency_chart(
     )
 
 
-def bode_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineChart, LineChart]:
+def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineChart, LineChart]:
     """Return gain and phase of a record and the model with its 95 % band; of an impedance the magnitude over Hz."""
     omega = curve_frequencies(record)
     response, wide, turned = model_curve(model, record, omega)
@@ -150,7 +150,7 @@ def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
 
 def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
-    bode = [chart.small_figure() for chart in bode_charts(model, record)]
+    bode = [chart.small_figure() for chart in record_charts(model, record)]
     nyquist = nyquist_figure(model, record)
     return [nyquist, *bode] if is_impedance(record) else [*bode, nyquist]
 
@@ -163,7 +163,7 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> F
     size = np.abs(record.response[order])
     missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
     hertz = is_impedance(record)
-    return line_chart(
+    return line_figure(
         omega / (2.0 * math.pi) if hertz else omega,
         [("real part", missed.real), ("imaginary part", missed.imag)],
         log_x=True,

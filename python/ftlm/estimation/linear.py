@@ -30,7 +30,7 @@ from ftlm.simulation.nonlinear_columns import has_derivative_channels
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.figure import Figure
-from ftlm.svg.line_chart import line_chart
+from ftlm.svg.line_chart import line_figure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, check_integer
@@ -309,7 +309,7 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
             raise DataError(
                 f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same {parameter('every')}"
             )
-    return line_chart(
+    return line_figure(
         steps,
         [(name, trace.error) for name, trace in traces],
         title=title,

@@ -34,7 +34,7 @@ from ftlm.svg.bar_chart import histogram as svg_histogram
 from ftlm.svg.complex_plane import plane_chart as svg_plane_chart
 from ftlm.svg.heat_map import correlation_map as svg_correlation_map
 from ftlm.svg.heat_map import heat_map as svg_heat_map
-from ftlm.svg.line_chart import line_chart as svg_line_chart
+from ftlm.svg.line_chart import line_figure as svg_line_chart
 
 __all__ = [
     "bode",

@@ -14,7 +14,7 @@ from ftlm.errors import DataError, FtlmError
 from ftlm.model.model import Model
 from ftlm.svg.bar_chart import bar_chart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
-from ftlm.svg.line_chart import LineChart, line_chart
+from ftlm.svg.line_chart import LineChart, line_figure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.statistics import NORMAL_95
@@ -61,7 +61,7 @@ def comparison_charts(
     """
     known = bands or {}
     return [
-        line_chart(
+        line_figure(
             pulse_times(comparison, k),
             [("measured", comparison.measured[name][k]), ("simulated", comparison.simulated[name][k])],
             title=f"{symbol(name)}, {f'{label}: ' if label else ''}{run}",
@@ -98,7 +98,7 @@ def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = M
         Most points of a line.
     """
     return [
-        line_chart(
+        line_figure(
             run.time,
             [(f"input {symbol(name)}", run[name])],
             x_label="time [s]",
@@ -132,7 +132,7 @@ def residual_series(
             what = f"Residual of {symbol(name)}{suffix}, {run}"
             axis = with_unit(f"residual of {symbol(name)}", units, name)
             figures.append(
-                line_chart(
+                line_figure(
                     pulse_times(comparison, k),
                     [("", missed)],
                     title=f"{what}: over time",
@@ -233,7 +233,7 @@ def error_chart(
             raise DataError(f"comparison {name!r} has no run {short_repr(run)}; give 0 to {count - 1}")
     run = index or 0
     errors = [(name, np.abs(c.measured[output][run] - c.simulated[output][run])) for name, c in compared]
-    return line_chart(
+    return line_figure(
         pulse_times(compared[0][1], run),
         errors,
         title=title or f"{symbol(output)}: absolute error of the simulation",
@@ -327,7 +327,7 @@ def run_charts(run: Run, *signals: str) -> Figures:
         if run.intersample.get(name) == "zoh":
             times, values = times.repeat(2)[1:], values.repeat(2)[:-1]
         charts.append(
-            line_chart(
+            line_figure(
                 times,
                 [("", values)],
                 title=f"{symbol(name)}, {role} of {run.name}",

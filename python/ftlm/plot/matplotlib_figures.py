@@ -21,8 +21,8 @@ from ftlm.estimation.frequency_result import (
     FrequencyValidation,
     assign_signals,
     nyquist_curves,
+    record_charts,
 )
-from ftlm.estimation.frequency_result import bode_charts as record_charts
 from ftlm.estimation.result import Identification
 from ftlm.experiment_design.result import DesignedInput
 from ftlm.model.model import Model

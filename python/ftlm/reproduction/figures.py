@@ -16,7 +16,7 @@ from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import ClaimVerdict
 from ftlm.reproduction.stage import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
 from ftlm.svg.figure import Figure
-from ftlm.svg.line_chart import line_chart
+from ftlm.svg.line_chart import line_figure
 from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, metrics
@@ -36,7 +36,7 @@ def angle_chart(
 ) -> Figure:
     """Chart of an angle over time by several models; the options are those of a line chart."""
     options = {"points": LINE_POINTS, "caption": caption.replace(" -", " −"), **options}
-    return line_chart(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
+    return line_figure(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
 
 
 def reference_label(*, simulated: bool) -> str:

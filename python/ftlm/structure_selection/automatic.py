@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 from ftlm.data.run import Run
 from ftlm.data.sampling import longest_delay
+from ftlm.estimation.nuisance_parameters import has_white_residuals
 from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.parser import equation
@@ -21,7 +22,6 @@ from ftlm.structure_selection.cross_validation import (
     schwarz_criterion,
 )
 from ftlm.structure_selection.stepwise import CandidateEvaluator
-from ftlm.utils.statistics import is_white
 from ftlm.validation.feedback import feedback_test
 from ftlm.validation.residual_tests import friction_term, sign_tanh_slope
 
@@ -339,7 +339,7 @@ class AutomaticSelection:
         speed = IntegerOrderForm(1, 0, delayed=delayed, offset=offset, friction="output")
         changes_sign = math.isfinite(self.problem.tanh_slope)
         for form in ([speed] if changes_sign else []) + [replace(speed, order=2, friction="derivative")]:
-            if fits and not all(is_white(e) for part in fits[0].joint.residuals for e in part.values()):
+            if fits and not has_white_residuals(fits[0].joint):
                 # Negative friction would drive the motion.
                 fitted = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
                 ranked = _rank([*fits, *fitted])

@@ -17,7 +17,7 @@ from ftlm.structure.structure import Structure
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
-from ftlm.svg.line_chart import line_chart
+from ftlm.svg.line_chart import line_figure
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, finite
 from ftlm.utils.validation import Floats
@@ -166,7 +166,7 @@ class Selection(ReportMixin):
             [max(best[n].validation_fit, MIN_FIT_PERCENT) for n in along],
         )
         chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, validation_data, strict=True)]
-        return line_chart(
+        return line_figure(
             [float(n) for n in along],
             [("estimation", seen), ("validation", validation_data), ("chosen", chosen)],
             title="Fit by number of parameters",

@@ -25,7 +25,7 @@ LETTER_WIDTH_PX, LINE_HEIGHT_PX = 6.7, 15
 
 @dataclass(frozen=True)
 class Figure:
-    """Chart of a report; `line_chart` returns one.
+    """Chart of a report; `line_figure` returns one.
 
     Parameters
     ----------

@@ -158,7 +158,7 @@ class Section:
     warnings
         Warnings in a box at the top.
     tables, figures
-        See :class:`ftlm.report.Table` and ``line_chart``.
+        See :class:`ftlm.report.Table` and ``line_figure``.
     small
         Whether two figures stand side by side on wide screens.
     more

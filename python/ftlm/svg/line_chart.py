@@ -172,7 +172,7 @@ class _Chart:
 
 
 @check_arguments
-def line_chart(
+def line_figure(
     x: ArrayLike,
     lines: Sequence[tuple[str, ArrayLike]],
     *,
@@ -263,7 +263,7 @@ class LineChart:
     Parameters
     ----------
     x, lines, title, x_label, y_label, caption, bands, log_x, log_y, stems, dots
-        See :func:`line_chart`.
+        See :func:`line_figure`.
     """
 
     x: Floats
@@ -280,7 +280,7 @@ class LineChart:
 
     def small_figure(self, height: int = 220) -> Figure:
         """Return the chart as SVG, two of which stand side by side; the height is in pixels."""
-        return line_chart(**vars(self), width=SMALL_WIDTH_PX, height=height)
+        return line_figure(**vars(self), width=SMALL_WIDTH_PX, height=height)
 
 
 def line_styles(names: Iterable[str]) -> list[int]:

@@ -431,7 +431,7 @@ def _test_direction(output: OutputResiduals, velocities: Sequence[Floats], lags:
         return output
     signs = [np.where(np.abs(v) > MAX_REST_VELOCITY_RATIO * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
     test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
-    return replace(output, direction=test, sign_slope=math.inf if order > 1.0 else SIGN_TANH_SLOPE / largest)
+    return replace(output, direction=test, sign_slope=math.inf if order > 1.0 else sign_tanh_slope(velocities))
 
 
 def _test_beyond_parameters(
