@@ -9,7 +9,7 @@ import ftlm
 from ftlm.estimation.cost_surface import correlated_orders, output_error_landscape
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
-from ftlm.svg.heat_map import heat_map
+from ftlm.svg.charts import heat_map
 
 WORDS = "D^alpha y = a D^nu y + c y + b u"
 

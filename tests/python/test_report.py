@@ -23,10 +23,8 @@ from ftlm.report.html_report import settings_table
 from ftlm.report.typesetting import equation_html, parameter_table
 from ftlm.reproduction.demo import PaperRow, paper_row, paper_table, paper_table_text
 from ftlm.svg import figure as axes
-from ftlm.svg.bar_chart import bar_chart, histogram
-from ftlm.svg.complex_plane import plane_chart
+from ftlm.svg.charts import bar_chart, correlation_map, heat_map, histogram, plane_chart
 from ftlm.svg.figure import LINE_HEIGHT_PX
-from ftlm.svg.heat_map import correlation_map, heat_map
 from ftlm.svg.html_page import ReportMixin
 from ftlm.svg.line_chart import line_figure
 from ftlm.utils import formatting as words

@@ -13,7 +13,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import fit_state
 from ftlm.estimation.result import Identification
 from ftlm.simulation.discretization import recording
-from ftlm.svg.heat_map import Landscape
+from ftlm.svg.charts import Landscape
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.resources import stop_flag
 

@@ -26,7 +26,7 @@ from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates, parameter_frame
 from ftlm.structure.circuit import Circuit
 from ftlm.structure.order import MAX_IMPROPER_ORDER
-from ftlm.svg.complex_plane import locus_chart
+from ftlm.svg.charts import locus_chart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import LineChart, line_figure

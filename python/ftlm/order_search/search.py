@@ -47,7 +47,7 @@ from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.structure.order import Order
 from ftlm.structure.order_grid import OrderGrid, axis_of, check_order_grid
 from ftlm.structure.structure import Structure
-from ftlm.svg.heat_map import Landscape
+from ftlm.svg.charts import Landscape
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import check_threads
 

@@ -29,11 +29,11 @@ from ftlm.plot.matplotlib_figures import (
 from ftlm.plot.model_charts import bode_charts as svg_bode_charts
 from ftlm.plot.model_charts import pole_charts as svg_pole_charts
 from ftlm.plot.model_charts import response_charts as svg_response_charts
-from ftlm.svg.bar_chart import bar_chart as svg_bar_chart
-from ftlm.svg.bar_chart import histogram as svg_histogram
-from ftlm.svg.complex_plane import plane_chart as svg_plane_chart
-from ftlm.svg.heat_map import correlation_map as svg_correlation_map
-from ftlm.svg.heat_map import heat_map as svg_heat_map
+from ftlm.svg.charts import bar_chart as svg_bar_chart
+from ftlm.svg.charts import correlation_map as svg_correlation_map
+from ftlm.svg.charts import heat_map as svg_heat_map
+from ftlm.svg.charts import histogram as svg_histogram
+from ftlm.svg.charts import plane_chart as svg_plane_chart
 from ftlm.svg.line_chart import line_figure as svg_line_chart
 
 __all__ = [

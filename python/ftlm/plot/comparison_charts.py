@@ -12,7 +12,7 @@ from ftlm.analysis.frequency_response import covariance_of, parameter_vector, wi
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError
 from ftlm.model.model import Model
-from ftlm.svg.bar_chart import bar_chart, histogram
+from ftlm.svg.charts import bar_chart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
 from ftlm.svg.line_chart import LineChart, line_figure
 from ftlm.utils.arguments import check_arguments

@@ -37,7 +37,7 @@ from ftlm.plot.model_charts import (
     response_line_chart,
 )
 from ftlm.structure.circuit import Circuit
-from ftlm.svg.heat_map import Landscape
+from ftlm.svg.charts import Landscape
 from ftlm.svg.line_chart import LINE_STYLES, LineChart, line_styles
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol

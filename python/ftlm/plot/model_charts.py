@@ -22,7 +22,7 @@ from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER, frequency_chart
 from ftlm.model.model import Model, check_model
 from ftlm.plot.comparison_charts import with_unit
 from ftlm.simulation.discretization import COULOMB_PREFIX
-from ftlm.svg.complex_plane import plane_chart
+from ftlm.svg.charts import plane_chart
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments

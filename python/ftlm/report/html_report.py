@@ -48,8 +48,8 @@ from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencie
 from ftlm.report.text_summary import describe_order, settings_rows
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
+from ftlm.svg.charts import correlation_map, heat_map
 from ftlm.svg.figure import MAX_LINE_POINTS, Figure
-from ftlm.svg.heat_map import correlation_map, heat_map
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html

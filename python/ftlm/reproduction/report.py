@@ -44,7 +44,7 @@ from ftlm.reproduction.stage import (
     Stage,
 )
 from ftlm.structure.equation import format_equation
-from ftlm.svg.heat_map import heat_map
+from ftlm.svg.charts import heat_map
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Cell, Exact, number, symbol, symbol_html

@@ -42,7 +42,7 @@ from ftlm.simulation.initial_conditions import starts_at_rest
 from ftlm.simulation.simulate import explicit_euler
 from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
-from ftlm.svg.heat_map import Landscape
+from ftlm.svg.charts import Landscape
 from ftlm.utils.formatting import attributes, json_value, symbol
 from ftlm.utils.validation import Floats, check_threads
 from ftlm.validation.comparison import Comparison, Metrics, compare_means, metrics
