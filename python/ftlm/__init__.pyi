@@ -45,9 +45,9 @@ from ftlm.estimation.methods import MultiInnovation as MultiInnovation
 from ftlm.estimation.methods import OutputError as OutputError
 from ftlm.estimation.order_ranking import search_orders as search_orders
 from ftlm.estimation.output_error import ProfileInterval as ProfileInterval
-from ftlm.estimation.physical_parameters import PhysicalParameter as PhysicalParameter
-from ftlm.estimation.physical_parameters import physical_parameters as physical_parameters
 from ftlm.estimation.result import Identification as Identification
+from ftlm.estimation.result import PhysicalParameter as PhysicalParameter
+from ftlm.estimation.result import physical_parameters as physical_parameters
 from ftlm.estimation.verdict import Validation as Validation
 from ftlm.estimation.verdict import Verdict as Verdict
 from ftlm.experiment_design.design_input import design_input as design_input
@@ -72,6 +72,8 @@ from ftlm.model.model import Model as Model
 from ftlm.model.parameter_estimates import Parameter as Parameter
 from ftlm.model.serialization import load_model as load_model
 from ftlm.order_search.certificate import certify_orders as certify_orders
+from ftlm.order_search.options import OrderGrid as OrderGrid
+from ftlm.order_search.options import order_grid as order_grid
 from ftlm.order_search.result import OrderCertificate as OrderCertificate
 from ftlm.order_search.result import SearchResult as SearchResult
 from ftlm.order_search.result import SearchRow as SearchRow
@@ -88,8 +90,6 @@ from ftlm.structure.equation import Friction as Friction
 from ftlm.structure.equation import Stribeck as Stribeck
 from ftlm.structure.equation import Term as Term
 from ftlm.structure.order import Order as Order
-from ftlm.structure.order_grid import OrderGrid as OrderGrid
-from ftlm.structure.order_grid import order_grid as order_grid
 from ftlm.structure.parser import equation as equation
 from ftlm.structure.sensor_filter import SensorFilter as SensorFilter
 from ftlm.structure.structure import Structure as Structure

@@ -22,8 +22,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import fit_output_error, parameter_set, parameter_set_of
 from ftlm.experiment_design.design_input import multisine, square_wave
 from ftlm.experiment_design.exchange import exchange_holds, scaled_design
-from ftlm.experiment_design.problem import Bounds, Criterion
-from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
+from ftlm.experiment_design.problem import Bounds, Criterion, ModelFit, Sensitivities
 from ftlm.experiment_design.spectrum import SpectralLines, best_spectrum, spectral_lines
 from ftlm.model.model import FitParameters
 from ftlm.reproduction.simulated_arm import demo_plant

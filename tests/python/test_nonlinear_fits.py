@@ -10,7 +10,7 @@ import ftlm
 from ftlm.cli.main import app
 from ftlm.estimation.linear import _estimate_coefficients, estimate_coefficients
 from ftlm.estimation.nonlinear_checks import nonlinear_findings
-from ftlm.order_search import free_run_ranking
+from ftlm.order_search import search as order_search
 from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.nonlinear_columns import differentiate
 from ftlm.simulation.output_samples import OutputSamples, simulate_samples
@@ -113,8 +113,8 @@ def test_a_record_is_the_run_of_its_pulse_means(runs):
         {n: v for n, v in PLANTS["duffing"].truth.items() if n not in ("alpha", "mu")}
     )
     (rec,) = ftlm.simulation.discretization.prepare([runs["duffing"]], structure, None, power_of_two=False)
-    run = free_run_ranking.record_run(rec, structure)
-    left = free_run_ranking.free_run_errors(ftlm.Model(structure), rec, run)["y"]
+    run = order_search.record_run(rec, structure)
+    left = order_search.free_run_errors(ftlm.Model(structure), rec, run)["y"]
     noise = np.std(runs["duffing"]["y"]) * 0.01
     assert np.std(left) < 1.2 * noise
 

@@ -47,10 +47,9 @@ from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import Coefficients, SearchSettings
+from ftlm.order_search.options import Coefficients, OrderGrid, SearchSettings
 from ftlm.order_search.search import announce_time, job_of, make_job, resume_job, run_job, search_status
 from ftlm.progress import Progress
-from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection import select as choice
 from ftlm.structure_selection.automatic import IntegerOrderForm

@@ -15,8 +15,7 @@ from ftlm.errors import ModelError
 from ftlm.estimation.confidence_intervals import Intervals
 from ftlm.estimation.methods import METHODS_BY_NAME
 from ftlm.estimation.output_error import Loss, Noise
-from ftlm.order_search.options import Criterion, Norm, RowBasis
-from ftlm.structure.order_grid import OrderGrid, order_grid
+from ftlm.order_search.options import Criterion, Norm, OrderGrid, RowBasis, order_grid
 from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import INITIAL_CHOICES, Offset, Structure, check_initial

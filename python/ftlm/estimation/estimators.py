@@ -32,13 +32,12 @@ from ftlm.estimation.result import Task
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import SearchSettings
+from ftlm.order_search.options import OrderGrid, SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, make_job, run_job
 from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.initial_conditions import resolve_start
-from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import orthonormal, projections, vector_norm
 from ftlm.utils.validation import Floats

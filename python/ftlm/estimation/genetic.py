@@ -21,12 +21,11 @@ from ftlm.estimation.model_checks import coefficient_law_findings
 from ftlm.estimation.result import Task
 from ftlm.findings import make_finding
 from ftlm.kernels import block_pulse_kernel
-from ftlm.order_search.options import Norm
+from ftlm.order_search.options import Norm, OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import Record, check_linear, order_grid_tuple, prepare
 from ftlm.structure.equation import Equation
 from ftlm.structure.order import Order
-from ftlm.structure.order_grid import OrderGrid, check_order_grid, check_order_grid_names
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting

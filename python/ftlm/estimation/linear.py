@@ -16,8 +16,8 @@ from ftlm.errors import DataError, FtlmError, InternalError, ModelError
 from ftlm.findings import Finding, make_finding
 from ftlm.kernels import Recursion
 from ftlm.model.model import Model
-from ftlm.order_search.free_run_ranking import free_run_score, record_run
 from ftlm.order_search.options import RowBasis, SearchSettings
+from ftlm.order_search.search import free_run_score, record_run
 from ftlm.simulation.discretization import (
     InitialTuple,
     Record,

@@ -19,10 +19,9 @@ from ftlm.estimation.identify import assess_fit
 from ftlm.estimation.result import Task
 from ftlm.estimation.verdict import MAX_ORDER_ERROR, verdict_from
 from ftlm.findings import Finding, make_finding, unique
-from ftlm.order_search.options import Coefficients, Criterion, Norm, RowBasis, SearchSettings
+from ftlm.order_search.options import Coefficients, Criterion, Norm, OrderGrid, RowBasis, SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
-from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.statistics import chi_squared_99, is_constant, variance_inflation

@@ -17,9 +17,8 @@ from ftlm.estimation.output_error import parameter_set_of
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import MAX_ORDER_ERROR
 from ftlm.experiment_design.exchange import Design, exchange_holds, scaled_design
-from ftlm.experiment_design.problem import Bounds, Criterion, Kind, per_signal_values
+from ftlm.experiment_design.problem import Bounds, Criterion, Kind, ModelFit, Sensitivities, per_signal_values
 from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
-from ftlm.experiment_design.sensitivity import ModelFit, Sensitivities
 from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
 from ftlm.findings import LEFT_OUT_CODES, NOT_WHITE_CODES, Finding, make_finding
 from ftlm.model.model import Model, check_model

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ftlm.experiment_design.problem import Bounds, Criterion
-from ftlm.experiment_design.sensitivity import Sensitivities
+from ftlm.experiment_design.problem import Bounds, Criterion, Sensitivities
 from ftlm.utils.validation import Complex, Floats
 
 #: Levels of a command, as fractions of its peak.

@@ -1,17 +1,27 @@
-"""Optimality criterion (D or E) and signal limits of an experiment."""
+"""Problem of input design: bounds, criterion, sensitivities of the outputs to the parameters."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
+from ftlm.data.run import Run
 from ftlm.errors import ModelError
-from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import Floats, nearest, real_number, short_repr
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.objective import Iterate, Objective
+from ftlm.estimation.output_error import parameter_set_of, problem_of
+from ftlm.model.model import Model
+from ftlm.simulation.simulate import simulate
+from ftlm.structure.equation import Term
+from ftlm.structure.order import Order
+from ftlm.utils.linalg import orthonormal, thin_svd
+from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr
 
 Kind = Literal["D", "E"]
 #: Exponent of Kiefer's mean, the smooth substitute of the widest axis: within s^(1/16) of it for s parameters.
@@ -183,3 +193,233 @@ def per_signal_values(
             )
         out[name] = value
     return out
+
+
+#: Relative size below which a direction of the offset responses is rounding error.
+OFFSET_RANK_TOLERANCE = 1e-10
+#: Relative change at which the step refinement of the simulations terminates.
+SIMULATION_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """Fit of a model as input design needs it: free parameters, their values, and the noise of each output.
+
+    Parameters
+    ----------
+    model
+        Model, simulated from its inputs only.
+    problem, values
+        Estimation problem of a run at rest, and its free parameters.
+    noise
+        Noise standard deviation of each output.
+    refinement
+        Block pulses per sampling interval.
+    """
+
+    model: Model
+    problem: FreeProblem
+    values: tuple[float, ...]
+    noise: Mapping[str, float]
+    refinement: int
+
+    @classmethod
+    def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
+        """Build from a model that records which of its parameters were free."""
+        problem, values = problem_of(model)
+        whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
+        return cls(whole, problem, tuple(values), noise, parameter_set_of(model).refinement)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(self.problem.names)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the modeled outputs."""
+        return self.problem.structure.outputs
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs of the coupled model."""
+        return tuple(s for s in self.problem.structure.signals if s not in self.outputs)
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance of the free parameters, as estimated from the runs of the model."""
+        known = parameter_set_of(self.model)
+        at = [known.names.index(n) for n in self.names]
+        return np.asarray(known.covariance)[np.ix_(at, at)]
+
+    def run(self, commands: Floats, step: float, name: str) -> Run:
+        """Simulate the model for commands of shape (inputs, rows)."""
+        blank = Run.from_arrays(
+            step=step,
+            inputs=dict(zip(self.inputs, commands, strict=True)),
+            outputs={o: np.zeros(commands.shape[1]) for o in self.outputs},
+            units={s: u for s, u in self.model.units.items() if u and s in (*self.inputs, *self.outputs)},
+            name=name,
+        )
+        answer = simulate(self.model, blank, tolerance=SIMULATION_TOLERANCE)
+        return blank.with_outputs({o: answer[o] for o in self.outputs})
+
+    def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
+        """Return output sensitivities of a simulated run over the noise, shape (parameters, outputs * samples).
+
+        They are those of the fit, computed by the core on its grid. The first and the last sample are not compared.
+        Offsets of each run, if the model has any, are projected out unless ``offset`` is False.
+        """
+        problem = self.problem
+        if not offset:
+            problem = replace(problem, structure=replace(problem.structure, offset="none"))
+        return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.refinement)
+
+    def predicted_covariance(self, run: Run) -> Floats:
+        """Return the covariance predicted for a fit of a simulated run alone, from exact derivatives."""
+        return _covariance_of(self.jacobian(run))
+
+
+def _covariance_of(rows: Floats) -> Floats:
+    """Inverse of the information of scaled derivatives; infinite variances if a parameter is not identifiable."""
+    size = np.linalg.norm(rows, axis=1)
+    scaled = rows / np.where(size > 0, size, 1.0)[:, None]
+    _, sizes, right = thin_svd(scaled.T)
+    lost = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
+    if np.any(size == 0) or sizes[-1] <= lost * sizes[0]:
+        return np.diag(np.full(len(rows), np.inf))
+    half = right.T / sizes / size[:, None]
+    return np.asarray(half @ half.T)
+
+
+def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], every: int) -> Floats:
+    orders, coefficients, inputs = problem.split(values)
+    grid = Objective(problem, [run], weights, every=every)
+    here = grid.minimize(Iterate(orders, coefficients, "the model", {}, inputs), 1, plain=True)
+    return np.asarray(here.outcome["jacobian"])
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """Responses to one zero-order-hold sample of each input; those to any input follow by convolution.
+
+    All equations are linear in their inputs and start at rest, so this is exact: it agrees with the derivatives of the
+    fit to rounding error.
+
+    Parameters
+    ----------
+    fit
+        Model and its fit.
+    step, rows
+        Sampling interval of the run [s], and its number of compared samples: all but the last.
+    ramp
+        Samples over which a command changes: every input is a moving average over that many samples.
+    kernels
+        Derivatives over the noise, shape (inputs, parameters, outputs, rows).
+    responses
+        Outputs, shape (inputs, outputs, rows).
+    nuisance
+        Orthonormal basis of the responses to offsets of the run, shape (basis vectors, outputs · rows).
+    """
+
+    fit: ModelFit
+    step: float
+    rows: int
+    ramp: int
+    kernels: Floats
+    responses: Floats
+    nuisance: Floats
+
+    @classmethod
+    def of(cls, fit: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
+        """Simulate the response to one sample of each input."""
+        kernels, answers, inputs = [], [], len(fit.inputs)
+        for k in range(inputs):
+            # The first sample of a run is not compared, so the pulse comes with the second.
+            commands = np.zeros((inputs, rows + 2))
+            commands[k, 1 : 1 + ramp] = 1.0 / ramp
+            run = fit.run(commands, step, "pulse")
+            found = fit.jacobian(run, offset=False)
+            kernels.append(found.reshape(len(fit.names), len(fit.outputs), rows))
+            answers.append(np.stack([run[o][1:-1] for o in fit.outputs]))
+        nuisance = _offset_responses(fit, step, rows)
+        return cls(fit, step, rows, ramp, np.stack(kernels), np.stack(answers), nuisance)
+
+    @cached_property
+    def length(self) -> int:
+        """Length of the Fourier transform that avoids circular convolution."""
+        return fast_length(2 * self.rows)
+
+    @cached_property
+    def spectra(self) -> tuple[Complex, Complex]:
+        """Fourier transforms of the kernels and of the responses."""
+        return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.responses, self.length)
+
+    def derivatives(self, commands: Floats) -> Floats:
+        """Return derivatives of the outputs over the noise standard deviation, shape (parameters, outputs, rows).
+
+        ``commands`` has shape (inputs, rows).
+        """
+        drive = np.fft.rfft(commands, self.length)
+        total = np.einsum("ipof,if->pof", self.spectra[0], drive)
+        return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
+
+    def outputs(self, commands: Floats) -> Floats:
+        """Outputs of the model, shape (outputs, rows), for commands of shape (inputs, rows)."""
+        total = np.einsum("iof,if->of", self.spectra[1], np.fft.rfft(commands, self.length))
+        return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
+
+    def information(self, derivatives: Floats) -> Floats:
+        """Fisher information of the free parameters, with offsets of the run projected out."""
+        flat = derivatives.reshape(len(derivatives), -1)
+        told = flat @ flat.T
+        if len(self.nuisance):
+            shared = flat @ self.nuisance.T
+            told = told - shared @ shared.T
+        return np.asarray(told)
+
+    def rig_commands(self, commands: Floats) -> Floats:
+        """Commands for a rig, shape (inputs, rows + 1): changes as ramps, and a last row of zeros."""
+        total = np.cumsum(commands, axis=1)
+        before = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
+        smooth = commands if self.ramp == 1 else (total - before) / self.ramp
+        return np.pad(smooth, ((0, 0), (0, 1)))
+
+
+def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
+    """Responses, over the noise, to unknown constants (and ramps) in the equations of one run."""
+    structure = fit.problem.structure
+    drives = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
+    if drives is None:
+        raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not decided; identify it again")
+    if not drives:
+        return np.zeros((0, len(fit.outputs) * rows))
+    taken = {*structure.signals, *structure.coefficient_names, *structure.order_names}
+    one = next(n for n in (f"one{k}" for k in range(len(taken) + 1)) if not any(t.startswith(n) for t in taken))
+    time = step * np.arange(rows + 2)
+    shapes = {f"{one}_{k}": np.asarray(time**k, dtype=np.float64) for k in range(drives)}
+    equations = tuple(
+        replace(e, terms=(*e.terms, *(Term(s, Order(), f"{s}_{e.output}") for s in shapes)))
+        for e in structure.equations
+    )
+    problem = FreeProblem.of(replace(structure, equations=equations, offset="none"))
+    values = dict(zip(fit.names, fit.values, strict=True))
+    still = fit.run(np.zeros((len(fit.inputs), rows + 2)), step, "still")
+    run = still.with_outputs(shapes)
+    found = _derivatives(
+        problem,
+        tuple(values.get(n, 0.0) for n in problem.names),
+        run,
+        [1.0 / fit.noise[o] for o in fit.outputs],
+        fit.refinement,
+    )
+    own = [i for i, n in enumerate(problem.names) if n not in values]
+    # They are told from the second sample on; at the first, a run from rest shows nothing of them.
+    told = found[own].reshape(len(own), len(fit.outputs), rows)
+    told = np.pad(told, ((0, 0), (0, 0), (1, 0)))[..., :rows]
+    return orthonormal(told.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T
+
+
+def fast_length(least: int) -> int:
+    """Smallest 2^a, 3·2^a, 5·2^a or 15·2^a that is at least ``least``: a fast length of a Fourier transform."""
+    return min(f << max((least - 1) // f, 0).bit_length() for f in (1, 3, 5, 15))

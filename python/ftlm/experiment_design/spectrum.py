@@ -14,8 +14,7 @@ from ftlm.analysis.frequency_response import (
     parameter_vector,
     with_parameter_vector,
 )
-from ftlm.experiment_design.problem import Bounds, Criterion
-from ftlm.experiment_design.sensitivity import ModelFit
+from ftlm.experiment_design.problem import Bounds, Criterion, ModelFit
 from ftlm.model.model import Model
 from ftlm.utils.validation import Complex, Floats
 

@@ -11,12 +11,11 @@ from typing import Any
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, FtlmError, ModelError
-from ftlm.order_search.options import SearchSettings
+from ftlm.order_search.options import DEFAULT_INCREMENT, OrderGrid, SearchSettings
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job, run_job
 from ftlm.simulation.discretization import check_linear, named_signals
 from ftlm.structure.equation import Equation
-from ftlm.structure.order_grid import DEFAULT_INCREMENT, OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting

@@ -1,4 +1,4 @@
-"""Job of an order search: one equation, or coupled equations under an order law."""
+"""Order search: jobs of one equation or of coupled ones, landscapes, ranking by free runs."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ from ftlm.order_search.batches import (
     search_equation,
 )
 from ftlm.order_search.checkpoint import Request, Store, check_record, read_store
-from ftlm.order_search.free_run_ranking import FREE_RUN_CANDIDATES, rank_by_free_runs
-from ftlm.order_search.options import SearchSettings
+from ftlm.order_search.options import Norm, OrderGrid, SearchSettings, axis_of, check_order_grid
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import (
@@ -44,12 +43,94 @@ from ftlm.simulation.discretization import (
     prepare,
 )
 from ftlm.simulation.nonlinear_columns import record_signals
+from ftlm.simulation.output_samples import simulate_samples
 from ftlm.structure.order import Order
-from ftlm.structure.order_grid import OrderGrid, axis_of, check_order_grid
 from ftlm.structure.structure import Structure
 from ftlm.svg.charts import Landscape
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.validation import check_threads
+from ftlm.utils.validation import Floats, check_threads
+
+#: Candidates of an order search that get a free run.
+FREE_RUN_CANDIDATES = 300
+
+
+def record_run(rec: Record, structure: Structure) -> Run:
+    """Return a record as a run whose pulse means are those of the record; samples of outputs are means of neighbors."""
+    rows = {name: rec.of(name) for name in structure.signals}
+    inputs = {
+        name: np.append(row, row[-1])
+        for (name, row), is_input in zip(rows.items(), rec.inputs, strict=False)
+        if is_input
+    }
+    outputs = {
+        name: np.concatenate([[1.5 * row[0] - 0.5 * row[1]], (row[:-1] + row[1:]) / 2, [1.5 * row[-1] - 0.5 * row[-2]]])
+        for name, row in rows.items()
+        if name not in inputs
+    }
+    return Run.from_arrays(step=rec.step, inputs=inputs, outputs=outputs, intersample=dict.fromkeys(inputs, "zoh"))
+
+
+def record_structure(rec: Record, structure: Structure) -> Structure:
+    """Return a structure for the run of a record, whose inputs have passed delays and nonlinearities."""
+    return replace(
+        structure, delay={}, free_delays={}, input_nonlinearities=UNSET, initial=rec.initial, offset=rec.offset
+    )
+
+
+def free_run_errors(model: Model, rec: Record, run: Run) -> dict[str, Floats]:
+    """Return measured minus simulated pulse means by output; not finite where the free run diverges."""
+    simulated, _ = simulate_samples(replace(model, structure=record_structure(rec, model.structure)), run, 1, None)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return {
+            name: rec.of(name) - (row[:-1] + row[1:]) / 2 for name, row in zip(model.outputs, simulated, strict=True)
+        }
+
+
+def free_run_score(
+    model: Model, records: Sequence[Record], runs: Sequence[Run], norm: Norm, scales: Sequence[float]
+) -> float:
+    """Return the score of a model by its free runs: error (45), or RMSE, summed over outputs in units of their scales.
+
+    Infinite where a free run diverges or a pulse has no solution.
+    """
+    try:
+        errors = [free_run_errors(model, rec, run) for rec, run in zip(records, runs, strict=True)]
+    except FtlmError:
+        return math.inf
+    score = 0.0
+    for name, scale in zip(model.outputs, scales, strict=True):
+        left = np.concatenate([e[name] for e in errors])
+        with np.errstate(over="ignore", invalid="ignore"):
+            own = float(np.abs(left).sum()) if norm == "l1" else math.sqrt(float(np.mean(left**2)))
+        score += own / scale
+    return score if math.isfinite(score) else math.inf
+
+
+def rank_by_free_runs(
+    table: Sequence[SearchRow], structure: Structure, records: Sequence[Record], norm: Norm, scales: Sequence[float]
+) -> list[SearchRow]:
+    """Return the rows with a finite free run, by its score.
+
+    Raises
+    ------
+    ModelError
+        No row has a finite free run.
+    """
+    runs = [record_run(rec, structure) for rec in records]
+    scored = []
+    for row in table:
+        model = Model(structure.with_orders(row.orders).with_coefficients(row.coefficients))
+        score = free_run_score(model, records, runs, norm, scales)
+        if math.isfinite(score):
+            scored.append(replace(row, score=score))
+    if not scored:
+        raise ModelError(
+            f"the free runs of the best {len(table)} candidates by equation error all diverge; check the signs of the "
+            "non-linear terms, or search by equation error"
+        )
+    scored.sort(key=lambda row: (row.score, row.index))
+    return [replace(row, rank=rank) for rank, row in enumerate(scored, 1)]
+
 
 Failures = list[tuple[dict[str, float], str]]
 

@@ -17,6 +17,7 @@ from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
 from ftlm.model.model import Model
+from ftlm.order_search.options import OrderGrid
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import compared_bars, comparison_charts
 from ftlm.plot.model_charts import pole_charts
@@ -28,7 +29,6 @@ from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, INNOVATION_L
 from ftlm.reproduction.report import criteria_cells, fits_text, joint_equations, letters_of, make_table, number_cells
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage import GRID_ALPHA, Candidate, DroppedDerivative, Preset, StageWork
-from ftlm.structure.order_grid import OrderGrid
 from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, write_page
 from ftlm.utils.files import check_folder
 from ftlm.utils.formatting import DIVERGED_TEXT, SIGNIFICANT_DIGITS, Cell, json_value, symbol, truncate_text, wrap_text

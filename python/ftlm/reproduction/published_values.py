@@ -26,7 +26,7 @@ from ftlm.errors import FtlmError
 from ftlm.fractional_calculus import haar_transform
 from ftlm.kernels import block_pulse_kernel, pulse_means
 from ftlm.model.model import Model
-from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
+from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS, OrderGrid
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
@@ -34,7 +34,6 @@ from ftlm.reproduction.simulated_arm import PAPERS_ARM, StageNumber, demo_run
 from ftlm.simulation.discretization import record, sensor_series
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import Order
-from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Exact, attributes, finite
 from ftlm.utils.validation import Floats

@@ -15,6 +15,7 @@ from typing import Any
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolution, load_pygad
+from ftlm.order_search.options import OrderGrid
 from ftlm.progress import format_time_left
 from ftlm.reproduction.checks import Check, checks
 from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, run_printed_models
@@ -35,7 +36,6 @@ from ftlm.reproduction.stage import (
     simulated_panel,
 )
 from ftlm.reproduction.workload import CONTEST_STEP, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
-from ftlm.structure.order_grid import OrderGrid
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.formatting import attributes, json_value
 from ftlm.utils.parameters import Placeholder, parameter, setting

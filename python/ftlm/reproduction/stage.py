@@ -23,6 +23,7 @@ from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import improves_prediction, is_degenerate
 from ftlm.kernels import pulse_means
 from ftlm.model.model import Model
+from ftlm.order_search.options import OrderGrid
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
@@ -40,7 +41,6 @@ from ftlm.reproduction.workload import CONTEST_STEP, WorkerProgress, seconds_of,
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.initial_conditions import starts_at_rest
 from ftlm.simulation.simulate import explicit_euler
-from ftlm.structure.order_grid import OrderGrid
 from ftlm.structure.structure import Structure
 from ftlm.svg.charts import Landscape
 from ftlm.utils.formatting import attributes, json_value, symbol
