@@ -23,6 +23,7 @@ from ftlm.progress import Progress
 from ftlm.report.html_report import grouped_findings
 from ftlm.report.typesetting import equation_html
 from ftlm.reproduction.figures import angle_chart
+from ftlm.reproduction.report import make_section, make_table
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
@@ -486,15 +487,7 @@ def rate_effect_table(found: OrderCrossValidation) -> Table | None:
         for output, full in found.deflections.items()
         if full.without_rate is not None
     }
-    if not rows:
-        return None
-    return Table.from_groups(
-        "Does the order earn its place?",
-        ("order", "without rate", "with rate"),
-        rows,
-        note="The rate of the other deflection stands in a link's equation as the gain of an observer would. An order "
-        "that earns its place only without the rate compensates for that gain.",
-    )
+    return make_table("rate_effect", rows) if rows else None
 
 
 def fits_table(found: OrderCrossValidation) -> Table:
@@ -512,13 +505,7 @@ def fits_table(found: OrderCrossValidation) -> Table:
             ]
             rows[heading].append([kind, numbers, *cells])
     heads = [f"{run}, fitted" if run == other else f"{run} → {other}" for run, other in pairs]
-    return Table.from_groups(
-        "Fit of the free run in percent",
-        ("structure", "numbers free", *heads),
-        rows,
-        note="Bold: validation runs. 100 is perfect, 0 is as good as the mean. Initial terms, initial state of the "
-        "filter and gauge offset belong to a run; of a validation run nothing else is estimated.",
-    )
+    return make_table("cross_fits", rows, {"@runs": heads})
 
 
 def estimates_table(deflection: Deflection, suffix: str = "") -> Table:
@@ -531,8 +518,7 @@ def estimates_table(deflection: Deflection, suffix: str = "") -> Table:
         for kind, each in deflection.fits.items()
         for run, fitted in each.items()
     }
-    title = f"{symbol(deflection.output)}{suffix}: estimates and their 95 % intervals"
-    return Table.from_groups(title, ("number", "estimate", "from", "to"), rows)
+    return make_table("cross_estimates", rows, output=f"{symbol(deflection.output)}{suffix}")
 
 
 def _deflection_section(full: Deflection) -> Section:
@@ -556,21 +542,10 @@ def _deflection_section(full: Deflection) -> Section:
 
 
 def _method_section(found: OrderCrossValidation) -> Section:
-    rows: list[list[Cell]] = [[r.name, r.length, Exact(round(r.step, 9)), r.duration] for r in found.runs]
+    rows = ([r.name, r.length, Exact(round(r.step, 9)), r.duration] for r in found.runs)
     filtered = " Both deflections passed the 2 Hz low-pass of the arm's stock model." if found.filtered else ""
-    words = [
-        "A link is the Euler–Lagrange equation (15) with the terms of a real arm: the measured motion of its hub, "
-        "whose coefficient −1 is known; the accelerations of the other stage and the rate of its deflection, if both "
-        f"stages were measured; hub angles in the gauge; an offset of the gauge.{filtered}",
-        "All structures have the same terms. Integer orders: elasticity of order 0, damping of order 1.",
-        "An order earns its place if every estimation run's 95 % interval excludes the integer order, the intervals of "
-        f"the runs have a common value, no validation run loses {MIN_FIT_GAIN:g} points of fit and the median gain is "
-        "as large. It does not if no validation run gains as much, or if no interval excludes the integer order and "
-        "the median gain is smaller. Otherwise the verdict cannot be told, for example for a fit that is worse on its "
-        "own run than the integer orders that its structure contains.",
-        *found.notes,
-    ]
-    return Section("How it is judged", words, tables=[Table("Runs", ("run", "rows", "step [s]", "length [s]"), rows)])
+    fields = {"filtered": filtered, "min_gain": MIN_FIT_GAIN}
+    return make_section("cross_validation", *found.notes, fields=fields, tables=[make_table("cross_runs", rows)])
 
 
 def cross_validation_page(found: OrderCrossValidation, path: str | os.PathLike[str], *, force: bool = False) -> Path:

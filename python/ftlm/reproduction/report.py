@@ -25,6 +25,7 @@ from ftlm.reproduction import figures
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import deviation_text, table_3_coefficients
 from ftlm.reproduction.published_values import (
+    ANGLE_NAMES,
     COEFFICIENT_LETTERS,
     ORDER_LETTERS,
     PRIOR_COVARIANCES,
@@ -84,7 +85,7 @@ def make_table(
     key
         Its key there.
     rows
-        Rows, or the rows of every angle by name.
+        Rows, or the rows of every angle by name, or those of other groups by heading.
     heads
         Heads of columns besides `COLUMN_HEADS`.
     **fields
@@ -96,7 +97,9 @@ def make_table(
     title, note = (texts.get(name, "").format(printed_note=PRINTED_NOTE, **fields) for name in ("title", "note"))
     options = {name: texts[name] for name in ("groups", "wrap", "stacked") if name in texts}
     if isinstance(rows, Mapping):
-        groups: dict[str, list[Any]] = {symbol_html(name): list(each) for name, each in rows.items()}
+        groups: dict[str, list[Any]] = {
+            symbol_html(name) if name in ANGLE_NAMES else name: list(each) for name, each in rows.items()
+        }
         return Table.from_groups(title, columns, groups, note=note, **options)
     return Table(title, columns, list(rows), note=note, **options)
 
