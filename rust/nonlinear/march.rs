@@ -78,7 +78,7 @@ pub(super) struct Operators {
     known: Vec<((usize, f64), Vec<f64>)>,
     terms: Vec<NonlinearTerm>,
     integrals: Vec<IntegralKernel>,
-    /// Values and heads of each integral kernel.
+    /// Kernel of each integral.
     kernels: Vec<ConvolutionKernel>,
     lanes: Vec<Lane>,
     inputs: Vec<InputLane>,

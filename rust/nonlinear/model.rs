@@ -3,7 +3,7 @@
 use super::channels::{ForcingTerms, SystemDerivatives};
 use super::initial_state::{merge_powers, State};
 use super::march::{FrozenProducts, LinearizedRun, Operators};
-use super::system::{refuse_beside, NonlinearSystem};
+use super::system::NonlinearSystem;
 use crate::equation::Equation;
 use crate::error::{Error, Result};
 use crate::estimation::output_error::{Experiment, FreeModel, Monomial};
@@ -284,11 +284,12 @@ impl NonlinearModel {
         for experiment in experiments {
             self.model.check_experiment(experiment)?;
             if experiment.nonuniform.is_some() {
-                return Err(refuse_beside("samples at times of their own", "resample the runs"));
+                let terms = if self.derived.is_empty() { "friction" } else { "non-linear terms" };
+                return refuse(&format!("{terms} with samples at times of their own"), "resample the runs");
             }
             let passes = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
             if passes != self.filtered {
-                return Err(refuse_beside("experiments with different filters", "give all runs the same filter"));
+                return refuse("experiments whose outputs pass different filters", "give all runs the same filter");
             }
         }
         self.model.initial.check()

@@ -2,7 +2,7 @@
 //!
 //! Blocks of 64 terms, of 2048 and so on each form a level. Within it the spectra of solved blocks and of the divisor's
 //! pieces are computed once, and only their products are summed for each later block. The many short transforms have
-//! their own code ([`block_transform`]).
+//! their own code.
 //!
 //! Exact for every divisor with a nonzero leading coefficient, stable or not. [`Division`] returns the quotient block
 //! by block, so that a search can drop a candidate early.
