@@ -130,8 +130,8 @@ pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
     let (blocks, rest) = terms.as_chunks();
     let mut padded = [0.0; BLOCK_TERMS];
     padded[..rest.len()].copy_from_slice(rest);
-    let mut blocks = blocks.iter();
-    let (low, high) = (blocks.next().unwrap_or(&padded), blocks.next().or((!rest.is_empty()).then_some(&padded)));
+    let mut blocks = blocks.iter().chain((!rest.is_empty()).then_some(&padded));
+    let (low, high) = (blocks.next().unwrap_or(&[0.0; BLOCK_TERMS]), blocks.next());
     let square = FACTORS.with(|factors| simd::dispatch_simd(Forward { factors, low, high }));
     for (row, tile) in square.iter().enumerate() {
         tiles[row * stride] = *tile;

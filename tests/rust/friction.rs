@@ -88,8 +88,8 @@ fn assert_law(law: FrictionLaw) -> Result<(), Error> {
 
 #[test]
 fn every_pulse_obeys_its_law() -> Result<(), Error> {
-    assert_law(FrictionLaw::coulomb(0.9))?;
-    assert_law(FrictionLaw { coulomb: 0.6, stribeck: 0.8, speed: 0.05 })
+    assert_law(FrictionLaw::coulomb(0.4))?;
+    assert_law(FrictionLaw { coulomb: 0.2, stribeck: 0.3, speed: 0.05 })
 }
 
 #[test]
@@ -234,16 +234,12 @@ fn what_has_no_velocity_is_refused() -> Result<(), Error> {
     let mut lost = body(1.5, 0.5);
     lost.equations[0].coefficients[0] = f64::NAN;
     assert!(lost.run(&record, &[vec![]]).is_err());
-    // Pushed away from where it is held: nothing is left of the digits of a run without friction.
-    let mut tipping = body(2.0, 5.0);
-    tipping.equations[0].structure.terms[0].order = 0.0;
-    tipping.equations[0].coefficients[0] = 400.0;
-    for m in [100, 200, 300, 400] {
-        let long = Record::new(0.05, PulseMeans::from_signals(vec![vec![0.0; m], vec![1.0; m]]), None)?;
-        assert!(matches!(tipping.run(&long, &[vec![]]), Err(Error::Diverged { .. })));
-    }
-    let short = Record::new(0.05, PulseMeans::from_signals(vec![vec![0.0; 15], vec![1.0; 15]]), None)?;
-    assert!(tipping.run(&short, &[vec![]])?.bodies[0].velocity.iter().all(|v| *v == 0.0));
+    // An unstable body rests for ever while friction holds it, although its motion without friction grows beyond all digits.
+    let mut unstable = body(2.0, 5.0);
+    unstable.equations[0].structure.terms[0].order = 0.0;
+    unstable.equations[0].coefficients[0] = 400.0;
+    let long = Record::new(0.05, PulseMeans::from_signals(vec![vec![0.0; 400], vec![1.0; 400]]), None)?;
+    assert!(unstable.run(&long, &[vec![]])?.bodies[0].velocity.iter().all(|v| *v == 0.0));
     Ok(())
 }
 

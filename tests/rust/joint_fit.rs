@@ -78,9 +78,9 @@ fn table(value: &Value) -> Vec<Vec<f64>> {
 
 /// Covariance Σ e² / (n − p) (J Jᵀ)⁻¹ of least squares with white noise, by Gauss–Jordan elimination.
 #[allow(clippy::cast_precision_loss)]
-fn classical_covariance(jacobian: &[Vec<f64>], residuals: &[Vec<Vec<f64>>]) -> Vec<f64> {
+fn classical_covariance(jacobian: &[Vec<f64>], residuals: &[Vec<f64>]) -> Vec<f64> {
     let p = jacobian.len();
-    let known: Vec<f64> = residuals.iter().flatten().flatten().copied().filter(|e| !e.is_nan()).collect();
+    let known: Vec<f64> = residuals.iter().flatten().copied().filter(|e| !e.is_nan()).collect();
     let level = known.iter().map(|e| e * e).sum::<f64>() / (known.len() - p) as f64;
     let product = |i: usize, j: usize| jacobian[i].iter().zip(&jacobian[j]).map(|(a, b)| a * b).sum::<f64>();
     let row = |i: usize| (0..p).map(|j| product(i, j)).chain((0..p).map(|j| f64::from(i == j))).collect::<Vec<f64>>();
@@ -120,9 +120,13 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
         assert_eq!(found.step_converged, case["stands"].as_bool().unwrap());
         close(&format!("{name}: estimate"), &found.estimate, &numbers(&case["estimate"]), END_TOLERANCE);
         close(&format!("{name}: on its grid"), &found.attempt.values(), &numbers(&case["on_grid"]), END_TOLERANCE);
+        // Residuals in the unit of the Jacobian, whose weights have converged to the noise within a tolerance.
+        let unit = found.noise[0] * found.weights.outputs[0];
+        let weighted = |run: &Vec<Vec<f64>>| run[0].iter().map(|e| e * unit).collect::<Vec<f64>>();
+        let series: Vec<Vec<f64>> = found.residuals.iter().map(weighted).collect();
         let expected = if name == "white" {
-            assert!(found.residuals.iter().all(|run| statistics::is_white(&run[0], statistics::WHITENESS_LAGS)));
-            classical_covariance(&found.attempt.jacobian, &found.residuals)
+            assert!(series.iter().all(|run| statistics::is_white(run, statistics::WHITENESS_LAGS)));
+            classical_covariance(&found.attempt.jacobian, &series)
         } else {
             table(&case["covariance"]).concat()
         };
@@ -132,7 +136,6 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
         let counted = case["robust"].as_array().map(|of| of.iter().map(|v| v.as_u64().unwrap()).collect());
         assert_eq!(robust, counted);
         // The colour of what is left, and what sums of it scatter by.
-        let series: Vec<Vec<f64>> = found.residuals.iter().map(|run| run[0].clone()).collect();
         let rows: Vec<&[f64]> = series.iter().map(Vec::as_slice).collect();
         let (filter, power) = statistics::whitening_filter(&rows, 6);
         close(&format!("{name}: filter"), &filter, &numbers(&case["filter"]), END_TOLERANCE);
