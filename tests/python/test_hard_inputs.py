@@ -162,8 +162,9 @@ def test_noise_as_large_as_the_signal_widens_the_intervals(noise, fit):
 
 def test_noise_beyond_the_instruments_is_a_typed_error_or_said():
     assert identified(run(square(), noise=1.0), "instrumental-variables").warnings
+    # At 3.2 rounding decides whether a candidate converges.
     with pytest.raises(ftlm.FtlmError, match="none of 35 candidates has a finite score; check the data"):
-        identified(run(square(), noise=3.2), "instrumental-variables")
+        identified(run(square(), noise=10.0), "instrumental-variables")
 
 
 def test_a_superfluous_order_does_not_run_away():
