@@ -92,13 +92,13 @@ fn turn_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
 }
 
 /// Transform of a block, or of a block and the one after it.
-struct Forward<'a> {
+struct ForwardTransform<'a> {
     factors: &'a Factors,
     low: &'a [f64; BLOCK_TERMS],
     high: Option<&'a [f64; BLOCK_TERMS]>,
 }
 
-impl simd::SimdKernel for Forward<'_> {
+impl simd::SimdKernel for ForwardTransform<'_> {
     type Output = Square;
 
     #[inline(always)]
@@ -132,19 +132,19 @@ pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
     padded[..rest.len()].copy_from_slice(rest);
     let mut blocks = blocks.iter().chain((!rest.is_empty()).then_some(&padded));
     let (low, high) = (blocks.next().unwrap_or(&[0.0; BLOCK_TERMS]), blocks.next());
-    let square = FACTORS.with(|factors| simd::dispatch_simd(Forward { factors, low, high }));
+    let square = FACTORS.with(|factors| simd::dispatch_simd(ForwardTransform { factors, low, high }));
     for (row, tile) in square.iter().enumerate() {
         tiles[row * stride] = *tile;
     }
 }
 
 /// Middle product of which tiles are the transform.
-struct Inverse<'a> {
+struct InverseTransform<'a> {
     factors: &'a Factors,
     tiles: &'a [Tile],
 }
 
-impl simd::SimdKernel for Inverse<'_> {
+impl simd::SimdKernel for InverseTransform<'_> {
     type Output = [f64; BLOCK_TERMS];
 
     #[inline(always)]
@@ -164,7 +164,7 @@ impl simd::SimdKernel for Inverse<'_> {
 
 /// Middle product of a block and a piece whose transforms' product the tiles are.
 pub(super) fn middle_product(tiles: &[Tile]) -> [f64; BLOCK_TERMS] {
-    FACTORS.with(|factors| simd::dispatch_simd(Inverse { factors, tiles }))
+    FACTORS.with(|factors| simd::dispatch_simd(InverseTransform { factors, tiles }))
 }
 
 #[cfg(test)]
