@@ -4,7 +4,7 @@
 //! mean forces on the other bodies change: φ_a = T_a(p_a − Σ_{b≠a} G_ab φ_b), e = p − G φ. With Coulomb friction T_a
 //! rises with its argument by at most 1/G_aa, so that friction and end velocity of a body never change in opposite
 //! directions: two solutions have Δe_a Δφ_a ≥ 0 for every a, while Δe = −G Δφ. If G is a P-matrix (all principal minors
-//! are positive, as for an inverse inertia matrix), no vector keeps all signs of its image, so the solution is unique:
+//! are positive, as for an inverse inertia matrix), some a has Δφ_a (G Δφ)_a > 0 unless Δφ = 0, so the solution is unique:
 //! exactly one combination of sliding and sticking is consistent. Newton steps find it in a few iterations. If one
 //! makes no progress, a Gauss–Seidel sweep over the bodies does. It decreases the error for inertia matrices, which are
 //! symmetric up to scaling.
@@ -16,11 +16,11 @@ use super::law::{FrictionLaw, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
-/// Friction laws of coupled bodies, and the velocity change of each for a unit of force on each in one pulse.
+/// Friction laws of coupled bodies, and the decrease of the end velocity of each for a unit of friction on each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ContactLaw {
     laws: Vec<FrictionLaw>,
-    /// Velocity changes per force, row by row.
+    /// Decreases of end velocities per friction, row by row.
     gains: Vec<f64>,
 }
 
@@ -59,13 +59,13 @@ impl ContactLaw {
         &self.laws[body]
     }
 
-    /// Velocity change of a body at the end of the pulse for a unit of force on another or on itself.
+    /// Decrease of the end velocity of a body for a unit of friction on another or on itself.
     #[must_use]
     pub fn gain(&self, body: usize, other: usize) -> f64 {
         self.gains[body * self.count() + other]
     }
 
-    /// Velocity change at the end of the pulse for a unit of force on the same body.
+    /// Decrease of the end velocity of a body for a unit of its own friction.
     #[must_use]
     pub fn own(&self, body: usize) -> f64 {
         self.gain(body, body)
@@ -77,7 +77,7 @@ impl ContactLaw {
         self.laws[body].breakaway()
     }
 
-    /// Velocity change of a body by the forces on the others.
+    /// Decrease of the end velocity of a body by the frictions of the others.
     fn coupling_velocity(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
         (0..self.count()).filter(|&b| b != body).map(|b| self.gain(body, b) * forces(b)).sum()
     }

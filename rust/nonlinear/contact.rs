@@ -248,8 +248,8 @@ impl ContactOperators {
 impl ContactSolver<'_> {
     /// Solve a pulse for its state channels and frictions.
     ///
-    /// A constant friction cannot balance a force that varies within the pulse. The mean output of a resting body would
-    /// drift with the square of the step, so the solver fixes it.
+    /// A constant friction cannot balance a force that varies within the pulse, so the mean output of a resting body would
+    /// drift with the square of the step. The solver keeps it fixed from one pulse at rest to the next.
     pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), PulseFailure> {
         for (rests, (before, now)) in self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities)) {
             *rests = before.1 && *now == 0.0;

@@ -27,7 +27,7 @@ enum Memory {
 }
 
 impl ConvolutionKernel {
-    /// Kernel of a convolution of as many values.
+    /// Kernel with these values from lag 0 on. A signal must not be longer.
     #[must_use]
     pub fn new(values: Vec<f64>) -> Self {
         let mut spectra = Vec::new();
@@ -40,7 +40,8 @@ impl ConvolutionKernel {
         Self { values, memory: Memory::Blocks(spectra) }
     }
 
-    /// Kernel of an integral of this order, which is a polynomial of the lag if the order is whole.
+    /// Kernel of an integral of this order, given its values. From lag 1 on it is a polynomial of the lag if the order is
+    /// whole; up to order 3 running sums are used then.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn of_integral(order: f64, values: Vec<f64>) -> Self {

@@ -171,7 +171,7 @@ impl Operators {
                     if eta < if l == j { MIN_INTEGRATION_ORDER } else { MIN_INTEGRATION_ORDER - MAX_EXCESS } {
                         return Err(beyond());
                     }
-                    if at_ends && system.enters_by_means(j, l, eta) {
+                    if at_ends && system.couples_by_means(j, l, eta) {
                         let mean = StateChannel::Mean { equation: l, order: 0.0 };
                         (find(mean), kernel_index(&mut integrals, eta - 1.0, true))
                     } else {
@@ -259,8 +259,8 @@ impl Operators {
         let at_ends = match &self.contact {
             Some(_) => {
                 let of = |(i, row): (usize, &Vec<Link>)| {
-                    let by_means = |link: &&Link| !system.enters_by_means(i, link.output, link.integration);
-                    row.iter().filter(by_means).copied().collect()
+                    let by_end_velocity = |link: &&Link| !system.couples_by_means(i, link.output, link.integration);
+                    row.iter().filter(by_end_velocity).copied().collect()
                 };
                 let links: Vec<Vec<Link>> = links.iter().enumerate().map(of).collect();
                 Some(EndForcing::new(powers, &links, self.m, self.step)?)

@@ -3,8 +3,8 @@
 //! D^α y = Σ c D^ν s + Σ k D^μ n − F(Dy) sgn(Dy), where n is an expression over signals and derivatives of them
 //! ([`DerivedSignal`](crate::expression::DerivedSignal)) and F a [`FrictionLaw`](crate::friction::FrictionLaw). Orders of
 //! the derivatives of outputs are at most α − μ. The scheme is of second order in the step, and implicit: Newton
-//! iterations solve the non-linear terms of a pulse, the contact law its friction. Memory is an online convolution with
-//! the kernels of fractional integrals alone.
+//! iterations solve the non-linear terms of a pulse, the contact law its friction. The past enters by online convolutions
+//! with the kernels of fractional integrals alone.
 
 mod channels;
 mod contact;
@@ -35,9 +35,9 @@ pub struct FreeRun {
 
 impl NonlinearSystem {
     /// Free run with initial terms, (exponent, coefficient) pairs of powers of t by equation. Outputs are NaN from the
-    /// pulse on at which the run leaves the range of numbers. O(d m log² m) for d convolutions; O(d m) for whole orders.
+    /// first pulse that overflows. O(d m log² m) for d convolutions of m pulses; O(d m) for whole orders.
     ///
-    /// The exponents −1, −2, … are an impulse and its derivatives in the output alone, which move nothing.
+    /// The exponents −1, −2, … add an impulse and its derivatives to the output alone; the equations do not contain them.
     /// After the filter of an output they become its initial transient.
     ///
     /// # Errors

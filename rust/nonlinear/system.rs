@@ -31,7 +31,7 @@ pub struct NonlinearSystem {
 }
 
 impl NonlinearSystem {
-    /// System without non-linear terms, whose outputs enter each other's equations as simulated.
+    /// Linear equations with dry friction, whose outputs enter each other's equations as simulated.
     #[must_use]
     pub fn linear(equations: Vec<Equation>, frictions: Vec<(usize, FrictionLaw)>, recorded: usize) -> Self {
         Self { equations, derived: Vec::new(), recorded, coupled: true, frictions }
@@ -46,7 +46,7 @@ impl NonlinearSystem {
         }
     }
 
-    /// Return an error for signals that do not exist, and for coefficients, orders or frictions that no equation has.
+    /// Return an error for signal indices out of range, and for invalid coefficients, orders or frictions.
     ///
     /// # Errors
     /// [`Error::Structure`], [`Error::OutOfRange`], [`Error::NotFinite`]; as [`Equation::check`].
@@ -174,9 +174,9 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(of).collect()
     }
 
-    /// Whether an output enters the end velocities of another one by its means, as an input does: an output of an order
-    /// up to 1, such as that of an actuator, has no velocity at an edge.
-    pub(super) fn enters_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
+    /// Whether the end velocity of an equation is computed from the pulse means of another output, as from those of an
+    /// input. True for outputs of an order up to 1, such as those of actuators, which have no velocity at a pulse end.
+    pub(super) fn couples_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
         let order = self.equations[output].structure.order;
         output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER && integration > 1.0 + MAX_FEEDTHROUGH_ORDER
     }
@@ -208,7 +208,7 @@ impl NonlinearSystem {
             for term in &self.equations[channel.equation()].structure.terms {
                 let eta = self.equations[channel.equation()].structure.order - term.order;
                 match self.output_index(channel.equation(), term.signal) {
-                    Some(l) if !(channel.is_at_ends() && self.enters_by_means(channel.equation(), l, eta)) => {
+                    Some(l) if !(channel.is_at_ends() && self.couples_by_means(channel.equation(), l, eta)) => {
                         add(&mut states, channel.with_equation(l));
                     }
                     _ => {}

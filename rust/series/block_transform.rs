@@ -1,7 +1,7 @@
 //! Complex transforms of blocks of 64 real terms, for products of series block by block.
 //!
-//! A block of 64 terms times a piece of 128 terms has 64 terms that depend on all of the block: the middle product,
-//! which joins a block of a quotient to a later one. Modulo z⁶⁴ − i a real series a + z⁶⁴ b is the complex series
+//! Terms 64 to 127 of the product of a block of 64 terms and a piece of 128 terms are the middle product: what a block
+//! of a quotient contributes to a later one. Modulo z⁶⁴ − i a real series a + z⁶⁴ b is the complex series
 //! a + i b, and the imaginary part of the product of the two is the middle product. Its 64 values at the roots of
 //! z⁶⁴ = i are a discrete Fourier transform in two passes of 8, each with [`LANE_COUNT`] columns side by side.
 
@@ -138,7 +138,7 @@ pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
     }
 }
 
-/// Middle product of which tiles are the transform.
+/// Middle product whose transform is given.
 struct InverseTransform<'a> {
     factors: &'a Factors,
     tiles: &'a [Tile],
@@ -162,7 +162,7 @@ impl simd::SimdKernel for InverseTransform<'_> {
     }
 }
 
-/// Middle product of a block and a piece whose transforms' product the tiles are.
+/// Middle product of a block and a piece from the product of their transforms.
 pub(super) fn middle_product(tiles: &[Tile]) -> [f64; BLOCK_TERMS] {
     FACTORS.with(|factors| simd::dispatch_simd(InverseTransform { factors, tiles }))
 }

@@ -370,9 +370,11 @@ def refit_if_accepted(
     accepts: Callable[[JointFit], bool],
     refit: Callable[[Sequence[Run], Structure], JointFit],
 ) -> JointFit | None:
-    """Refit a linear structure with other initial conditions or offsets; None if it is not accepted or not finite.
+    """Return the refit of a linear structure with other initial conditions or offsets; None if rejected or failed.
 
-    It is fitted only if a few evaluations from the optimum are accepted, with a share of the residuals that they leave.
+    First, at most `MAX_SCREENING_EVALUATIONS` are made from the optimum. The residuals that they leave, multiplied by
+    `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of the complete fit. `refit` is called only if
+    `accepts` accepts this estimate, and its result must be accepted, too.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]

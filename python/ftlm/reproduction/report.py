@@ -83,13 +83,13 @@ def make_table(
     Parameters
     ----------
     key
-        Its key there.
+        Key of the table in page.toml.
     rows
         Rows, or the rows of every angle by name, or those of other groups by heading.
     heads
         Heads of columns besides `COLUMN_HEADS`.
     **fields
-        Fields of its title and note.
+        Values of the placeholders in its title and note.
     """
     texts = read_texts("page")["tables"][key]
     known = {**COLUMN_HEADS, **(heads or {})}
