@@ -18,6 +18,9 @@ const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
 
 /// Equations of a pulse at given friction.
 pub(super) trait PulseEquations {
+    /// Whether the state channels are linear in the frictions.
+    fn is_linear(&self) -> bool;
+
     /// Solve the equations for the state channels at these frictions.
     fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), PulseFailure>;
 
@@ -296,6 +299,12 @@ impl ContactSolver<'_> {
                 return Err(PulseFailure::Overflow);
             }
             if miss <= FRICTION_ROUNDING_RATIO * size {
+                break;
+            }
+            if pulse.is_linear() {
+                // The frictions do not depend on the state channels, which follow from them.
+                pulse.solve_with(&self.forces)?;
+                miss = 0.0;
                 break;
             }
         }

@@ -519,7 +519,7 @@ impl<'a> Pulse<'a> {
     fn linearize(&mut self) -> bool {
         let (states, count, width) = (self.z.len(), self.operators.sources(), self.z.len() + self.known.len());
         let is_fixed = self.fixed.iter().map(Option::is_some);
-        if self.operators.terms.is_empty() && is_fixed.clone().eq(self.inverted_for.iter().copied()) {
+        if self.is_linear() && is_fixed.clone().eq(self.inverted_for.iter().copied()) {
             return true;
         }
         self.inverted_for = is_fixed.collect();
@@ -544,8 +544,32 @@ impl<'a> Pulse<'a> {
         true
     }
 
+    /// Solve the pulse of a system without non-linear terms, with the present frictions.
+    fn solve_linear(&mut self) -> std::result::Result<(), PulseFailure> {
+        if !self.linearize() {
+            return Err(PulseFailure::Newton("its linearization is singular"));
+        }
+        let (states, count) = (self.z.len(), self.operators.sources());
+        for (a, right) in self.residual.iter_mut().enumerate() {
+            let gains = &self.operators.gains[a * count + states..(a + 1) * count];
+            let driven = || self.free[a] + gains.iter().zip(&self.values).map(|(g, x)| g * x).sum::<f64>();
+            *right = self.fixed[a].unwrap_or_else(driven);
+        }
+        for (z, row) in self.z.iter_mut().zip(self.inverse.chunks(states)) {
+            *z = row.iter().zip(&self.residual).map(|(v, right)| v * right).sum();
+        }
+        if self.z.iter().all(|z| z.is_finite()) {
+            Ok(())
+        } else {
+            Err(PulseFailure::Overflow)
+        }
+    }
+
     /// Solve the pulse from the current z, with the present frictions.
     fn solve(&mut self) -> std::result::Result<(), PulseFailure> {
+        if self.is_linear() {
+            return self.solve_linear();
+        }
         let states = self.z.len();
         let mut norm = self.evaluate();
         if !norm.is_finite() && self.free.iter().all(|v| v.is_finite()) {
@@ -600,6 +624,10 @@ impl<'a> Pulse<'a> {
 }
 
 impl PulseEquations for Pulse<'_> {
+    fn is_linear(&self) -> bool {
+        self.operators.terms.is_empty()
+    }
+
     fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), PulseFailure> {
         let terms = self.operators.terms.len();
         self.values[terms..].copy_from_slice(frictions);
