@@ -18,20 +18,20 @@ use crate::linalg::small;
 
 /// Friction laws of coupled bodies, and the decrease of the end velocity of each for a unit of friction on each.
 #[derive(Debug, Clone, PartialEq)]
-pub struct ContactLaw {
+pub struct ContactProblem {
     laws: Vec<FrictionLaw>,
     /// Decreases of end velocities per friction, row by row.
     gains: Vec<f64>,
 }
 
 /// Most iterations for the frictions of a pulse. Two weakly coupled bodies need two.
-const MAX_FORCE_ITERATIONS: usize = 200;
+const MAX_CONTACT_ITERATIONS: usize = 200;
 /// Rounding error relative to the largest velocity without friction. A force that equals friction moves nothing.
 pub(crate) const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
-/// Largest error of a solution, relative to the velocities.
-const FORCE_TOLERANCE_RATIO: f64 = 1e-9;
+/// Largest error of a friction, as a change of velocity relative to the velocities.
+pub(crate) const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
 
-impl ContactLaw {
+impl ContactProblem {
     /// Bodies with these laws.
     ///
     /// # Errors
@@ -85,7 +85,7 @@ impl ContactLaw {
     /// Solve a pulse that starts at the velocities `v` and would end at `p` without friction.
     ///
     /// `at` receives each body's end velocity without its own friction, and its pulse. `near` are the initial forces.
-    pub fn pulse(&self, v: &[f64], p: &[f64], rounding: &[f64], near: &[f64], at: &mut Vec<(f64, Pulse)>) {
+    pub fn solve(&self, v: &[f64], p: &[f64], rounding: &[f64], near: &[f64], at: &mut Vec<(f64, Pulse)>) {
         let n = self.count();
         let of = |a: usize, forces: &[f64]| {
             let free = p[a] - self.coupling_velocity(a, |b| forces[b]);
@@ -102,13 +102,15 @@ impl ContactLaw {
         };
         let mut miss = wrong(at, &forces);
         let size = (0..n).map(|a| v[a].abs() + p[a].abs() + self.own(a) * self.breakaway(a)).fold(0.0, f64::max);
-        for _ in 0..MAX_FORCE_ITERATIONS {
+        for _ in 0..MAX_CONTACT_ITERATIONS {
             if miss <= 4.0 * f64::EPSILON * size {
                 break;
             }
             let misses: Vec<f64> = at.iter().zip(&forces).map(|(x, f)| x.1.force - f).collect();
-            let newton =
-                self.through(&(0..n).map(|a| self.rise(a, v[a], at[a].0, &at[a].1)).collect::<Vec<_>>(), &misses);
+            let newton = self.solve_coupled(
+                &(0..n).map(|a| self.force_slope(a, v[a], at[a].0, &at[a].1)).collect::<Vec<_>>(),
+                &misses,
+            );
             let ahead: Vec<f64> = forces.iter().zip(&newton).map(|(f, s)| f + s).collect();
             let there: Vec<(f64, Pulse)> = (0..n).map(|a| of(a, &ahead)).collect();
             let left = wrong(&there, &ahead);
@@ -124,7 +126,7 @@ impl ContactLaw {
             miss = wrong(at, &forces);
         }
         let falls = self.laws.iter().any(|law| law.stribeck > 0.0);
-        if !falls && miss > FORCE_TOLERANCE_RATIO * size {
+        if !falls && miss > MAX_FRICTION_ERROR_RATIO * size {
             // NaN counts as overflow: no solution is better than a wrong one.
             at.iter_mut().for_each(|(_, pulse)| pulse.end = f64::NAN);
         }
@@ -132,18 +134,18 @@ impl ContactLaw {
 
     /// Derivative of a body's friction with respect to its end velocity without friction.
     #[must_use]
-    pub fn rise(&self, body: usize, velocity: f64, free: f64, pulse: &Pulse) -> f64 {
+    pub fn force_slope(&self, body: usize, velocity: f64, free: f64, pulse: &Pulse) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
         self.laws[body].slope(velocity, free, self.own(body), pulse, &unit).0
     }
 
-    /// Solution of (1 + diag(rises) (G − diag G)) x = `vector`.
-    fn through(&self, rises: &[f64], vector: &[f64]) -> Vec<f64> {
+    /// Solution of (1 + diag(slopes) (G − diag G)) x = `vector`.
+    fn solve_coupled(&self, slopes: &[f64], vector: &[f64]) -> Vec<f64> {
         let n = self.count();
         let mut matrix = vec![0.0; n * n];
         for a in 0..n {
             for b in 0..n {
-                matrix[a * n + b] = if a == b { 1.0 } else { rises[a] * self.gains[a * n + b] };
+                matrix[a * n + b] = if a == b { 1.0 } else { slopes[a] * self.gains[a * n + b] };
             }
         }
         match small::inverse(&matrix, n) {

@@ -38,7 +38,7 @@ pub struct Pulse {
     pub force: f64,
     /// Velocity at the end, exactly 0 at rest.
     pub end: f64,
-    /// State of the body.
+    /// Phase of the body: sliding, at rest, or turning.
     pub phase: Phase,
 }
 

@@ -1,20 +1,18 @@
 //! Dry friction in a free run: friction of a pulse, and its derivatives.
 //!
-//! The end velocity of a body is V = P − G φ. P is the end velocity without the friction φ, G the linear response within
-//! the pulse. Non-linear terms change P little within a pulse, so that the iteration for φ converges in a few steps.
+//! The end velocity of a body is e = p − G φ. p is the end velocity without the friction φ, G the linear response within
+//! the pulse. Non-linear terms change p little within a pulse, so that the iteration for φ converges in a few steps.
 
 use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
 use crate::error::Result;
-use crate::friction::contact::{ContactLaw, VELOCITY_ROUNDING_RATIO};
+use crate::friction::contact::{ContactProblem, MAX_FRICTION_ERROR_RATIO, VELOCITY_ROUNDING_RATIO};
 use crate::friction::law::{FrictionLaw, Phase, Pulse as FrictionPulse, PulseDerivatives};
 use crate::linalg::small;
 
-/// Iterations for the friction of a pulse. Three are usual.
-const MAX_FRICTION_ITERATIONS: usize = 60;
+/// Most solutions of the state channels and contacts in turn in a pulse. Three are usual.
+const MAX_PULSE_ITERATIONS: usize = 60;
 /// Error of a friction, relative to the velocities, that ends the iteration.
 const FRICTION_ROUNDING_RATIO: f64 = 64.0 * f64::EPSILON;
-/// Largest error of a friction, relative to the velocities.
-const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
 
 /// Equations of a pulse at given friction.
 pub(super) trait PulseEquations {
@@ -34,7 +32,7 @@ pub(super) trait PulseEquations {
 /// Bodies with friction.
 pub(super) struct ContactOperators {
     /// Friction laws, and decrease of the end velocities for a unit of each friction without the non-linear terms.
-    law: ContactLaw,
+    problem: ContactProblem,
     /// State channels of the output and of the end velocity of each body.
     outputs: Vec<usize>,
     velocities: Vec<usize>,
@@ -51,7 +49,7 @@ pub struct BodyMotion {
     pub force: Vec<f64>,
     /// Velocity at the pulse edges, one more than there are pulses. Exactly 0 at rest.
     pub velocity: Vec<f64>,
-    /// State of the body in each pulse.
+    /// Phase of the body in each pulse.
     pub phases: Vec<Phase>,
 }
 
@@ -59,11 +57,11 @@ pub struct BodyMotion {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PulseContact {
     /// Velocity at the start.
-    start: f64,
+    start_velocity: f64,
     /// Velocity at the end without the friction of the body.
-    free: f64,
+    free_velocity: f64,
     /// Whether the body rests in this pulse and in the one before, so that its mean output stays.
-    rests: bool,
+    is_resting: bool,
     pulse: FrictionPulse,
 }
 
@@ -115,13 +113,13 @@ impl ContactOperators {
         let response = |a: usize, b: usize| -> f64 {
             (0..states).map(|s| -inverse[velocities[a] * states + s] * gains[s * count + count - n + b]).sum()
         };
-        let law = ContactLaw::new(laws, (0..n * n).map(|at| response(at / n, at % n)).collect())?;
-        Ok(Self { law, outputs, velocities, states, inverse })
+        let problem = ContactProblem::new(laws, (0..n * n).map(|at| response(at / n, at % n)).collect())?;
+        Ok(Self { problem, outputs, velocities, states, inverse })
     }
 
     /// Number of bodies.
     pub(super) fn count(&self) -> usize {
-        self.law.count()
+        self.problem.count()
     }
 
     /// State channel of the output of each body, which is the index of its equation.
@@ -203,7 +201,7 @@ impl ContactOperators {
     ) -> Result<()> {
         let (states, n, count) = (self.states, self.count(), x.len());
         let moves_freely =
-            |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.rests && output == state);
+            |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.is_resting && output == state);
         let free: Vec<usize> = (0..states).filter(|&state| moves_freely(state)).collect();
         // Response of the state channels to a friction, with the non-linear terms.
         let response = |b: usize| -> Vec<f64> {
@@ -212,12 +210,12 @@ impl ContactOperators {
         };
         let responses: Vec<Vec<f64>> = (0..n).map(response).collect();
         let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);
-        for (a, &PulseContact { start, free, pulse, .. }) in at.iter().enumerate() {
-            let own = self.law.own(a);
-            let rise = self.law.rise(a, start, free, &pulse);
+        for (a, &PulseContact { start_velocity: start, free_velocity: free, pulse, .. }) in at.iter().enumerate() {
+            let own = self.problem.own(a);
+            let slope = self.problem.force_slope(a, start, free, &pulse);
             for b in 0..n {
-                let direct = if a == b { 1.0 - rise * own } else { 0.0 };
-                matrix[a * n + b] = direct - rise * responses[b][self.velocities[a]];
+                let direct = if a == b { 1.0 - slope * own } else { 0.0 };
+                matrix[a * n + b] = direct - slope * responses[b][self.velocities[a]];
             }
             let end = derivatives.starts[a].1 + x[self.velocities[a]];
             let moved = PulseDerivatives {
@@ -226,7 +224,7 @@ impl ContactOperators {
                 first: derivatives.gains[a],
                 law: derivatives.laws[a],
             };
-            right[a] = self.law.law(a).slope(start, free, own, &pulse, &moved).0;
+            right[a] = self.problem.law(a).slope(start, free, own, &pulse, &moved).0;
         }
         let solution = small::inverse(&matrix, n)?;
         for b in 0..n {
@@ -242,7 +240,7 @@ impl ContactOperators {
 
     /// Set the derivatives of the outputs of bodies at rest to those of the last pulse.
     pub(super) fn fix_resting_outputs(&self, at: &[PulseContact], motion: &[(f64, f64)], free: &mut [f64]) {
-        for (a, _) in at.iter().enumerate().filter(|(_, at)| at.rests) {
+        for (a, _) in at.iter().enumerate().filter(|(_, at)| at.is_resting) {
             free[self.outputs[a]] = motion[a].0;
         }
     }
@@ -278,21 +276,21 @@ impl ContactSolver<'_> {
         let (contact, n) = (self.contact, self.contact.count());
         let mut miss = f64::INFINITY;
         let mut size: f64 = 0.0;
-        for _ in 0..MAX_FRICTION_ITERATIONS {
+        for _ in 0..MAX_PULSE_ITERATIONS {
             pulse.solve_with(&self.forces)?;
-            let through = |a: usize| (0..n).map(|b| contact.law.gain(a, b) * self.forces[b]).sum::<f64>();
+            let through = |a: usize| (0..n).map(|b| contact.problem.gain(a, b) * self.forces[b]).sum::<f64>();
             let free: Vec<f64> = (0..n)
                 .map(|a| self.initial_velocities[a] + *pulse.channel(contact.velocities[a]) + through(a))
                 .collect();
             for (rounding, free) in self.rounding.iter_mut().zip(&free) {
                 *rounding = f64::max(*rounding, VELOCITY_ROUNDING_RATIO * free.abs());
             }
-            contact.law.pulse(&self.velocities, &free, &self.rounding, &self.forces, &mut self.at);
+            contact.problem.solve(&self.velocities, &free, &self.rounding, &self.forces, &mut self.at);
             (miss, size) = (0.0, 0.0);
             for (a, (_, found)) in self.at.iter().enumerate() {
-                let own = contact.law.own(a);
+                let own = contact.problem.own(a);
                 miss = f64::max(miss, (found.force - self.forces[a]).abs() * own);
-                size = size.max(self.velocities[a].abs() + free[a].abs() + contact.law.breakaway(a) * own);
+                size = size.max(self.velocities[a].abs() + free[a].abs() + contact.problem.breakaway(a) * own);
                 self.forces[a] = found.force;
             }
             if self.at.iter().any(|(_, found)| found.end.is_nan()) {
@@ -320,10 +318,10 @@ impl ContactSolver<'_> {
     /// Go on to the next pulse; return the contacts of the solved one, with these state channels.
     pub(super) fn advance(&mut self, z: &[f64]) -> &[PulseContact] {
         self.contacts.clear();
-        for (a, &(free, pulse)) in self.at.iter().enumerate() {
-            let start = self.velocities[a];
-            self.contacts.push(PulseContact { start, free, rests: self.is_resting[a], pulse });
-            self.last_outputs[a] = (z[self.contact.outputs[a]], start == 0.0 && pulse.end == 0.0);
+        for (a, &(free_velocity, pulse)) in self.at.iter().enumerate() {
+            let start_velocity = self.velocities[a];
+            self.contacts.push(PulseContact { start_velocity, free_velocity, is_resting: self.is_resting[a], pulse });
+            self.last_outputs[a] = (z[self.contact.outputs[a]], start_velocity == 0.0 && pulse.end == 0.0);
             self.velocities[a] = pulse.end;
         }
         &self.contacts

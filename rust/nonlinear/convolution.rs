@@ -102,7 +102,7 @@ impl<'a> OnlineConvolution<'a> {
 
     /// Sum Σ_{j<k} κ_{k−j} x_j for the next value k.
     #[must_use]
-    pub fn past(&self) -> f64 {
+    pub fn history_sum(&self) -> f64 {
         if let Memory::Polynomial(coefficients) = &self.kernel.memory {
             return coefficients.iter().zip(&self.sums).map(|(c, sum)| c * sum).sum();
         }

@@ -26,7 +26,7 @@ pub struct Start {
 /// Optimum of a fit and its diagnostics.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
-pub struct StateFit {
+pub struct NonlinearFit {
     /// Free orders.
     pub orders: Vec<f64>,
     /// Free coefficients.
@@ -256,7 +256,7 @@ pub fn fit(
     start: &Start,
     settings: MinimizationSettings,
     stop: &Stop,
-) -> Result<StateFit> {
+) -> Result<NonlinearFit> {
     model.check(experiments)?;
     check_length("orders", model.model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.model.coordinates.len(), start.coefficients.len())?;
@@ -300,7 +300,7 @@ pub fn fit(
         }
     }
     let Point { orders, coefficients, inputs, states } = found.point;
-    Ok(StateFit {
+    Ok(NonlinearFit {
         initial: states.iter().map(|values| model.powers(&orders, &coefficients, values)).collect(),
         orders,
         coefficients,

@@ -19,7 +19,7 @@ pub(super) struct Link {
 
 /// Motion of each output at the ends of pulses by initial terms: its start, and the forcing of its velocity.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct EndForcing {
+pub(super) struct EndVelocityForcing {
     /// Contribution to the velocity at pulse ends, relative to the initial velocity.
     pub(super) velocities: Vec<Vec<f64>>,
     /// Initial velocities.
@@ -28,7 +28,7 @@ pub(super) struct EndForcing {
     pub(super) initial_outputs: Vec<f64>,
 }
 
-impl EndForcing {
+impl EndVelocityForcing {
     /// Forcing by powers of t at the level of the outputs, (exponent, coefficient) by equation, with coupling terms.
     ///
     /// Coupling terms integrate an initial level x₀, and also the jump to it: in the velocity it is c x₀ t^{η−1}/Γ(η).
@@ -42,7 +42,7 @@ impl EndForcing {
         let n = powers.len();
         let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
         let initial_outputs = solve_feedthrough(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
-        let mut rates = vec![Sum::default(); n];
+        let mut rates = vec![PowerSum::default(); n];
         for (i, own) in powers.iter().enumerate() {
             for &(exponent, value) in own.iter().filter(|power| power.0.abs() >= ORDER_GRAIN) {
                 rates[i].add(exponent - 1.0, value * exponent);
@@ -83,9 +83,9 @@ impl EndForcing {
 
 /// Sum of powers of t with distinct exponents.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Sum(Vec<(f64, f64, f64)>);
+pub(super) struct PowerSum(Vec<(f64, f64, f64)>);
 
-impl Sum {
+impl PowerSum {
     pub(super) fn add(&mut self, exponent: f64, value: f64) {
         match self.0.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
             Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
@@ -102,13 +102,13 @@ impl Sum {
 /// Powers of t, (exponent, coefficient), of the derivative of an output of this order, from those of all equations.
 ///
 /// D^ρ I^η y is I^η D^ρ y, and the powers of t that y(0), y′(0), … add. They cancel those of Caputo's initial terms.
-pub(super) fn channel_powers(
+pub(super) fn derivative_powers(
     equation: usize,
     order: f64,
     links: &[Vec<Link>],
     powers: &[Vec<(f64, f64)>],
 ) -> Result<Vec<(f64, f64)>> {
-    let mut sum = Sum::default();
+    let mut sum = PowerSum::default();
     powers[equation].iter().for_each(|&(exponent, value)| sum.add(exponent, value));
     let mut whole = 0.0;
     while whole < order - ORDER_GRAIN {
@@ -149,7 +149,7 @@ pub(super) fn channel_powers(
 }
 
 /// Pulse means of t^e. Negative powers are those of the derivative kernels applied to a step.
-pub(super) fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+pub(super) fn power_term_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent >= 0.0 {
         return power_means(exponent, m, step);
     }
@@ -180,7 +180,7 @@ pub(super) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Ve
 
 /// Free initial state of a run: a combination of powers of t in the named equation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum State {
+pub(super) enum InitialTerm {
     /// Initial level of the output.
     Level(usize),
     /// Initial velocity of the output.
@@ -198,7 +198,7 @@ pub(super) enum State {
     Power(usize, f64),
 }
 
-impl State {
+impl InitialTerm {
     /// States of a run.
     ///
     /// `free` says whether the integration order of an equation's term depends on a free order. Each filtered output
@@ -296,11 +296,11 @@ mod tests {
         let links = vec![vec![Link { output: 0, order: 0.6, integration: 1.4, coefficient: -0.7 }]];
         let taken = 0.7 * 3.0 / libm::tgamma(2.4);
         let powers = vec![vec![(0.0, 3.0), (1.0, 2.0), (1.4, taken)]];
-        assert_eq!(channel_powers(0, 1.0, &links, &powers)?, [(0.0, 2.0)]);
-        let half = channel_powers(0, 0.5, &links, &powers)?;
+        assert_eq!(derivative_powers(0, 1.0, &links, &powers)?, [(0.0, 2.0)]);
+        let half = derivative_powers(0, 0.5, &links, &powers)?;
         assert!(half.len() == 1 && (half[0].0 - 0.5).abs() < 1e-12);
         assert!((half[0].1 - 2.0 / libm::tgamma(1.5)).abs() < 1e-12);
-        assert_eq!(channel_powers(0, 0.0, &links, &powers)?.len(), 3);
+        assert_eq!(derivative_powers(0, 0.0, &links, &powers)?.len(), 3);
         Ok(())
     }
 }

@@ -9,7 +9,7 @@
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
 use super::contact::{BodyDerivatives, BodyMotion, ContactOperators, PulseContact, PulseEquations};
 use super::convolution::{average_neighbors, product, ConvolutionKernel, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
-use super::initial_state::{channel_powers, means_of, EndForcing, Link};
+use super::initial_state::{derivative_powers, power_term_means, EndVelocityForcing, Link};
 use super::system::{NonlinearSystem, MIN_INTEGRATION_ORDER};
 use crate::equation::{Equation, ORDER_GRAIN};
 use crate::error::{Error, Result};
@@ -263,7 +263,7 @@ impl Operators {
                     row.iter().filter(by_end_velocity).copied().collect()
                 };
                 let links: Vec<Vec<Link>> = links.iter().enumerate().map(of).collect();
-                Some(EndForcing::new(powers, &links, self.m, self.step)?)
+                Some(EndVelocityForcing::new(powers, &links, self.m, self.step)?)
             }
             None => None,
         };
@@ -273,8 +273,8 @@ impl Operators {
                     row.clone_from(&at_ends.velocities[equation])
                 }
                 _ => {
-                    for (exponent, value) in channel_powers(channel.equation(), channel.order(), links, powers)? {
-                        let means = means_of(exponent, self.m, self.step);
+                    for (exponent, value) in derivative_powers(channel.equation(), channel.order(), links, powers)? {
+                        let means = power_term_means(exponent, self.m, self.step);
                         row.iter_mut().zip(means).for_each(|(sum, v)| *sum += value * v);
                     }
                 }
@@ -345,7 +345,7 @@ impl Operators {
         for k in 0..self.m {
             pulse.free.iter_mut().zip(&forcing.channels).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
-                pulse.free[lane.state] += convolution.past();
+                pulse.free[lane.state] += convolution.history_sum();
             }
             pulse.predict(&run.sources);
             pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
@@ -791,7 +791,7 @@ impl Operators {
         for k in 0..self.m {
             free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
-                free[lane.state] += convolution.past();
+                free[lane.state] += convolution.history_sum();
             }
             let slopes = &run.slopes[k * values * width..(k + 1) * values * width];
             let inverse = &run.inverses[k * states * states..(k + 1) * states * states];

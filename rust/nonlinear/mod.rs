@@ -16,9 +16,9 @@ mod model;
 mod system;
 
 pub use contact::BodyMotion;
-pub use fit::{fit, Start, StateFit};
+pub use fit::{fit, NonlinearFit, Start};
 pub use model::{filtered_outputs, FreeFrictionLaw, NonlinearModel};
-pub(crate) use system::refuse_beside;
+pub(crate) use system::unsupported_with;
 pub use system::NonlinearSystem;
 
 use crate::error::{check_length, Result};
@@ -72,7 +72,7 @@ impl NonlinearSystem {
     /// // A block slides at 1 m/s with friction of 2 m/s²: it stops after half a second and 0.25 m.
     /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
     /// let frictions = vec![(0, FrictionLaw::coulomb(2.0))];
-    /// let block = NonlinearSystem::linear(vec![Equation::new(structure, vec![1.0])?], frictions, 2);
+    /// let block = NonlinearSystem::with_friction(vec![Equation::new(structure, vec![1.0])?], frictions, 2);
     /// let run = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 100], vec![0.0; 100]]), None)?;
     /// let motion = block.run(&run, &[vec![(1.0, 1.0)]])?;
     /// let velocity = &motion.bodies[0].velocity;

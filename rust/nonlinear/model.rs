@@ -1,7 +1,7 @@
 //! Parameters of equations with non-linear terms: residuals of all experiments and their derivatives.
 
 use super::channels::{ForcingTerms, SystemDerivatives};
-use super::initial_state::{merge_powers, State};
+use super::initial_state::{merge_powers, InitialTerm};
 use super::march::{FrozenProducts, LinearizedRun, Operators};
 use super::system::NonlinearSystem;
 use crate::equation::Equation;
@@ -111,7 +111,7 @@ pub(super) enum Parameter {
     /// Free order, free coefficient, or state of one run.
     Order(usize),
     Coefficient(usize),
-    State(usize, usize),
+    InitialTerm(usize, usize),
     /// Free parameter of an input.
     Input(usize),
 }
@@ -126,7 +126,7 @@ impl Parameter {
             all.extend((0..point.inputs.len()).map(Self::Input));
         }
         let states = point.states.iter().enumerate();
-        all.extend(states.flat_map(|(run, states)| (0..states.len()).map(move |state| Self::State(run, state))));
+        all.extend(states.flat_map(|(run, states)| (0..states.len()).map(move |state| Self::InitialTerm(run, state))));
         all
     }
 }
@@ -154,14 +154,14 @@ impl NonlinearModel {
         }
     }
 
-    fn states(&self, orders: &[f64]) -> (Vec<State>, Vec<Equation>) {
+    fn states(&self, orders: &[f64]) -> (Vec<InitialTerm>, Vec<Equation>) {
         let is_order_free = |i: usize, term: usize| {
             let alpha = &self.model.equations[i].order.weights;
             let own = &self.model.equations[i].terms[term].1.weights;
             alpha.iter().zip(own).any(|(a, w)| (a - w).abs() > 0.0)
         };
         let equations = self.system(orders, &vec![0.0; self.model.coordinates.len()], 0).equations;
-        (State::all(&equations, &self.model.initial, &self.filtered, is_order_free), equations)
+        (InitialTerm::all(&equations, &self.model.initial, &self.filtered, is_order_free), equations)
     }
 
     /// Forcing by the initial states of a run.
@@ -233,7 +233,7 @@ impl NonlinearModel {
                     derivatives.forcing = difference(&shifted, by)?;
                 }
             }
-            Parameter::State(_, state) => {
+            Parameter::InitialTerm(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
                 let at = (point.orders.as_slice(), point.coefficients.as_slice(), unit.as_slice());
                 derivatives.forcing = self.initial_forcing(&part.operators, at)?;
@@ -384,17 +384,17 @@ impl NonlinearModel {
             let record = part.record.as_ref().unwrap_or(&experiment.record);
             let mut frozen = FrozenProducts::new(&part.operators, &part.run);
             for (column, moved) in columns.iter_mut().zip(&all) {
-                if matches!(moved, Parameter::State(run, _) if *run != index) {
+                if matches!(moved, Parameter::InitialTerm(run, _) if *run != index) {
                     column.extend(std::iter::repeat_n(0.0, self.model.equations.len() * experiment.compared_count()));
                     continue;
                 }
                 stop.check()?;
                 let slopes = match moved {
-                    Parameter::State(_, state) if states[*state].is_impulse() => {
+                    Parameter::InitialTerm(_, state) if states[*state].is_impulse() => {
                         // A filter transient does not enter the equations.
                         let mut slopes = vec![vec![0.0; record.m()]; self.model.equations.len()];
                         let mut own = vec![Vec::new(); self.model.equations.len()];
-                        if let State::Power(i, e) = states[*state] {
+                        if let InitialTerm::Power(i, e) = states[*state] {
                             own[i].push((e, 1.0));
                         }
                         add_impulses(&mut slopes, &own, record.step());
@@ -419,16 +419,16 @@ impl NonlinearModel {
 /// Guesses of the initial states from the first samples of a run: positions and velocities of the outputs, with several
 /// constant forces within the frictions, all other states 0.
 fn state_guesses(
-    (states, equations): &(Vec<State>, Vec<Equation>),
+    (states, equations): &(Vec<InitialTerm>, Vec<Equation>),
     frictions: &[(usize, FrictionLaw)],
     experiment: &Experiment,
 ) -> Vec<Vec<f64>> {
     let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
     let with_force = |body: usize, force: f64| -> Vec<f64> {
-        let value = |state: &State| match *state {
-            State::Level(i) => begun[i].0,
-            State::Rate(i) => begun[i].1,
-            State::Offset(i, 0) if i == body => force / libm::tgamma(equations[i].structure.order + 1.0),
+        let value = |state: &InitialTerm| match *state {
+            InitialTerm::Level(i) => begun[i].0,
+            InitialTerm::Rate(i) => begun[i].1,
+            InitialTerm::Offset(i, 0) if i == body => force / libm::tgamma(equations[i].structure.order + 1.0),
             _ => 0.0,
         };
         states.iter().map(value).collect()

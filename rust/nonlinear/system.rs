@@ -33,7 +33,7 @@ pub struct NonlinearSystem {
 impl NonlinearSystem {
     /// Linear equations with dry friction, whose outputs enter each other's equations as simulated.
     #[must_use]
-    pub fn linear(equations: Vec<Equation>, frictions: Vec<(usize, FrictionLaw)>, recorded: usize) -> Self {
+    pub fn with_friction(equations: Vec<Equation>, frictions: Vec<(usize, FrictionLaw)>, recorded: usize) -> Self {
         Self { equations, derived: Vec::new(), recorded, coupled: true, frictions }
     }
 
@@ -221,6 +221,6 @@ impl NonlinearSystem {
 }
 
 /// Error for non-linear terms beside something else.
-pub(crate) fn refuse_beside(what: &str, remedy: &str) -> Error {
+pub(crate) fn unsupported_with(what: &str, remedy: &str) -> Error {
     Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
 }

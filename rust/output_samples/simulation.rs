@@ -137,7 +137,7 @@ impl OutputSimulation {
         }
         if recording.is_all_filtered() {
             let remedy = "the sensor filter does not commute with them: use coupling='simulated' and inputs before it";
-            return Err(nonlinear::refuse_beside("inputs behind the sensor filter", remedy));
+            return Err(nonlinear::unsupported_with("inputs behind the sensor filter", remedy));
         }
         let found = Self { recording, equations, frictions, times, derived };
         found.system().check()?;

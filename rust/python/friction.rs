@@ -33,7 +33,7 @@ pub fn friction_respond<'py>(
             Ok(Equation { structure, coefficients: coefficients.into() })
         })
         .collect::<PyResult<_>>()?;
-    let system = NonlinearSystem::linear(equations, frictions, record.len());
+    let system = NonlinearSystem::with_friction(equations, frictions, record.len());
     let motion = run_interruptible(py, record.m(), None, move |_| system.run(&record, &to_vectors(terms)))?;
     let dict = PyDict::new(py);
     dict.set_item("outputs", stack_rows(py, &motion.outputs)?)?;

@@ -4,7 +4,7 @@ use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::FreeModel;
 use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, MinimizationSettings, Monomial};
-use ftlm::friction::contact::{is_p_matrix, ContactLaw};
+use ftlm::friction::contact::{is_p_matrix, ContactProblem};
 use ftlm::friction::law::{Phase, PulseDerivatives};
 use ftlm::friction::FrictionLaw;
 use ftlm::nonlinear::convolution::{ConvolutionKernel, OnlineConvolution};
@@ -19,7 +19,7 @@ fn body(order: f64, friction: f64) -> NonlinearSystem {
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
     let structure = Structure { output: 0, order, terms };
     let equation = Equation { structure, coefficients: vec![-1.0, 1.0] };
-    NonlinearSystem::linear(vec![equation], vec![(0, FrictionLaw::coulomb(friction))], 2)
+    NonlinearSystem::with_friction(vec![equation], vec![(0, FrictionLaw::coulomb(friction))], 2)
 }
 
 fn force(m: usize) -> Vec<f64> {
@@ -314,9 +314,9 @@ fn of_all_combinations_of_bodies_at_rest_exactly_one_is_taken() {
         let all = consistent(&most, &p, &gains);
         assert_eq!(all.len(), 1, "{gains:?} {p:?}");
         let laws = most.iter().map(|f| FrictionLaw::coulomb(*f)).collect();
-        let rubbing = ContactLaw::new(laws, gains).expect("a P-matrix");
+        let problem = ContactProblem::new(laws, gains).expect("a P-matrix");
         let mut at = Vec::new();
-        rubbing.pulse(&vec![0.0; n], &p, &vec![0.0; n], &vec![0.0; n], &mut at);
+        problem.solve(&vec![0.0; n], &p, &vec![0.0; n], &vec![0.0; n], &mut at);
         for (body, force) in at.iter().zip(&all[0]) {
             assert!((body.1.force - force).abs() < 1e-12, "{at:?} {all:?}");
         }
@@ -339,11 +339,11 @@ fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
             (0..2).map(|_| FrictionLaw { coulomb: random.uniform(0.1, 2.0), stribeck, speed: 0.5 }).collect();
         let (v, p): (Vec<f64>, Vec<f64>) =
             (0..2).map(|_| (random.uniform(-0.4, 0.4), random.uniform(-0.7, 0.7))).unzip();
-        let rubbing = ContactLaw::new(laws.clone(), gains.clone()).expect("a P-matrix");
+        let problem = ContactProblem::new(laws.clone(), gains.clone()).expect("a P-matrix");
         let (mut at, mut other) = (Vec::new(), Vec::new());
-        rubbing.pulse(&v, &p, &[0.0; 2], &[0.0; 2], &mut at);
+        problem.solve(&v, &p, &[0.0; 2], &[0.0; 2], &mut at);
         for begun in [[2.0, 2.0], [-2.0, 2.0], [0.3, -1.0]] {
-            rubbing.pulse(&v, &p, &[0.0; 2], &begun, &mut other);
+            problem.solve(&v, &p, &[0.0; 2], &begun, &mut other);
             assert!(at.iter().zip(&other).all(|(x, y)| (x.1.force - y.1.force).abs() < 1e-11), "{case}");
         }
         for a in 0..2 {
@@ -356,7 +356,7 @@ fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
     }
     assert_eq!(seen.len(), 9);
     assert!(matches!(
-        ContactLaw::new(vec![FrictionLaw::coulomb(1.0); 2], vec![0.1, 0.2, 0.2, 0.1]),
+        ContactProblem::new(vec![FrictionLaw::coulomb(1.0); 2], vec![0.1, 0.2, 0.2, 0.1]),
         Err(Error::Diverged { .. })
     ));
 }

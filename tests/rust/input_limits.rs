@@ -82,7 +82,7 @@ fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
     let structure = Structure { output: 0, order: 1.8, terms };
     let equation = Equation { structure, coefficients: vec![-1.0, 1.5] };
-    let body = NonlinearSystem::linear(vec![equation], vec![(0, FrictionLaw::coulomb(f))], 2);
+    let body = NonlinearSystem::with_friction(vec![equation], vec![(0, FrictionLaw::coulomb(f))], 2);
     let record = Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; M], acting(&u, law, limit)]), None)?;
     let output = body.run(&record, &[vec![]])?.outputs.swap_remove(0);
     let record = Record::new(STEP, PulseMeans::from_signals(vec![output.clone(), u]), None)?;

@@ -19,7 +19,7 @@ use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::structure::{ParametricEquation, ParametricStructure};
 use crate::expression::{DerivedSignal, Values};
 use crate::fractional::kernels::grunwald_letnikov_weights;
-use crate::nonlinear::refuse_beside;
+use crate::nonlinear::unsupported_with;
 use crate::recording::{Channel, Recording, Recordings, Role};
 use crate::series;
 use crate::signal::block_pulse::{delay_samples, Intersample};
@@ -141,7 +141,7 @@ fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterS
 fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, half_width: usize) -> Result<Recordings> {
     let of = |run: &Recording| {
         if run.has_nonuniform_samples() {
-            return Err(refuse_beside("samples at times of their own", "resample the runs"));
+            return Err(unsupported_with("samples at times of their own", "resample the runs"));
         }
         let mut channels = run.channels().to_vec();
         for (derived, name) in structure.derived.iter().zip(&structure.signals[structure.recorded_count()..]) {

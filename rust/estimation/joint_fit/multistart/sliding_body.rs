@@ -181,7 +181,7 @@ mod tests {
         let terms = vec![equation::Term { signal: 0, order: 1.0 }, equation::Term { signal: 1, order: 0.0 }];
         let linear = equation::Structure { output: 0, order: 2.0, terms };
         let equation = equation::Equation::new(linear, vec![-2.0, 3.0])?;
-        let body = NonlinearSystem::linear(vec![equation], vec![(0, FrictionLaw::coulomb(0.5))], 2);
+        let body = NonlinearSystem::with_friction(vec![equation], vec![(0, FrictionLaw::coulomb(0.5))], 2);
         let record = Record::from_rows(step, vec![vec![0.0; rows - 1], u[..rows - 1].to_vec()], None)?;
         let means = body.run(&record, &[Vec::new()])?.outputs.remove(0);
         let y: Vec<f64> = std::iter::once(0.0).chain(means.windows(2).map(|w| 0.5 * (w[0] + w[1]))).collect();
