@@ -7,8 +7,12 @@ benches/results.json.
 from __future__ import annotations
 
 import argparse
+import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -24,6 +28,8 @@ M, STEP, ORDER, SIGNALS = 2048, 10.0 / 2048, 0.85, 256
 SCORED, INCREMENT = 512, 0.05
 #: Samples of a recursion with four terms and p = 7.
 SAMPLES = 20_000
+#: Signals of the batch whose memory is measured, in a process of its own.
+BATCH = 10_000
 
 
 def shortest(work: Callable[[], object], seconds: float = 0.5) -> float:
@@ -36,6 +42,18 @@ def shortest(work: Callable[[], object], seconds: float = 0.5) -> float:
         each = time.process_time() - start
         best, spent = min(best, each), spent + each
     return best
+
+
+def batch_memory() -> None:
+    """Print the peak memory before and after the integrals of a batch [MB]."""
+    x = np.ones((BATCH, M))
+
+    def peak() -> float:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    before = peak()
+    kernels.integrate(x, ORDER, step=STEP)
+    print(before, peak())
 
 
 def main() -> None:
@@ -65,6 +83,14 @@ def main() -> None:
         f"P19, integrate, {SIGNALS} signals of {M}: {ours / SIGNALS * 1e6:.1f} us each; NumPy, spectrum prepared, "
         f"{numpy_time / SIGNALS * 1e6:.1f} (ratio {ours / numpy_time:.2f}, promised 1); fftconvolve "
         f"{scipy_time / SIGNALS * 1e6:.1f}"
+    )
+    command = [sys.executable, "-c", "import public_kernels; public_kernels.batch_memory()"]
+    answer = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent).stdout
+    before, after = (float(value) for value in answer.split())
+    result = BATCH * M * 8 / 2**20
+    say(
+        f"P19, integrate, {BATCH} signals of {M}: peak memory {after - before:.0f} MB above that of the argument; "
+        f"the result has {result:.0f}"
     )
     first, row = np.concatenate([[1.0], random.standard_normal(M - 1) / M]), np.zeros(M)
     row[0] = first[0]

@@ -4,8 +4,8 @@ use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArra
 use pyo3::prelude::*;
 
 use super::convert::{
-    initial, prior, record, records, rows, stack_rows, structure, to_vectors, vector, InitialArg, List, RecordArg,
-    StructureArg,
+    check_size, initial, prior, record, records, rows, stack_rows, structure, to_vectors, vector, InitialArg, List,
+    RecordArg, StructureArg,
 };
 use super::errors::{run_attached, run_detached};
 use super::recording::Experiment;
@@ -299,17 +299,20 @@ impl Streaming {
         py: Python<'py>,
         samples: PyReadonlyArray2<'py, f64>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        let (samples, count) = (rows(&samples)?, self.inner.coefficient_count());
+        check_size(&samples)?;
+        let (length, width) = (samples.shape()[0], samples.shape()[1]);
+        let (values, count): (Vec<f64>, usize) =
+            (samples.as_array().iter().copied().collect(), self.inner.coefficient_count());
         let inner = &mut self.inner;
-        let found = run_detached(py, || {
-            let mut found = Vec::with_capacity(samples.len() * count);
-            for sample in &samples {
-                inner.push(sample)?;
-                inner.append_coefficients(&mut found);
+        let path = run_detached(py, || {
+            let mut path = Vec::with_capacity(length * count);
+            for row in 0..length {
+                inner.push(&values[row * width..(row + 1) * width])?;
+                inner.append_coefficients(&mut path);
             }
-            Ok(found)
+            Ok(path)
         })?;
-        PyArray1::from_vec(py, found).reshape([samples.len(), count])
+        PyArray1::from_vec(py, path).reshape([length, count])
     }
 
     #[getter]
