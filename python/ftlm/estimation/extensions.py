@@ -161,7 +161,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     try:
         joint, runs = _first_samples(joint, structure, runs)
         own = _prediction_criterion(joint, structure, runs, 0)
-        extensions = [*_drift(structure, runs), *_other_intersample(structure, joint, runs)]
+        extensions = [*_drift(structure, joint, runs), *_other_intersample(structure, joint, runs)]
         if names:
             extensions += _extensions(structure, joint, runs, names)
             extensions += [*_friction(structure, runs), *_load_step(structure, joint, runs)]
@@ -225,12 +225,12 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
     return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
 
 
-def _drift(structure: Structure, runs: Runs) -> list[Extension]:
+def _drift(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
     """Return the linear structure with levels of the outputs that change linearly; none if its offsets were given."""
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
     count = (2 if structure.offset == "none" else 1) * len(structure.equations) * len(runs)
-    return [Extension("drift_fits", replace(structure, offset="ramp"), count, [])]
+    return [Extension("drift_fits", replace(structure, offset="ramp"), count, [], starts=[joint.values_by_name])]
 
 
 def _other_intersample(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
